@@ -1,9 +1,10 @@
-"""How many files of the project one compression enters.
+"""How many files of the project one command enters.
 
-    python -m benchmarks.files_entered [-v] [--tree DIRECTORY]
+    python -m benchmarks.files_entered [--call CALL] [-v] [--tree DIRECTORY]
 
-Runs ``me2e-compress compress m.onnx -r full --frames F -o o.onnx`` in this process, on
-the graph of `benchmarks.seven_nodes`, and counts the files of ``me2e_compress`` in
+Runs a command in this process: ``compress m.onnx -r full --frames F -o o.onnx`` on the
+graph of `benchmarks.seven_nodes`, ``evaluate highway --routes 1`` or ``study paper
+--records`` on drives that are kept. Counts the files of ``me2e_compress`` in
 which a function ran (a lambda, a comprehension and a generator too). What runs while a
 module is being imported, and methods that dataclasses generate, do not count; files
 that were only imported are counted apart. ``-v`` lists the files, each with its
@@ -18,7 +19,7 @@ import sys
 import tempfile
 import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import CodeType, FrameType
@@ -82,13 +83,14 @@ class Entered:
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-v", "--verbose", action="store_true")
+    parser.add_argument("--call", choices=CALLS, default="compress")
     parser.add_argument("--tree", type=Path, default=Path(__file__).parents[1])
     options = parser.parse_args(argv)
     tree = options.tree.resolve()
     sys.path.insert(0, str(tree))
     entered = Entered(tree / PACKAGE)
     with tempfile.TemporaryDirectory() as scratch:
-        compress(entered, Path(scratch))
+        run(entered, CALLS[options.call](Path(scratch)))
     functions = entered.functions()
     print(f"{len(functions)} files entered by calls, {len(entered.called)} functions")
     print(f"{len(entered.imported)} files executed at import")
@@ -97,25 +99,63 @@ def main(argv: Sequence[str] | None = None) -> None:
             print(f"  {count:4} {file}")
 
 
-def compress(entered: Entered, folder: Path) -> None:
-    """Run the command on files in a folder; what it prints is not shown."""
+def compress(folder: Path) -> list[str]:
+    """Compress seven nodes."""
     model, frames = folder / "m.onnx", folder / "frames"
     seven_nodes.write_model(model)
     seven_nodes.write_frames(frames)
     words = ["compress", model, "-r", "full", "--frames", frames]
-    sys.argv = ["me2e-compress", *map(str, words), "-o", str(folder / "o.onnx")]
-    said = io.StringIO()
+    return [*map(str, words), "-o", str(folder / "o.onnx")]
+
+
+def evaluate(folder: Path) -> list[str]:
+    """Drive one route: in this process, as a worker would in its own."""
+    from me2e_compress.evaluators.highway.engine import LocalEngine
+    from me2e_compress.evaluators.highway.runner import drive
+    from me2e_compress.evaluators.highway.worker import Driven, Job
+    from me2e_compress.simulator.routes import Route
+
+    def here(self: LocalEngine, job: Job, routes: Sequence[Route]) -> Iterator[Driven]:
+        for route in routes:
+            yield Driven(drive(route, job.driver.open(), job.conditions), 0.0, 0)
+
+    LocalEngine.drive = here  # type: ignore[method-assign]
+    return ["evaluate", "highway", "--routes", "1", "-o", str(folder / "driven")]
+
+
+def paper(folder: Path) -> list[str]:
+    """Make the paper's tables of drives that are kept."""
+    records = Path(__file__).parent / "paper"
+    return ["study", "paper", "--records", str(records), "-o", str(folder / "paper")]
+
+
+CALLS: Mapping[str, Callable[[Path], list[str]]] = {
+    "compress": compress,
+    "evaluate": evaluate,
+    "paper": paper,
+}
+
+
+def run(entered: Entered, words: Sequence[str]) -> None:
+    """Run a command line; what it prints is shown only where it fails."""
+    sys.argv = ["me2e-compress", *words]
+    said, code = io.StringIO(), 1
+
+    def called() -> None:
+        nonlocal code
+        code = command()
+
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-        entered.during(command)
-    if not (folder / "o.onnx").is_file():
+        entered.during(called)
+    if code:
         sys.exit(said.getvalue())
 
 
-def command() -> None:
+def command() -> int:
     """Run ``me2e-compress`` as its entry point does, its import with it."""
-    from me2e_compress.cli import main as run
+    from me2e_compress.cli import main as run_command
 
-    run()
+    return run_command()
 
 
 if __name__ == "__main__":

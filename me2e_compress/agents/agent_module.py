@@ -1,4 +1,4 @@
-"""An agent's class by its file, imported as the leaderboard imports one."""
+"""Import an agent's class from its file, as the leaderboard does."""
 
 import importlib
 import sys
@@ -11,11 +11,7 @@ from me2e_compress.errors import EvaluationError
 
 
 def agent_module(text: str) -> ModuleType:
-    """Import an agent's module as the leaderboard does: its folder is on the path.
-
-    Raises:
-        EvaluationError: No such file.
-    """
+    """Import an agent's module as the leaderboard does: its folder is on the path."""
     if not text.endswith(".py"):
         return importlib.import_module(text)
     path = Path(text)
@@ -27,11 +23,7 @@ def agent_module(text: str) -> ModuleType:
 
 
 def agent_class(module: ModuleType) -> Any:
-    """Return the class that a module's entry point names.
-
-    Raises:
-        EvaluationError: It names none, or an agent of ROS.
-    """
+    """Return the class that a module's entry point names; ROS agents are refused."""
     if not hasattr(module, "get_entry_point"):
         raise EvaluationError(f"agent {module.__name__} has no get_entry_point")
     found = getattr(module, module.get_entry_point())
@@ -43,11 +35,7 @@ def agent_class(module: ModuleType) -> Any:
 
 
 def function_named(text: str) -> Callable[[], object]:
-    """Import what ``module:function`` names.
-
-    Raises:
-        EvaluationError: There is no such function.
-    """
+    """Import what ``module:function`` names."""
     if not text:
         return lambda: None
     module, _, name = text.partition(":")

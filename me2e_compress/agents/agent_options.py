@@ -16,11 +16,7 @@ class AgentOptions(BaseModel):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a TOML file.
-
-        Raises:
-            EvaluationError: No such file, not TOML, or an unknown key or value.
-        """
+        """Read a TOML file."""
         try:
             return cls.model_validate(documents.from_toml(documents.content(path)))
         except OSError as error:
@@ -34,27 +30,18 @@ class AgentOptions(BaseModel):
 
 
 def conf_parts(text: str) -> tuple[Path, str]:
-    """Take the leaderboard's configuration text apart.
+    """Split the leaderboard's configuration text into file and save name.
 
-    Bench2Drive's evaluator appends ``+save_name`` for every route and never takes it
-    off again, so the first field is the file and the last the name of this route.
-
-    Args:
-        text: ``FILE``, or ``FILE+...+save_name``.
-
-    Returns:
-        The file, and the save name; empty where there is none.
+    Bench2Drive's evaluator appends ``+save_name`` for every route and never removes it,
+    so the first field is the file and the last the name of this route, if there are two
+    or more; else the name is empty.
     """
     first, *others = text.split("+")
     return Path(first), others[-1] if others else ""
 
 
 def route_folder(parent: Path, save_name: str) -> Path:
-    """Make the folder of one route: of its save name, else the next free number.
-
-    Raises:
-        EvaluationError: It cannot be made.
-    """
+    """Make the folder of one route, by its save name or the next free number."""
     folder, number = parent / save_name, 0
     while not save_name and (folder := parent / f"route-{number:03}").exists():
         number += 1

@@ -1,6 +1,6 @@
-"""What is asked of CARLA and of its leaderboard.
+"""The parts of CARLA and of its leaderboard that agents use.
 
-Both are imported where they are asked for, so that naming an agent takes neither.
+Both are imported on first use, so that naming an agent needs neither.
 """
 
 import importlib
@@ -11,9 +11,9 @@ from typing import Any, Protocol, TypeAlias, TypeVar
 from me2e_compress.errors import EvaluationError, MissingPackageError
 
 SensorData: TypeAlias = Mapping[str, tuple[int, Any]]
-"""Of one tick, by the sensor's id: (frame, data)."""
+"""The data of one tick, by the sensor's id: (frame, data)."""
 SensorSpecs: TypeAlias = list[dict[str, Any]]
-"""What an agent asks the leaderboard to mount."""
+"""The sensors that an agent asks the leaderboard to mount."""
 
 AGENT_MODULE = "leaderboard.autoagents.autonomous_agent"
 
@@ -43,22 +43,14 @@ def copy_of(control: ControlT) -> ControlT:
 
 
 def carla_control(throttle: float, steer: float, brake: float) -> CarlaControl:
-    """Build a control: throttle and brake 0 to 1, steer -1 (left) to 1 (right).
-
-    Raises:
-        MissingPackageError: CARLA's client is not installed.
-    """
+    """Build a control: throttle and brake 0 to 1, steer -1 (left) to 1 (right)."""
     control: CarlaControl = carla_module().VehicleControl()
     control.throttle, control.steer, control.brake = throttle, steer, brake
     return control
 
 
 def carla_module() -> ModuleType:
-    """Import CARLA's client.
-
-    Raises:
-        MissingPackageError: It is not installed.
-    """
+    """Import CARLA's client; raises MissingPackageError if it is not installed."""
     try:
         return importlib.import_module("carla")
     except ModuleNotFoundError as error:
@@ -68,12 +60,7 @@ def carla_module() -> ModuleType:
 
 
 def autonomous_agent_class() -> type:
-    """Import the leaderboard's base class of agents.
-
-    Raises:
-        EvaluationError: The leaderboard is not on the path.
-        MissingPackageError: CARLA's client is not installed.
-    """
+    """Import the leaderboard's base class of agents."""
     carla_module()
     try:
         module = importlib.import_module(AGENT_MODULE)

@@ -1,7 +1,6 @@
-"""CARLA's sensors to an observation: the one way in for whatever a model sees.
+"""CARLA's sensors to an observation: the only source of what a model sees.
 
-Raises:
-    MissingExtraError: On import, if OpenCV is not installed.
+Importing it without OpenCV raises MissingExtraError.
 """
 
 import math
@@ -34,11 +33,9 @@ Images = npt.NDArray[np.uint8]
 class CarlaReading:
     """What the cheap sensors say at one tick, in a right-handed world.
 
-    Args:
-        motion: Of the ego.
-        command: Where the route goes next, 0 to 5.
-        node: The next node of the route, metres to the right and forward.
-        node_after: The one after it; at the end of the route the same.
+    ``command`` is where the route goes next, 0 to 5; ``node`` is the next node of the
+    route, metres to the right and forward, and ``node_after`` the one after it (at the
+    end of the route the same).
     """
 
     motion: EgoKinematics
@@ -48,31 +45,20 @@ class CarlaReading:
 
 
 class Preprocessing(Protocol):
-    """Makes an observation of one tick that decides.
-
-    What another stack needs besides (lidar, a history, a map) is made here and here
-    alone: an agent asks nothing else.
-    """
+    """Makes the observation of a tick that decides, from sensors and reading."""
 
     def observe(
         self, sensors: SensorData, reading: CarlaReading, time_us: int
     ) -> Observation:
-        """Return what the policy gets.
-
-        Args:
-            sensors: All of the tick's data.
-            reading: What the cheap ones say.
-            time_us: Simulated time since the route began, microseconds.
-        """
+        """Return what the policy gets from all of the tick's data and its reading."""
         ...
 
 
 class RouteReader:
     """Reads the cheap sensors at every tick, and follows the route with them.
 
-    Args:
-        gps_plan: The leaderboard's plan: ({"lat", "lon"}, RoadOption) by node.
-        world_plan: The same nodes: (transform, RoadOption).
+    It takes the leaderboard's plan in both forms: ``gps_plan`` has ({"lat", "lon"},
+    RoadOption) by node, ``world_plan`` (transform, RoadOption) of the same nodes.
     """
 
     def __init__(
@@ -85,6 +71,7 @@ class RouteReader:
 
     def read(self, sensors: SensorData) -> CarlaReading:
         """Return what GPS, IMU and speedometer say at one tick."""
+        # position, heading and motion, in a right-handed world
         latitude, longitude, *_ = sensors[GPS][1]
         x, y = self._geo.metres(latitude, longitude)
         imu = [float(value) for value in sensors[IMU][1]]
@@ -102,6 +89,7 @@ class RouteReader:
             # Bench2Drive's agents turn all three round
             (-imu[3], -imu[4], -imu[5]),
         )
+        # the next two nodes of the route, to the right and forward
         place, command = self._follower.next(x, y)
         nodes = np.stack([place, self._follower.after_next]) - (x, y)
         sin, cos = math.sin(heading), math.cos(heading)
@@ -113,14 +101,11 @@ class RouteReader:
 class CarlaObserver:
     """Makes observations as the contract has them, of six cameras.
 
-    Args:
-        rig: How the cameras see.
-        seen: Places among the rig's cameras of those that the model sees; the others
-            stay black, and without any there are no images.
-        origin_m: Of the model's ground frame, in the ego frame.
-        jpeg_quality: Every image is written and read as a JPEG of this quality, as
-            Bench2Drive's agents do to match their training data; 0 leaves it as it is.
-        fill: Colour of what is padded, R, G, B.
+    Cameras that are not in ``seen`` stay black; without any there are no images.
+    ``origin_m`` is the origin of the model's ground frame in the ego frame. Every image
+    is encoded and decoded as a JPEG of ``jpeg_quality``, as Bench2Drive's agents do to
+    match their training data; 0 leaves it as it is. ``fill`` is the padding's colour,
+    R, G, B.
     """
 
     rig: CarlaRig
@@ -137,7 +122,7 @@ class CarlaObserver:
     def observe(
         self, sensors: SensorData, reading: CarlaReading, time_us: int
     ) -> Observation:
-        """Return the observation; the CAN bus counts from the one before."""
+        """Return the observation; its CAN bus counts from the previous one."""
         can_bus = can_bus_between(reading.motion, self._last)
         self._last = reading.motion
         return Observation(
@@ -158,7 +143,7 @@ class CarlaObserver:
         return images
 
     def _taken(self, bgra: Images) -> Images:
-        """Return one picture, BGRA [rows, columns, 4], as RGB of the model's size."""
+        """Convert one picture, BGRA [rows, columns, 4], to RGB of the model's size."""
         picture = np.asarray(cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGB))
         if self.jpeg_quality:
             # red and blue swapped, as in those agents: chroma is what it costs
@@ -174,5 +159,5 @@ class CarlaObserver:
 
 
 def _ego_frame(*places: tuple[float, float]) -> npt.NDArray[np.float32]:
-    """Return [n, 2] of places that lie so many metres to the right and forward."""
+    """Convert positions (right, forward) to [n, 2] of the ego frame."""
     return np.array([(forward, -right) for right, forward in places], np.float32)

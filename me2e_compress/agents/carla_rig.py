@@ -1,8 +1,8 @@
-"""Sensors as Bench2Drive's VAD and UniAD agents mount them, and how cameras project.
+"""Sensors as Bench2Drive's VAD and UniAD agents mount them, and camera projections.
 
-CARLA is left-handed: y to the right, yaw clockwise. Angles and places are turned once,
-here, into the ego frame of the contract: x forward, y left, its origin on the ground
-under the centre of the ego.
+CARLA is left-handed: y to the right, yaw clockwise. Angles and positions are converted
+once, here, to the ego frame of the contract: x forward, y left, its origin on the
+ground under the centre of the ego.
 """
 
 from collections.abc import Collection
@@ -25,7 +25,7 @@ class CarlaCamera(BaseModel):
     """A level pinhole camera, in CARLA's own terms.
 
     Attributes:
-        id: What the leaderboard calls it.
+        id: Its name in the leaderboard.
         x: Metres forward of the vehicle's centre.
         y: Metres to the right.
         z: Metres above the ground.
@@ -57,16 +57,12 @@ the contract's order."""
 
 @dataclass(frozen=True, eq=False)
 class CarlaRig:
-    """Six cameras as CARLA renders them and as a model takes them.
+    """Six cameras, their pictures as rendered by CARLA and as taken by a model.
 
-    A picture is scaled as a whole, as large as the model's allows, and stands at the
-    upper left of it: 1600 x 900 at 0.4 in 384 rows of 640 leaves 24 rows below, as the
-    pipelines of VAD and UniAD pad.
-
-    Args:
-        cameras: In the contract's order.
-        rendered: Columns and rows of CARLA's pictures.
-        taken: Rows and columns of the model's.
+    A whole picture is scaled to the largest size that fits and placed at the upper
+    left: 1600 x 900 at 0.4 in 384 rows of 640 leaves 24 rows below, as the pipelines of
+    VAD and UniAD pad. ``rendered`` is columns and rows of CARLA's pictures, ``taken``
+    rows and columns of the model's.
     """
 
     cameras: tuple[CarlaCamera, ...]
@@ -75,15 +71,14 @@ class CarlaRig:
 
     @property
     def scale(self) -> float:
-        """Of a picture, from CARLA's to the model's pixels."""
+        """Factor from CARLA's to the model's pixels."""
         (columns, rows), (high, wide) = self.rendered, self.taken
         return min(wide / columns, high / rows)
 
     def specs(self, seen: Collection[int]) -> SensorSpecs:
         """List the sensors that an agent asks for: cameras, IMU, GPS, speedometer.
 
-        Args:
-            seen: Places among `cameras` of those that a model sees.
+        ``seen`` holds the indices of the cameras that a model sees.
         """
         columns, rows = self.rendered
         mounted: SensorSpecs = [
@@ -107,10 +102,9 @@ class CarlaRig:
         return [*mounted, *others]
 
     def lidar2img(self, origin_m: Triple) -> npt.NDArray[np.float32]:
-        """Return [6, 4, 4]: a frame parallel to the ego's to the model's pixels.
+        """Return [6, 4, 4], from a frame parallel to the ego's to the model's pixels.
 
-        Args:
-            origin_m: Of that frame, in the ego frame; zeros for the ego frame itself.
+        ``origin_m`` is that frame's origin in the ego frame.
         """
         places = [self._projection(camera) for camera in self.cameras]
         moved = np.eye(4)

@@ -1,4 +1,4 @@
-"""What the decisions of one route took: a line each, and a latency trace at the end."""
+"""Logs of one route: a line per decision, and a latency trace at the end."""
 
 import json
 from dataclasses import asdict, dataclass, field
@@ -13,15 +13,11 @@ TRACE = "latency.json"
 
 @dataclass(frozen=True)
 class DecisionRecord:
-    """One decision.
+    """One decision, what it took here and what latency it was charged with.
 
-    Attributes:
-        frame: Tick of the route, from 0.
-        time_s: Simulated time, as the leaderboard told it.
-        wall_s: Time since the first tick on this machine's clock: beside `time_s` it
-            says how much slower than the world the machine is, which is no latency.
-        measured_us: What the decision took here.
-        latency_us: What it was charged with.
+    Times are simulated (``time_s``) and on this machine's clock since the first tick
+    (``wall_s``): their ratio tells how much slower than the world the machine is, which
+    is no latency.
     """
 
     frame: int
@@ -33,19 +29,11 @@ class DecisionRecord:
 
 @dataclass
 class DecisionLog:
-    """Writes the decisions of one route into a folder.
+    """Writes the decisions of one route into an existing folder.
 
     ``decisions.jsonl`` grows by a line each, so that a worker that is killed loses
-    none. ``latency.json`` is a `LatencyTrace` of what they took here, without the
-    first, which warms up.
-
-    Args:
-        folder: Of the route; it is there.
-        model_sha256: Of the model that decides.
-        machine: Where it runs, in words.
-
-    Raises:
-        EvaluationError: Another run wrote there, or nothing can be written.
+    none. ``latency.json`` is a `LatencyTrace` of the measured times without the first,
+    which warms up. Files of another run are refused.
     """
 
     folder: Path
@@ -55,7 +43,7 @@ class DecisionLog:
     _warm: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
-        """Begin the lines; those of another run are not written over."""
+        """Begin the lines; those of another run are not overwritten."""
         path = self.folder / LINES
         try:
             path.touch(exist_ok=False)
@@ -63,7 +51,7 @@ class DecisionLog:
             raise EvaluationError(f"{path}: {error.strerror}") from error
 
     def note(self, decision: DecisionRecord) -> None:
-        """Write one decision; the first of them is no sample of the trace."""
+        """Write one decision; the first one is no sample of the trace."""
         if self._warm:
             self.samples_us.append(decision.measured_us)
         self._warm = True
@@ -71,11 +59,7 @@ class DecisionLog:
             lines.write(json.dumps(asdict(decision)) + "\n")
 
     def write_trace(self) -> None:
-        """Write the trace, where there is a sample.
-
-        Raises:
-            EvaluationError: It cannot be written.
-        """
+        """Write the trace, if there is a sample."""
         if self.samples_us:
             samples = tuple(self.samples_us)
             trace = LatencyTrace(self.model_sha256, self.machine, samples)

@@ -1,4 +1,4 @@
-"""An agent of the leaderboard by composition: no base class is needed to define one."""
+"""Leaderboard agents by composition, defined without their base class."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,17 +7,12 @@ from me2e_compress.agents.carla_interface import CarlaControl
 
 
 class ForwardingAgent:
-    """Answers for the agent that it holds.
+    """Forwards to the agent that it holds.
 
-    Whatever is not defined here is that agent's own: ``track``, ``sensor_interface``,
-    ``hero_actor``, ``get_metric_info``, ``step``, ``metric_info``, ``save_path``. The
-    leaderboard names the route before `setup`, where that agent is made: the route is
-    kept for it.
-
-    Args:
-        carla_host: Of the simulator's server.
-        carla_port: Of the simulator's server.
-        debug: The leaderboard's own option.
+    Attributes that are not defined here are that agent's: ``track``,
+    ``sensor_interface``, ``hero_actor``, ``get_metric_info``, ``step``,
+    ``metric_info``, ``save_path``. The leaderboard names the route before it calls
+    `setup`, which makes that agent, so the route is kept for it.
     """
 
     _inner: Any = None
@@ -27,14 +22,13 @@ class ForwardingAgent:
         self._route: tuple[Any, Any] | None = None
 
     def adopt(self, make: Callable[[str, int, bool], Any]) -> None:
-        """Make the agent to answer for, and name it the route."""
+        """Make the inner agent, and pass the route on to it."""
         inner = make(*self._made_with)
         if self._route is not None:
             inner.set_global_plan(*self._route)
         self._inner = inner
 
     def __getattr__(self, name: str) -> Any:
-        """Return what the agent has under this name."""
         if self._inner is None:
             raise AttributeError(f"{type(self).__name__} has no {name} before setup")
         return getattr(self._inner, name)
@@ -53,7 +47,7 @@ class ForwardingAgent:
     def set_global_plan(
         self, global_plan_gps: Any, global_plan_world_coord: Any
     ) -> None:
-        """Name the route, as GPS positions and as places of the world."""
+        """Keep the route, as GPS positions and as positions in the world."""
         if self._inner is None:
             self._route = global_plan_gps, global_plan_world_coord
         else:
@@ -61,5 +55,5 @@ class ForwardingAgent:
 
     @staticmethod
     def get_ros_version() -> int:
-        """Say that it is no agent of ROS."""
+        """Return -1: this is no agent of ROS."""
         return -1

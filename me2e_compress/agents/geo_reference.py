@@ -7,32 +7,21 @@ from typing import Self
 EARTH_M = 6378137.0
 """Equatorial radius in CARLA's GeoLocation.cpp."""
 STEPS = 8
-"""Of Newton's method; places of a town take three."""
+"""Iterations of Newton's method; places in a town take three."""
 
 
 @dataclass(frozen=True, slots=True)
 class GeoReference:
-    """The geographic origin of a CARLA map, whose projection is Mercator's.
-
-    Args:
-        latitude: Degrees.
-        longitude: Degrees.
-    """
+    """The geographic origin of a CARLA map in degrees; maps are Mercator's."""
 
     latitude: float
     longitude: float
 
     @classmethod
     def through(cls, latitude: float, longitude: float, x: float, y: float) -> Self:
-        """Find the origin from one place that is known in both ways.
+        """Find the origin from a place in degrees and in metres (x east, y north).
 
-        A leaderboard names the route both ways, but not the origin.
-
-        Args:
-            latitude: Of the place, degrees.
-            longitude: Of the place, degrees.
-            x: Metres east.
-            y: Metres north.
+        A leaderboard gives the route in both forms, but not the origin.
         """
         place, origin = math.radians(latitude), math.radians(latitude)
         for _ in range(STEPS):
@@ -43,7 +32,7 @@ class GeoReference:
         return cls(math.degrees(origin), longitude - west)
 
     def metres(self, latitude: float, longitude: float) -> tuple[float, float]:
-        """Return a place as metres east and north of the map's origin."""
+        """Convert a place to metres east and north of the map's origin."""
         origin = math.radians(self.latitude)
         scale = EARTH_M * math.cos(origin)
         north = _mercator(math.radians(latitude)) - _mercator(origin)

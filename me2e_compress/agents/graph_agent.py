@@ -42,21 +42,20 @@ def get_entry_point() -> str:
 
 
 class GraphAgentOptions(AgentOptions):
-    """Which graph drives, and how it sees.
+    """Which graph drives, and its cameras and controller.
 
     Attributes:
         model: The ONNX file.
         adapter: TOML file that adapts it to the contract, or the name of one that
-            ships; None where it keeps it.
-        provider: What runs it, as a text.
-        folder: Where each route's folder with ``metric_info.json`` is made: what the
-            leaderboard is given as SAVE_PATH; None writes none.
+            ships; None if it keeps the contract.
+        provider: Execution provider, as a text.
+        folder: Where each route's folder with ``metric_info.json`` is made: the
+            leaderboard's SAVE_PATH; None writes none.
         width: Columns of CARLA's pictures.
         height: Rows of CARLA's pictures.
         cameras: Six, in the contract's order.
-        origin_m: Where the model's ground frame has its origin, in the ego frame (x
-            forward, y left, z up). The Zoo's models have it at their lidar:
-            -0.39, 0.0, 1.84.
+        origin_m: Origin of the model's ground frame, in the ego frame (x forward, y
+            left, z up). The Zoo's models have it at their lidar: -0.39, 0.0, 1.84.
         jpeg_quality: See `CarlaObserver`.
         pid: Gains and limits of the controller.
     """
@@ -75,12 +74,7 @@ class GraphAgentOptions(AgentOptions):
     pid: PidOptions = PidOptions()
 
     def policy(self) -> OnnxPolicy:
-        """Open the graph, its recurrent state at its first value.
-
-        Raises:
-            EvaluationError: No such file, or it cannot drive.
-            ProviderError: The provider is not there.
-        """
+        """Open the graph, with its recurrent state at its first value."""
         if not self.model.is_file():
             raise EvaluationError(f"model {self.model}: no such file")
         named = self.adapter
@@ -90,10 +84,10 @@ class GraphAgentOptions(AgentOptions):
         return policy
 
     def observer(self, policy: OnnxPolicy) -> CarlaObserver:
-        """Build what makes the observations that this policy takes.
+        """Build the observer for this policy.
 
-        What is padded has the mean colour, which becomes zero, as the pipelines of VAD
-        and UniAD pad after normalisation.
+        Padding has the mean colour, so it becomes zero, as in the pipelines of VAD and
+        UniAD.
         """
         rig = CarlaRig(self.cameras, (self.width, self.height), policy.image_size)
         fill: tuple[int, ...] = (0, 0, 0)
@@ -108,28 +102,24 @@ class GraphAgentOptions(AgentOptions):
 class GraphAgent(ForwardingAgent):
     """Drives a graph: sensors, observation, plan, control; or its controls as they are.
 
-    Its cheap part is ``tick``, as in Bench2DriveZoo's agents; `RealTimeAgent` puts its
-    latency into the drive.
+    Its cheap method is ``tick``, as in Bench2DriveZoo's agents; `RealTimeAgent` adds
+    the latency to the drive.
     """
 
     def setup(self, path_to_conf_file: str) -> None:
-        """Open the graph.
+        """Open the graph that ``FILE.toml+...+save_name`` or ``FILE.onnx+...`` names.
 
-        Args:
-            path_to_conf_file: ``FILE.toml+...+save_name``, see `GraphAgentOptions`; or
-                the graph itself, ``FILE.onnx+...``, at the defaults.
+        The TOML file holds `GraphAgentOptions`; a graph alone takes their defaults.
 
         Raises:
-            EvaluationError: The options or the graph are unusable, or the leaderboard
-                is not on the path.
-            MissingPackageError: CARLA's client is not installed.
-            ProviderError: The provider is not there.
+            EvaluationError: Unusable options or graph, or no leaderboard on the path.
         """
         path, save_name = conf_parts(path_to_conf_file)
         if path.suffix == ".onnx":
             options = GraphAgentOptions(model=path)
         else:
             options = GraphAgentOptions.load(path)
+        # the graph, its observer and its controller
         base = autonomous_agent_class()
         self._policy = options.policy()
         observer = options.observer(self._policy)
@@ -138,6 +128,7 @@ class GraphAgent(ForwardingAgent):
         self._pid = WaypointPid(options.pid)
         self._reader: RouteReader | None = None
         self._began_s: float | None = None
+        # what Bench2Drive's evaluator reads of an agent
         self.step, self.metric_info = -1, dict[int, object]()
         self.save_path: Path | None = None
         if options.folder is not None:
@@ -150,7 +141,7 @@ class GraphAgent(ForwardingAgent):
         return self._specs
 
     def tick(self, input_data: SensorData) -> CarlaReading:
-        """Count the step and follow the route; every frame needs it, decided or not."""
+        """Count the step and follow the route, as every frame must."""
         self.step += 1
         if self._reader is None:
             self._reader = RouteReader(
@@ -159,12 +150,7 @@ class GraphAgent(ForwardingAgent):
         return self._reader.read(input_data)
 
     def run_step(self, input_data: SensorData, timestamp: float) -> CarlaControl:
-        """Return the control that follows from this frame.
-
-        Raises:
-            EvaluationError: The plan is not finite, or a control out of its range.
-            GraphError: A node of the model failed.
-        """
+        """Return this frame's control."""
         reading = self.tick(input_data)
         if self._began_s is None:
             self._began_s = timestamp
@@ -181,7 +167,7 @@ class GraphAgent(ForwardingAgent):
         return carla_control(found.throttle, found.steer, found.brake)
 
     def destroy(self) -> None:
-        """Write ``metric_info.json`` where there is a folder for it."""
+        """Write ``metric_info.json`` if there is a folder for it."""
         if self._inner is not None:
             if self.save_path is not None:
                 self._metrics.write()

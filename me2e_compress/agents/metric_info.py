@@ -1,4 +1,4 @@
-"""``metric_info.json``: how the ego moved, which Bench2Drive's comfort is made of."""
+"""``metric_info.json``: the ego's motion, from which Bench2Drive computes comfort."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,13 +14,10 @@ FILE = "metric_info.json"
 class MetricInfo:
     """Keeps an agent's ``metric_info`` complete: one record a tick, at 20 Hz.
 
-    The agents of Bench2DriveZoo write a record wherever they decide; one that is there
-    is left as it is. An agent whose base class has no ``get_metric_info`` (the official
-    leaderboard's) has none.
-
-    Args:
-        agent: Whose ego moves.
-        folder: Of the route, where the agent has no ``save_path`` of its own.
+    The agents of Bench2DriveZoo write a record whenever they decide; existing records
+    are left as they are. An agent whose base class has no ``get_metric_info`` (the
+    official leaderboard's) gets none. ``folder`` is used if the agent has no
+    ``save_path``.
     """
 
     agent: Any
@@ -29,26 +26,21 @@ class MetricInfo:
 
     @property
     def records(self) -> dict[int, Any]:
-        """By step: the agent's own dictionary, else one kept for it."""
+        """Records by step: the agent's own dictionary, else one kept for it."""
         found = getattr(self.agent, "metric_info", None)
         return found if isinstance(found, dict) else self._own
 
     def note(self, frame: int) -> None:
-        """Add this tick, unless the agent did.
+        """Add a record for this tick, unless the agent did.
 
-        Args:
-            frame: Tick of the route, for an agent that counts no ``step``.
+        ``frame`` is the tick of the route, for an agent that counts no ``step``.
         """
         step = getattr(self.agent, "step", frame)
         if step not in self.records and hasattr(self.agent, "get_metric_info"):
             self.records[step] = self.agent.get_metric_info()
 
     def write(self) -> None:
-        """Write the file, where there is a record.
-
-        Raises:
-            EvaluationError: It cannot be written.
-        """
+        """Write the file, if there is a record."""
         if not self.records:
             return
         own = getattr(self.agent, "save_path", None)

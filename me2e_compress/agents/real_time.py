@@ -1,9 +1,9 @@
 """Equation 4 in a real leaderboard run: a wrapper around any agent.
 
 The leaderboard is left as it is. It waits for ``run_step`` while the world stands
-still, whatever that takes; this agent decides from what it took, or from a latency
-source, in which frame the control acts, exactly as the evaluator of highway-env does
-(`me2e_compress.driving.realtime`).
+still, however long that takes. This agent derives from the measured time, or from a
+latency source, in which frame the control acts, exactly as the evaluator of highway-env
+does (`me2e_compress.driving.realtime`).
 """
 
 import hashlib
@@ -70,16 +70,16 @@ class RealTimeOptions(AgentOptions):
         in_order: See `TraceLatency`.
         scale: See `TraceLatency` and `MeasuredLatency`.
         seed: See `TraceLatency`.
-        tick: The wrapped agent's cheap part, called with the sensors' data in the
-            frames that skip its decision: it follows the route and counts steps. The
-            agents of Bench2DriveZoo call it ``tick``; empty where there is none.
+        tick: The wrapped agent's cheap method, called with the sensors' data in frames
+            that skip its decision: it follows the route and counts steps. The agents of
+            Bench2DriveZoo call it ``tick``; empty if there is none.
         synchronize: ``module:function`` that waits until the GPU is done, such as
-            ``torch.cuda:synchronize``; empty where ``run_step`` returns with its
-            result computed.
+            ``torch.cuda:synchronize``; empty if ``run_step`` returns with its result
+            computed.
         folder: Where each route's folder is made; None takes the agent's own
             ``save_path``.
         model: The file whose digest the trace carries; None takes the agent's file.
-        machine: Where the agent runs, in words; empty for this machine's processor.
+        machine: Description of the machine; empty for this machine's processor.
     """
 
     agent: str
@@ -96,24 +96,20 @@ class RealTimeOptions(AgentOptions):
     machine: str = ""
 
     def source(self) -> LatencySource:
-        """Build the latency source.
-
-        Raises:
-            EvaluationError: No such source, or an option that it refuses.
-        """
+        """Build the latency source."""
         return parse_latency(
             self.latency, in_order=self.in_order, scale=self.scale, seed=self.seed
         )
 
 
 class RealTimeAgent(ForwardingAgent):
-    """Holds every control of the wrapped agent as long as its latency says.
+    """Delays every control of the wrapped agent by its latency.
 
-    In a frame whose decision is skipped the wrapped agent's cheap part alone is called;
-    ``metric_info`` goes on in every frame. The first call warms up: a latency that is
-    measured charges it nothing, and the trace leaves it out. Before the first control
-    acts, the brake is pressed fully. Each frame gets a control of its own, since the
-    leaderboard's ControlLoss changes it in place.
+    In a frame whose decision is skipped only the wrapped agent's cheap method is
+    called; ``metric_info`` goes on in every frame. The first call warms up: a measured
+    latency charges nothing for it, and the trace leaves it out. Before the first
+    control acts, the brake is pressed fully. Each frame gets its own copy of the
+    control, since the leaderboard's ControlLoss changes it in place.
     """
 
     now_ns: Callable[[], int] = staticmethod(time.perf_counter_ns)
@@ -121,10 +117,9 @@ class RealTimeAgent(ForwardingAgent):
     _last_s: float | None = None
 
     def setup(self, path_to_conf_file: str) -> None:
-        """Make the wrapped agent and set it up.
+        """Make the wrapped agent from ``FILE.toml+...+save_name`` and set it up.
 
-        Args:
-            path_to_conf_file: ``FILE.toml+...+save_name``, see `RealTimeOptions`.
+        The file holds `RealTimeOptions`.
 
         Raises:
             EvaluationError: The options, the wrapped agent or the folder are unusable.
@@ -136,6 +131,7 @@ class RealTimeAgent(ForwardingAgent):
         if options.model is not None and not options.model.is_file():
             raise EvaluationError(f"model {options.model}: no such file")
         self._synchronize = function_named(options.synchronize)
+        # the wrapped agent, set up as the leaderboard would
         module = agent_module(options.agent)
         self.adopt(agent_class(module))
         if options.tick and not hasattr(self._inner, options.tick):
@@ -144,11 +140,13 @@ class RealTimeAgent(ForwardingAgent):
                 'part as `tick`, or "" where there is none'
             )
         self._inner.setup("+".join(filter(None, (options.config, save_name))))
+        # what the route's decisions cost
         self._clock: ControlClock[CarlaControl] = control_clock(
             options.latency_model, brake, DT_US
         )
         self._charge = self._clock_of(source, WALL_CLOCK.sub("", save_name))
         self._tick, self._frame, self._began_ns = options.tick, 0, self.now_ns()
+        # where its trace and metrics go
         folder = self._folder(options, save_name)
         self._metrics = MetricInfo(self._inner, folder)
         model = _digest(options.model or Path(str(module.__file__)))
@@ -160,12 +158,10 @@ class RealTimeAgent(ForwardingAgent):
         return specs
 
     def run_step(self, input_data: SensorData, timestamp: float) -> CarlaControl:
-        """Return the control that acts in this frame, a copy of its own.
+        """Return the control that acts in this frame, as a copy.
 
-        Whatever the wrapped agent raises leaves trace and ``metric_info.json`` behind.
-
-        Raises:
-            EvaluationError: The world does not tick at 20 Hz.
+        If the wrapped agent raises, the trace and ``metric_info.json`` are still
+        written. The world must tick at 20 Hz.
         """
         with ExitStack() as failed:
             failed.callback(self._write)
@@ -180,7 +176,7 @@ class RealTimeAgent(ForwardingAgent):
         return copy_of(self._clock.advance())
 
     def destroy(self) -> None:
-        """Write the trace and ``metric_info.json``, then let the wrapped agent go."""
+        """Write the trace and ``metric_info.json``, then destroy the wrapped agent."""
         try:
             self._write()
         finally:
@@ -215,11 +211,7 @@ class RealTimeAgent(ForwardingAgent):
         return DecisionFacts(measured_us, around)
 
     def _clock_of(self, source: LatencySource, route: str) -> Charge:
-        """Return the route's clock; a first decision that is measured here is free.
-
-        Raises:
-            EvaluationError: The source asks for what nobody tells here.
-        """
+        """Return the route's clock; a first decision that is measured here is free."""
         source.on_route(route)(self._facts(0))  # a clock of its own
         charge, warm = source.on_route(route), not source.measures
 
@@ -231,7 +223,7 @@ class RealTimeAgent(ForwardingAgent):
         return charged
 
     def _skip(self, input_data: SensorData) -> None:
-        """Let the wrapped agent see the frame, and count it, without deciding."""
+        """Show the frame to the wrapped agent, and count it, without deciding."""
         before = getattr(self._inner, "step", None)
         if self._tick:
             getattr(self._inner, self._tick)(input_data)
@@ -255,7 +247,7 @@ class RealTimeAgent(ForwardingAgent):
 
 
 def _digest(path: Path) -> str:
-    """Hash a file; a graph with its weights, as `profile` does."""
+    """Hash a file; a graph together with its weights, as `profile` does."""
     if path.suffix == ".onnx":
         return sha256_of(path)
     with path.open("rb") as stream:

@@ -1,4 +1,4 @@
-"""Where the route goes next: the near node and the command of Bench2Drive's agents."""
+"""The next node of a route and its command, as Bench2Drive's agents find them."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -20,8 +20,7 @@ Node = tuple[npt.NDArray[np.float64], int]
 class RouteFollower:
     """Steps along the nodes of a route, never back.
 
-    Args:
-        nodes: (x east, y north, CARLA's RoadOption), at least one.
+    ``nodes`` are (x east, y north, CARLA's RoadOption), at least one.
     """
 
     def __init__(self, nodes: Iterable[tuple[float, float, int]]) -> None:
@@ -33,15 +32,9 @@ class RouteFollower:
     def next(self, x: float, y: float) -> Node:
         """Return the node after the last one reached, and its command.
 
-        Reached is, of the nodes within 4 m and 50 m of route, the farthest away; the
-        last node is never passed.
-
-        Args:
-            x: Of the ego, metres east.
-            y: Of the ego, metres north.
-
-        Returns:
-            (float64 [2] x east, y north; command 0 to 5, as `Observation` numbers it).
+        The farthest node within 4 m of the ego and 50 m of route is reached; the last
+        node is never passed. The ego is at ``x`` metres east, ``y`` north; the result
+        is (float64 [2] x east, y north; command 0 to 5, as `Observation` numbers it).
         """
         places = self._places[self._at :]
         steps = np.hypot(*np.diff(places, axis=0).T)
@@ -56,7 +49,7 @@ class RouteFollower:
 
     @property
     def after_next(self) -> npt.NDArray[np.float64]:
-        """Return the node after the one that `next` told last, float64 [2]."""
+        """The node after the latest result of `next`, float64 [2]."""
         after: npt.NDArray[np.float64] = self._places[self._at :][:3][-1]
         return after
 

@@ -1,4 +1,4 @@
-"""Where other road users are: what a latency that depends on the scene is told."""
+"""Positions of other road users, for latency sources that depend on the scene."""
 
 import math
 from typing import Any
@@ -11,13 +11,10 @@ KINDS = ("vehicle.", "walker.pedestrian.")
 
 
 def agents_around(hero: Any) -> npt.NDArray[np.float64] | None:
-    """Return [N, 2], where other road users are, whatever hides them.
+    """Return positions [N, 2] of other road users, occluded or not.
 
-    Args:
-        hero: The ego's ``carla.Actor``; None where the leaderboard does not give it.
-
-    Returns:
-        Metres in the ego frame, x forward, y left; None without a hero.
+    Metres in the ego frame, x forward, y left; None without ``hero``, the ego's
+    ``carla.Actor``, which not every leaderboard gives.
     """
     if hero is None:
         return None

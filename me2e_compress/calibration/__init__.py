@@ -1,1 +1,1 @@
-"""Calibration: recorded frames, probes, observers, and the ranges that follow."""
+"""Calibration: recorded frames, probes, observers and ranges."""

@@ -1,4 +1,4 @@
-"""Arrays in ``.npz`` files, whose sizes are known before they are read."""
+"""Read arrays from ``.npz`` files, checking their sizes first."""
 
 import dataclasses
 import math
@@ -20,27 +20,20 @@ LARGEST_BYTES = 2 << 30
 
 @dataclasses.dataclass(frozen=True)
 class Declared:
-    """What a file says of one array.
-
-    Attributes:
-        shape: of the array.
-        dtype: of its elements.
-    """
+    """Shape and type of an array, as its file states."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[np.generic]
 
 
 def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared]:
-    """Read what an ``.npz`` says of its arrays, by name, not the arrays.
+    """Read the headers of an ``.npz`` by array name, without the arrays.
 
-    Args:
-        path: the file.
-        what: it should be, for the message.
+    The message calls the expected content ``what``.
 
     Raises:
-        FramesError: the file cannot be read, holds something else, more than
-            `LARGEST_BYTES`, or an array that is not as large as it says.
+        FramesError: the file cannot be read, is larger than `LARGEST_BYTES`, or an
+            array has another size than its header states.
     """
     try:
         check_regular(path)
@@ -50,6 +43,7 @@ def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared
         raise FramesError(f"{path}: not {what} ({reason(error)})") from error
     if len(dict(found)) < len(found):
         raise FramesError(f"{path}: not {what} (an array is there twice)")
+    # A header could claim any size: check before reading.
     total = sum(_bytes(each) for _, each in found)
     if total > LARGEST_BYTES:
         raise FramesError(
@@ -60,15 +54,7 @@ def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared
 
 
 def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
-    """Read every array of an ``.npz``, by name.
-
-    Args:
-        path: the file.
-        what: it should be, for the message.
-
-    Raises:
-        FramesError: as :func:`declared`.
-    """
+    """Read every array of an ``.npz`` by name, after the checks of :func:`declared`."""
     declared(path, what)
     try:
         with path.open("rb") as source, np.load(source, allow_pickle=False) as content:

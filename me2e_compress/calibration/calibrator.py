@@ -1,4 +1,4 @@
-"""Calibration: one streaming pass over the frames, in the memory of inference."""
+"""Calibrate a graph in one streaming pass, in the memory of inference."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -30,18 +30,18 @@ Progress: TypeAlias = Callable[[int, int], None]
 
 @dataclasses.dataclass(frozen=True)
 class Calibrator:
-    """Measures ranges.
+    """Measure the ranges of tensors.
 
     Attributes:
         method: how statistics become ranges, see
             :data:`me2e_compress.calibration.observers.OBSERVERS`.
-        threads: within an operator; 0 for every core.
-        optimize: False runs the nodes as they stand: the ranges are then those of
-            tools that switch onnxruntime's optimizations off, to the bit.
-        checkpoint: a file that holds the progress of a calibration; where it exists,
-            the calibration resumes from it. It is removed at the end. None keeps none.
+        threads: threads within an operator; 0 takes every core.
+        optimize: False runs the nodes as written: the ranges then equal, bit for bit,
+            those of tools that disable onnxruntime's optimizations.
+        checkpoint: file of the progress, from which a calibration resumes; it is
+            removed at the end. None keeps none.
         every: frames between two checkpoints.
-        provider: what runs the model.
+        provider: the execution provider.
     """
 
     method: str = "max-min"
@@ -58,7 +58,7 @@ class Calibrator:
         frames: FrameSource,
         progress: Progress | None = None,
     ) -> Ranges:
-        """Collect statistics and read the ranges off them; see :meth:`collect`."""
+        """Collect statistics and compute ranges; see :meth:`collect`."""
         return Ranges.of(
             self.collect(model, tensors, frames, progress), OBSERVERS.parse(self.method)
         )
@@ -70,26 +70,22 @@ class Calibrator:
         frames: FrameSource,
         progress: Progress | None = None,
     ) -> Statistics:
-        """Run the model over the frames, its own recurrent state fed forward.
+        """Run the model over the frames, its recurrent state fed forward.
 
-        Once; twice where the method needs histograms, whose bins the first pass finds.
-
-        Args:
-            model: the float graph.
-            tensors: which to measure.
-            frames: the recording, or part of it in order.
-            progress: called as ``progress(frames done, frames)``, both passes counted.
+        A method that needs histograms takes a second pass, because the first one finds
+        their bins. ``progress`` is called with frames done and all frames, of both
+        passes.
 
         Raises:
-            FramesError: no frames; one does not fit, or makes a tensor NaN or infinite
-                (the message names tensor and frame); the checkpoint is of another
-                calibration.
+            FramesError: there are no frames; one does not fit, or makes a tensor NaN or
+                infinite; the checkpoint is of another calibration.
             GraphError: onnxruntime cannot run the graph.
             RecipeError: no such method.
         """
         counting = OBSERVERS.parse(self.method).counts
         if not len(frames):
             raise FramesError("no frames to calibrate on")
+        # Without tensors, or an operator's kernel, nothing is run.
         blank = Statistics(
             graph.digest(model),
             frames.fingerprint,
@@ -105,6 +101,7 @@ class Calibrator:
                 f"{reason}; ranges that TensorRT measured are taken by `calibrate"
                 " --import CACHE`, and then by `compress --ranges`"
             )
+        # Extremes first: they decide the bins of the histograms.
         job = _Job(self, model, blank, frames, progress, 2 if counting else 1)
         job.extremes()
         if counting:
@@ -114,7 +111,7 @@ class Calibrator:
 
 
 class _Job:
-    """One calibration under way."""
+    """One running calibration."""
 
     def __init__(
         self,
@@ -130,6 +127,7 @@ class _Job:
         self.frames = frames
         self.progress = progress
         self.total = passes * len(frames)
+        # A checkpoint is valid only for the same calibration.
         key = {
             "model": blank.model,
             "recording": blank.source,
@@ -152,7 +150,7 @@ class _Job:
         )
 
     def extremes(self) -> None:
-        """Measure smallest, largest and mean square of every tensor, by frame."""
+        """Measure minimum, maximum and mean square of every tensor and frame."""
         rows = list(self.seen.measured)
 
         def take(readings: Readings, place: int) -> None:
@@ -163,7 +161,7 @@ class _Job:
         self._pass(Extremes(), 0, take)
 
     def counts(self) -> None:
-        """Count the magnitudes of every tensor, all frames together."""
+        """Count the magnitudes of every tensor over all frames."""
         blank = np.zeros((len(self.seen.tensors), BINS), np.int64)
         total = blank if self.seen.counts is None else self.seen.counts
         self.seen = dataclasses.replace(self.seen, counts=total)
@@ -176,7 +174,7 @@ class _Job:
     def _pass(
         self, probe: Probe, before: int, take: Callable[[Readings, int], None]
     ) -> None:
-        """Run what is left of a pass; ``before`` frames were run by earlier passes."""
+        """Run the rest of a pass; ``before`` frames belong to earlier passes."""
         begin = max(self.begun.done - before, 0)
         if begin >= len(self.frames):
             return
@@ -206,11 +204,7 @@ class _Job:
 
 
 def check_finite(readings: Readings, tensors: Sequence[str], place: int) -> None:
-    """Refuse a NaN or infinite element; a mean square may overflow without harm.
-
-    Raises:
-        FramesError: names the first such tensors and the frame.
-    """
+    """Raise a FramesError for a NaN or infinite element; mean squares may overflow."""
     bad = np.isnan(readings).any(1) | np.isinf(readings[:, :2]).any(1)
     bad &= ~no_element(readings)
     if not bad.any():

@@ -1,9 +1,9 @@
-"""Recorded frames, in scenes: what ranges and fidelity are measured on.
+"""Recorded frames, in scenes, for calibration and fidelity.
 
-A recording is a folder: one ``.npz`` a frame, keyed by input name, in the order of
-their names, and ``scenes.json``: ``{"scenes": [0, 64, ...]}``, the index of the first
+A recording is a folder with one ``.npz`` a frame, keyed by input name and ordered by
+file name, and ``scenes.json``: ``{"scenes": [0, 64, ...]}``, the index of the first
 frame of every scene, and which inputs are pixels (`me2e_compress.calibration.pixels`).
-Beside a frame there may be a ``.future.json``: what really happened next.
+A frame may have a ``.future.json`` beside it: what really happened next.
 """
 
 import hashlib
@@ -28,7 +28,7 @@ from me2e_compress.runtime.recorded_future import RecordedFuture
 from me2e_compress.runtime.recurrence import not_fed_back, recurrent_inputs, sides
 
 FUTURE = ".future.json"
-"""Beside a frame: what really happened next, `RecordedFuture`."""
+"""Suffix of the file beside a frame that holds its `RecordedFuture`."""
 
 T = TypeVar("T", Array, Declared)
 
@@ -38,11 +38,8 @@ __all__ = ["CalibrationSet", "Frame", "synthetic"]
 class CalibrationSet(Displayed):
     """A recording on disk, read frame by frame.
 
-    Args:
-        folder: where the frames are.
-
     Raises:
-        FramesError: no such folder, no frames, or scenes.json is missing or wrong.
+        FramesError: no such folder, no frames, or scenes.json is missing or malformed.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -61,11 +58,11 @@ class CalibrationSet(Displayed):
 
     @property
     def headline(self) -> str:
-        """Folder, frames, scenes."""
+        """The folder and the numbers of frames and scenes."""
         return f"{self.folder}: {len(self)} frames in {len(self.scenes)} scenes"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return a row an input: what the first frame holds of it."""
+        """Return a table with the type and shape of each input in the first frame."""
         arrays = self[0].arrays
         rows = [
             (name, str(each.dtype), str(list(each.shape)))
@@ -74,12 +71,11 @@ class CalibrationSet(Displayed):
         return (table("The first frame", ("input", "type", "shape"), rows, words=3),)
 
     def __len__(self) -> int:
-        """Count the frames."""
         return len(self.files)
 
     @property
     def places(self) -> range:
-        """Indices of the frames in the recording: all of them, in order."""
+        """Indices of all frames."""
         return range(len(self.files))
 
     def __iter__(self) -> Iterator[Frame]:
@@ -87,12 +83,7 @@ class CalibrationSet(Displayed):
         return (self[index] for index in range(len(self)))
 
     def __getitem__(self, index: int) -> Frame:
-        """Read one frame; its pixels are normalised.
-
-        Raises:
-            FramesError: the file cannot be read as arrays, its pixels are none, or
-                what happened next is malformed.
-        """
+        """Read one frame and normalise its pixels."""
         path = self.files[index]
         arrays = self._as_fed(path, load_arrays(path), PixelInput.normalised)
         return Frame(index, index in self.scenes, arrays, future=_future(path))
@@ -100,7 +91,7 @@ class CalibrationSet(Displayed):
     def _as_fed(
         self, path: Path, held: Mapping[str, T], turn: Callable[[PixelInput, T], T]
     ) -> dict[str, T]:
-        """Turn what is pixels of a frame into what is fed."""
+        """Convert the pixel inputs of a frame to what is fed."""
         ready = dict(held)
         for name, pixels in self.pixels.items():
             try:
@@ -114,8 +105,8 @@ class CalibrationSet(Displayed):
     def fingerprint(self) -> str:
         """A digest that changes with the content, the order or the scenes.
 
-        Read from the checksums that every .npz carries (CRC-32 and size of each
-        array), so that hundreds of frames take a moment, not the time to read them.
+        It uses the checksums in every .npz (CRC-32 and size of each array), so that the
+        arrays need not be read.
         """
         seal = hashlib.blake2b(digest_size=16)
         seal.update(repr(self.scenes).encode())
@@ -137,13 +128,13 @@ class CalibrationSet(Displayed):
     def check(self, model: ir.Model) -> None:
         """Read every frame once and check it against a model's inputs.
 
-        Recurrent inputs may be absent; names that the model lacks are an error, but
-        for those that ``static-geometry`` made constants of it: they must be the same.
+        Recurrent inputs may be absent. Names that the model lacks are an error, except
+        those that ``static-geometry`` made constants of it: their values must be the
+        same.
 
         Raises:
-            FramesError: on the first array that is missing, unknown, of another
-                shape or dtype, or not finite: its file, its name, what was found and
-                what is expected.
+            FramesError: the first array that is missing, unknown, of another shape or
+                dtype, or not finite.
         """
         fixed = static_inputs(model)
         for path in self.files:
@@ -157,16 +148,7 @@ class CalibrationSet(Displayed):
 
 
 def _check_frame(frame: Mapping[str, Declared], model: ir.Model, source: str) -> None:
-    """Check names, dtypes and shapes, before an array is read.
-
-    Args:
-        frame: what its file says of it.
-        model: whose inputs it must fit; recurrent inputs may be absent.
-        source: what the message calls the frame, e.g. its file.
-
-    Raises:
-        FramesError: names the frame and the input, what was found, what is expected.
-    """
+    """Check names, dtypes and shapes before arrays are read."""
     ports = {str(value.name): value for value in model.graph.inputs}
     optional = recurrent_inputs(model)
     for name, value in ports.items():
@@ -209,25 +191,18 @@ def _fits(found: tuple[int, ...], expected: ir.Shape) -> bool:
 
 
 def synthetic(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
-    """Draw seeded inputs where there is no recording: one scene of ``count`` frames.
+    """Draw random inputs for a model: one scene of ``count`` frames.
 
-    Floats are standard normal, integers 0 or 1, booleans either. They prove that two
-    graphs compute the same; they are not what a model sees, so nothing is calibrated
-    on them. Recurrent inputs are left to the replay.
-
-    Args:
-        model: whose inputs.
-        seed: same seed, same frames.
-        count: how many frames.
-
-    Returns:
-        The frames, made one by one.
+    Floats are standard normal, integers and booleans 0 or 1. They show that two graphs
+    compute the same, but differ from real inputs, so nothing is calibrated on them.
+    Recurrent inputs are left to the replay.
 
     Raises:
         PreconditionError: an input has an open shape or a type that cannot be drawn.
     """
     open_state = recurrent_inputs(model)
     ports = [value for value in model.graph.inputs if value.name not in open_state]
+    # Refuse inputs that cannot be drawn before any frame is.
     for value in ports:
         if static_shape(value) is None or value.dtype is None:
             raise PreconditionError(
@@ -254,7 +229,7 @@ def _draw(value: ir.Value, generator: np.random.Generator) -> Array:
 
 
 def _future(frame: Path) -> RecordedFuture | None:
-    """Read what happened after a frame; None where nobody recorded it."""
+    """Read the recorded future of a frame; None where there is none."""
     path = frame.with_suffix(FUTURE)
     if not path.is_file():
         return None
@@ -264,7 +239,7 @@ def _future(frame: Path) -> RecordedFuture | None:
 
 
 def _index(path: Path) -> dict[str, Any]:
-    """Read what a recording says of itself."""
+    """Read the index of a recording."""
     if not path.is_file():
         raise FramesError(
             f'{path}: missing; {{"scenes": [0]}} if the frames are one scene'
@@ -287,7 +262,7 @@ def _pixels(path: Path, index: Mapping[str, object]) -> PixelInputs:
 
 
 def _scenes(path: Path, index: Mapping[str, object], count: int) -> tuple[int, ...]:
-    """Read where scenes begin."""
+    """Read and check where scenes begin."""
     starts = index.get("scenes")
     if not isinstance(starts, list) or not all(type(at) is int for at in starts):
         raise FramesError(f'{path}: must hold {{"scenes": [0, ...]}}')

@@ -1,6 +1,6 @@
-"""Ranges of other tools, written and read: TensorRT's cache, onnxruntime's table.
+"""Exchange ranges with other tools: TensorRT's cache, onnxruntime's table.
 
-Both know one number a tensor, so what comes back is symmetric: [-reach, reach].
+Both store one number per tensor, so imported ranges are symmetric: [-reach, reach].
 """
 
 import re
@@ -21,20 +21,20 @@ from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes
 
 TABLE_FILES = ("calibration.flatbuffers", "calibration.json", "calibration.cache")
-"""What an onnxruntime table is made of, in a folder."""
+"""Files of an onnxruntime table."""
 
 _MIN_MAX, _ENTROPY = "MinMaxCalibration", "EntropyCalibration2"
 _HEAD = re.compile(r"TRT-\d+-(\w+)")
 
 _VERSION = "TRT-101000"
-"""What the cache claims to be written by; TensorRT 10 reads caches of this form."""
+"""Version in the head of a written cache; TensorRT 10 reads caches of this form."""
 
 
 def write_tensorrt_cache(ranges: Ranges, path: Path) -> None:
-    """Write a TensorRT calibration cache: a line ``name: scale`` for every tensor.
+    """Write a TensorRT calibration cache with a line ``name: scale`` for every tensor.
 
     The scale, reach / 127, is a float32 in big-endian hexadecimal. The head names the
-    calibrator whose cache it is: that of an imported one, if it said which.
+    calibrator: that of an imported cache, if it is known.
     """
     extremes = ranges.method in (MaxMin.name, IMPORTED)
     kind = ranges.calibrator or (_MIN_MAX if extremes else _ENTROPY)
@@ -49,8 +49,9 @@ def write_tensorrt_cache(ranges: Ranges, path: Path) -> None:
 def write_onnxruntime_table(ranges: Ranges, folder: Path) -> None:
     """Write onnxruntime's calibration table into a folder, as its own tool does.
 
-    That is ``calibration.flatbuffers``, which its TensorRT provider reads, and the
-    same as ``calibration.json`` and, a line ``name reach`` each, ``calibration.cache``.
+    That is ``calibration.flatbuffers``, which its TensorRT provider reads, and the same
+    as ``calibration.json`` and ``calibration.cache`` (a line ``name reach`` per
+    tensor).
     """
     table = {name: _entry(*bounds) for name, bounds in ranges.tensors.items()}
     folder.mkdir(parents=True, exist_ok=True)
@@ -63,16 +64,11 @@ def write_onnxruntime_table(ranges: Ranges, folder: Path) -> None:
 def read_foreign(path: Path, model: str, tensors: tuple[str, ...]) -> Ranges:
     """Read a TensorRT cache, or the ``calibration.cache`` of an onnxruntime table.
 
-    Neither says of which model it is: it counts as that of ``model`` if it has every
-    tensor that is needed.
-
-    Args:
-        path: the file.
-        model: digest of the graph that is to be quantized.
-        tensors: what it needs a range of.
+    Neither names its model: it is accepted for ``model``, the digest of the graph to be
+    quantized, if it has all ``tensors``.
 
     Raises:
-        FramesError: no such file, a line that cannot be read, or a tensor is missing.
+        FramesError: no such file, a malformed line, or a tensor is missing.
     """
     if not path.is_file():
         raise FramesError(f"{path}: no such calibration cache")
@@ -80,6 +76,7 @@ def read_foreign(path: Path, model: str, tensors: tuple[str, ...]) -> Ranges:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
         raise FramesError(f"{path}: not a calibration cache ({error})") from error
+    # The head tells the two formats apart.
     head = _HEAD.fullmatch(lines[0]) if lines else None
     if lines and lines[0].startswith("TRT-"):
         reach = _parse(path, lines, 1, ": ", _hexadecimal)
@@ -123,6 +120,6 @@ def _needed(
 
 
 def _entry(low: float, high: float) -> TensorData:
-    """Return symmetric bounds: the table keeps the larger number, not the magnitude."""
+    """Return symmetric bounds: the table keeps the larger bound, not the magnitude."""
     reach = np.array(max(abs(low), abs(high)), np.float32)
     return TensorData(lowest=-reach, highest=reach)

@@ -1,4 +1,4 @@
-"""Mean values over a recording: the constants that substitute an ablated module."""
+"""Mean values over a recording: constants that replace an ablated module."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -25,24 +25,15 @@ def token_means(
 ) -> dict[str, Array]:
     """Average values over a recording, element by element, in one streaming pass.
 
-    The model runs as it stands, its recurrent state fed forward and reset at the start
-    of a scene. A float is its mean; a boolean what it mostly is, True in a draw; an
-    integer its most frequent value, the smallest in a draw.
-
-    Args:
-        model: the graph; it stays as it is.
-        frames: the recording.
-        values: names of values anywhere in the main graph.
-        threads: within an operator; 0 for every core.
-        provider: what runs the model.
-
-    Returns:
-        One array a value, of its own shape and type.
+    The model runs as it is, its recurrent state fed forward and reset at the start of a
+    scene. ``values`` are names in the main graph; means keep their shape and type.
+    Floats give their mean, booleans the majority (True in a tie), and integers the most
+    frequent value (the smallest in a tie).
 
     Raises:
         GraphError: no such value, or onnxruntime cannot run the graph.
         FramesError: a frame does not fit, changes the shape of a value, or makes it
-            NaN or infinite; the message names the value and the frame.
+            NaN or infinite.
     """
     if not values:
         return {}
@@ -55,11 +46,7 @@ def token_means(
 
 
 def load_means(path: Path, values: Sequence[str]) -> dict[str, Array]:
-    """Read means from an ``.npz`` keyed by value name.
-
-    Raises:
-        FramesError: the file is missing or no ``.npz``, or lacks one of the values.
-    """
+    """Read means from an ``.npz`` keyed by value name."""
     found = load_arrays(path)
     if missing := [name for name in values if name not in found]:
         raise FramesError(
@@ -84,10 +71,9 @@ def _exposed(model: ir.Model, values: Sequence[str]) -> ir.Model:
 
 @dataclasses.dataclass
 class _Average:
-    """One value, frame by frame.
+    """Running average of one value.
 
-    Floats and booleans are a running sum in float64; integers are few (indices), so
-    they are kept as they come.
+    Floats and booleans are summed in float64; integers are few (indices) and are kept.
     """
 
     name: str
@@ -105,6 +91,7 @@ class _Average:
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             kind = "NaN" if np.isnan(value).any() else "infinite"
             raise FramesError(f"frame {index} makes {self.name} {kind}: it has no mean")
+        # Integers need all values for their mode.
         self.like, self.count = value, self.count + 1
         if value.dtype.kind in "iu":
             self.kept.append(value)

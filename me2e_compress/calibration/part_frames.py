@@ -1,4 +1,4 @@
-"""What one file of a stack is fed, frame by frame, while the whole stack runs."""
+"""Compute the inputs of one file of a stack, frame by frame."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,20 +16,12 @@ from me2e_compress.runtime.stack.stack_session import StackSession
 
 
 class PartFrames:
-    """The frames of one file: made as they are asked for, by the files that feed it.
+    """The frames of one file, computed on demand by the files that feed it.
 
-    Only those files run; nothing is kept but the state. A file for first frames has
-    the first frame of every scene, each a scene of its own; the other file of that
-    part has the rest, whose scenes begin one frame later.
-
-    Args:
-        stack: the whole.
-        label: of the file.
-        whole: the recording of the stack.
-        provider: what runs the other files.
-
-    Raises:
-        FramesError: there is no frame at which the file runs.
+    Only those files run; only the state is kept. A file for first frames has the first
+    frame of every scene, each a scene of its own; the other file of that part has the
+    rest, whose scenes begin one frame later. A file that runs at no frame is a
+    FramesError.
     """
 
     def __init__(
@@ -57,18 +49,18 @@ class PartFrames:
 
     @property
     def fingerprint(self) -> str:
-        """That of the whole recording, and which file of which stack it is."""
+        """The fingerprint of the whole recording, the stack and the file."""
         return part_fingerprint(self._stack, self._file.label, self._whole)
 
     @property
     def places(self) -> Sequence[int]:
-        """Places of these frames in the whole recording."""
+        """Indices of these frames in the whole recording."""
         places = self._whole.places
         return tuple(places[at] for at in self._rows)
 
     @property
     def scenes(self) -> Sequence[int]:
-        """Indices of those of these frames that begin a scene."""
+        """Positions among these frames where a scene begins."""
         return self._scenes
 
     @cached_property
@@ -81,20 +73,14 @@ class PartFrames:
         )
 
     def __len__(self) -> int:
-        """Count the frames."""
         return len(self._rows)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Make the frames in order, one in memory at a time."""
+        """Compute the frames in order, one in memory at a time."""
         return (self[index] for index in range(len(self)))
 
     def __getitem__(self, index: int) -> Frame:
-        """Make one frame; going on from the one before takes the least work.
-
-        Raises:
-            FramesError: a frame does not fit the stack.
-            GraphError: a node of another file failed.
-        """
+        """Compute one frame; continuing from the previous one is cheapest."""
         row = self._rows[index]
         opens = max(at for at in self._openings if at <= row)
         begin = self._next if opens < self._next <= row else opens
@@ -104,7 +90,7 @@ class PartFrames:
         return Frame(self.places[index], index in self.scenes, detached(fed))
 
     def _step(self, at: int) -> Mapping[str, Array]:
-        """Run one frame; return what the file was fed, of nothing if it did not run."""
+        """Run one frame; return the inputs of the file, empty if it did not run."""
         frame, fed = self._whole[at], dict[str, Array]()
         if frame.starts_scene:
             self._state = self._session.first_state(frame.arrays)
@@ -116,6 +102,7 @@ class PartFrames:
                 fed = dict(run.feeds)
             part = self._stack.files[run.label].part
             answers |= {(part, name): value for name, value in run.values.items()}
+        # Keep the state that was computed; other state is not needed.
         known = self._stack.answers
         self._state = {
             name: answers[known[output]]
@@ -127,7 +114,7 @@ class PartFrames:
 
     @cached_property
     def _needed(self) -> frozenset[str]:
-        """The parts that feed the file, by edges or by the state."""
+        """The parts that feed the file, through edges or the state."""
         found, waiting = set[str](), [self._file.part]
         while waiting:
             for each in self._feeding(waiting.pop()):
@@ -159,13 +146,13 @@ class PartFrames:
 
 
 def part_fingerprint(stack: SplitStack, label: str, whole: Recording) -> str:
-    """Return what identifies the frames of one file of a stack."""
+    """Return the fingerprint of the frames of one file of a stack."""
     return f"{whole.fingerprint} {label} {stack.sha256()}"
 
 
 @dataclasses.dataclass(frozen=True)
 class _FedOnly:
-    """A file that is fed and never run."""
+    """Session of a file that is fed but never run."""
 
     inputs: Mapping[str, SessionPort]
     provider: Provider

@@ -1,10 +1,10 @@
 """Images in recordings: bytes on disk, normalised when they are fed.
 
 A frame of six 1600 x 928 images has 107 MB as float32 and 27 MB as bytes. A recording
-says in ``scenes.json`` which inputs are kept so, in how it is fed:
-``{"pixels": {"version": 1, "inputs": {"img": {"mean": ..., "std": ..., ...}}}}``. What
-is not named there is fed as it stands. A reader that does not know the key refuses the
-bytes, since they are not the type and shape that the model takes.
+lists the inputs stored as bytes in ``scenes.json``:
+``{"pixels": {"version": 1, "inputs": {"img": {"mean": ..., "std": ..., ...}}}}``.
+Other inputs are fed unchanged. A reader that does not know the key refuses the bytes,
+since their type and shape do not fit the model.
 """
 
 from collections.abc import Mapping
@@ -24,18 +24,18 @@ CHANNELS = 3
 
 
 class PixelInput(BaseModel):
-    """An image input that is kept as bytes: (pixel - mean) / std, padded with zeros.
+    """An image input stored as bytes: (pixel - mean) / std, padded with zeros.
 
     On disk it is uint8 [..., 3, h, w], its planes in the order of the model; fed it is
     float32 [..., 3, rows, columns], zero below and to the right of the picture, as
     mmdetection pads after it normalises.
 
     Attributes:
-        mean: in grey levels 0 to 255, plane by plane.
-        std: the same.
-        order: of the planes: red first or blue first.
-        rows: of the input.
-        columns: of the input.
+        mean: in grey levels 0 to 255, for each plane.
+        std: in grey levels, for each plane.
+        order: order of the planes: red first or blue first.
+        rows: rows of the input.
+        columns: columns of the input.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -47,7 +47,7 @@ class PixelInput(BaseModel):
     columns: PositiveInt
 
     def fed(self, stored: Declared) -> Declared:
-        """Return what an input on disk is when it is fed.
+        """Return shape and type of a stored input when it is fed.
 
         Raises:
             ValueError: it is not bytes, has not three planes, or is too large.
@@ -67,11 +67,7 @@ class PixelInput(BaseModel):
         return Declared(shape, np.dtype(np.float32))
 
     def normalised(self, stored: Array) -> npt.NDArray[np.float32]:
-        """Return the input, float32 [..., 3, rows, columns].
-
-        Raises:
-            ValueError: see :meth:`fed`.
-        """
+        """Return the input, float32 [..., 3, rows, columns]; errors as :meth:`fed`."""
         shape = self.fed(Declared(stored.shape, stored.dtype)).shape
         height, width = stored.shape[-2:]
         ready = np.zeros(shape, np.float32)
@@ -83,11 +79,11 @@ class PixelInput(BaseModel):
 
 
 class PixelInputs(BaseModel):
-    """What ``scenes.json`` says under ``pixels``.
+    """The entry ``pixels`` of ``scenes.json``.
 
     Attributes:
-        version: of this format; a later one is refused, not guessed.
-        inputs: by name, those that are kept as bytes.
+        version: version of this format; later ones are refused.
+        inputs: the inputs stored as bytes, by name.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -97,10 +93,6 @@ class PixelInputs(BaseModel):
 
     @classmethod
     def of(cls, index: Mapping[str, object]) -> Self:
-        """Read it from the content of ``scenes.json``; recordings before it have none.
-
-        Raises:
-            ValidationError: it is malformed, or of a later version.
-        """
+        """Read the entry from the content of ``scenes.json``; old ones have none."""
         found = index.get("pixels")
         return cls() if found is None else cls.model_validate(found)

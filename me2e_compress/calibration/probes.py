@@ -1,4 +1,4 @@
-"""Probes: what is measured of a tensor, as nodes of its own graph."""
+"""Probes measure a tensor by nodes that are added to its graph."""
 
 import dataclasses
 from typing import Protocol, TypeAlias
@@ -11,15 +11,15 @@ from me2e_compress import rewrite
 from me2e_compress.calibration.statistics import BINS
 
 Reading: TypeAlias = tuple[list[ir.Node], list[ir.Value]]
-"""Nodes that measure a tensor, in order, and the 1-D values that they end in."""
+"""Nodes that measure a tensor, in order, and the 1-D values that they produce."""
 
 
 class Probe(Protocol):
-    """Measures tensors by nodes that stand behind them."""
+    """Measures tensors by nodes inserted after them."""
 
     @property
     def width(self) -> int:
-        """Count of the numbers that are read of a tensor."""
+        """Number of values read per tensor."""
         ...
 
     def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
@@ -31,7 +31,7 @@ class Probe(Protocol):
 class Extremes:
     """Smallest element, largest element, mean square.
 
-    The mean square tells a tensor whose range a few elements make. It also finds every
+    The mean square shows where few elements determine the range. It also finds every
     NaN, which onnxruntime's ReduceMin and ReduceMax overlook unless it comes first.
     A tensor without elements gives infinity, minus infinity and 0.
     """
@@ -39,13 +39,14 @@ class Extremes:
     width: int = 3
 
     def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
-        """Reduce the whole tensor three times."""
+        """Build three reductions of the whole tensor."""
         one = _shared(where, np.array([1], np.int64), "one")
         least = _shared(where, np.array(1, np.float32), "least")
         low, high, total = (
             ir.node(op, [value], {"keepdims": 0})
             for op in ("ReduceMin", "ReduceMax", "ReduceSumSquare")
         )
+        # Divide by at least 1: a tensor may be empty.
         size = ir.node("Size", [value])
         count = _cast(size.outputs[0], ir.DataType.FLOAT)
         some = ir.node("Max", [count.outputs[0], least])
@@ -62,7 +63,7 @@ class Counts:
     """A histogram of magnitudes.
 
     Attributes:
-        exponents: int64 [tensors]: the bins of a tensor share [0, 2^exponent).
+        exponents: int64 [tensors]: the bins of a tensor divide [0, 2^exponent).
         width: the number of bins.
     """
 
@@ -70,16 +71,17 @@ class Counts:
     width: int = BINS
 
     def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
-        """Number the bins, and count the numbers as a text's words are counted.
+        """Compute bin numbers, and count them as a text's words are counted.
 
-        TfidfVectorizer is the one standard operator that counts integers: exact, of
-        every opset from 9 on, without a second array as large as the tensor. Scaling
-        by a power of two is exact, so shards agree on the bin of every element.
+        TfidfVectorizer is the one standard operator that counts integers: exact,
+        available from opset 9 on, without a second array as large as the tensor.
+        Scaling by a power of two is exact, so shards agree on the bin of every element.
         """
         bins_per_unit = np.ldexp(np.float32(BINS), -self.exponents[at])
         factor = _shared(where, np.asarray(bins_per_unit, np.float32), f"factor_{at}")
         last = _shared(where, np.array(BINS - 1, np.float32), "last_bin")
         row = _shared(where, np.array([-1], np.int64), "row")
+        # Number the bins; the last one takes what lies beyond.
         magnitude = ir.node("Abs", [value])
         scaled = ir.node("Mul", [magnitude.outputs[0], factor])
         capped = ir.node("Min", [scaled.outputs[0], last])
@@ -104,7 +106,7 @@ def _cast(value: ir.Value, to: ir.DataType) -> ir.Node:
 
 
 def _shared(where: ir.Graph, array: npt.NDArray[np.generic], name: str) -> ir.Value:
-    """Return a constant of the probes, made where it is first asked for."""
+    """Return a constant of the probes, created at its first use."""
     name = f"me2e_probe_{name}"
     known = where.initializers.get(name)
     return known if known is not None else rewrite.add_constant(where, array, name)

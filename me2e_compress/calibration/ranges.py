@@ -1,4 +1,4 @@
-"""Ranges of tensors, and the graph and frames that they were measured on."""
+"""Ranges of tensors, with the graph and frames they were measured on."""
 
 import dataclasses
 from pathlib import Path
@@ -15,7 +15,7 @@ from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_json
 
 OUTLIER_CREST = 64
-"""Largest magnitude over root mean square (crest factor) beyond which a tensor is
+"""Crest factor (largest magnitude over root mean square) from which a tensor is
 reported: its int8 step then exceeds half its root mean square, so that most elements
 round to 0, 1 or 2 steps."""
 
@@ -23,7 +23,7 @@ LARGEST = float(np.finfo(np.float32).max)
 """The largest bound of a range: elements are float32."""
 
 IMPORTED = "imported"
-"""Method of ranges that another tool measured; on which frames, is not known."""
+"""Method of ranges measured by another tool, on unknown frames."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -31,15 +31,14 @@ class Ranges(Displayed):
     """The range of every calibrated tensor.
 
     Attributes:
-        tensors: (low, high) bounds of the range, by tensor name.
-        method: how statistics became ranges, e.g. ``max-min`` or ``percentile:99.9``.
-        frames: how many frames were seen.
+        tensors: (low, high) bounds by tensor name.
+        method: observer with options, e.g. ``max-min`` or ``percentile:99.9``.
+        frames: number of frames.
         model: digest of the graph they were measured on.
         source: fingerprint of the recording.
-        outliers: crest factor of each tensor whose range a few elements make, see
+        outliers: crest factors of tensors whose range is due to few elements, see
             :data:`OUTLIER_CREST`.
-        calibrator: of TensorRT, that made the cache they were imported from; empty if
-            none did.
+        calibrator: TensorRT's calibrator of an imported cache; else empty.
     """
 
     tensors: dict[str, tuple[float, float]]
@@ -52,7 +51,7 @@ class Ranges(Displayed):
 
     @classmethod
     def of(cls, seen: Statistics, method: Observer) -> Self:
-        """Read ranges off what a calibration saw.
+        """Compute ranges from the statistics of a calibration.
 
         Raises:
             FramesError: the method needs histograms, and none were collected.
@@ -70,14 +69,14 @@ class Ranges(Displayed):
 
     @property
     def headline(self) -> str:
-        """Tensors, method, frames."""
+        """The number of tensors, the method and the number of frames."""
         return (
             f"{counted(len(self.tensors), 'tensor')}, {self.method},"
             f" {counted(self.frames, 'frame')}"
         )
 
     def tables(self) -> tuple[Table, ...]:
-        """Return a row a tensor: its bounds."""
+        """Return a table of the bounds of each tensor."""
         rows = [
             (name, f"{low:.4g}", f"{high:.4g}")
             for name, (low, high) in self.tensors.items()
@@ -90,7 +89,7 @@ class Ranges(Displayed):
         return tuple(name for name, each in self.tensors.items() if each == (0.0, 0.0))
 
     def save(self, path: Path) -> None:
-        """Write JSON, all or nothing."""
+        """Write JSON atomically."""
         write_json(path, dataclasses.asdict(self), indent=1)
 
     @classmethod
@@ -98,8 +97,8 @@ class Ranges(Displayed):
         """Read what :meth:`save` wrote.
 
         Raises:
-            FramesError: no such file, or not saved ranges: a bound that is not a
-                float32 number, or a low one above the high one.
+            FramesError: no such file, or a bound is not a float32 number or the low one
+                is above the high one.
         """
         if not path.is_file():
             raise FramesError(f"{path}: no such ranges file")
@@ -120,7 +119,7 @@ class Ranges(Displayed):
         return found
 
     def hold_for(self, model: str, tensors: tuple[str, ...], method: str) -> bool:
-        """Whether they are of this graph and method, and of all these tensors."""
+        """Return whether they fit this graph and method and have all these tensors."""
         asked = OBSERVERS.text(OBSERVERS.parse(method), defaults=True)
         known = self.model == model and self.method == asked
         return known and all(name in self.tensors for name in tensors)
@@ -133,17 +132,14 @@ class Ranges(Displayed):
         method: str,
         source: str | None = None,
     ) -> None:
-        """Check that ranges are of this graph, tensor list, method and recording.
+        """Check that ranges fit this graph, tensor list, method and recording.
 
-        Args:
-            model: digest of the graph that is to be quantized.
-            tensors: what it needs a range of.
-            method: what was asked for.
-            source: fingerprint of the frames at hand; None if there are none.
-                Imported ranges fit any method and frames.
+        ``model`` is the digest of the graph to be quantized, ``source`` the fingerprint
+        of the frames, None if there are none. Imported ranges fit any method and
+        frames.
 
         Raises:
-            FramesError: names what is stale, and what to do.
+            FramesError: something is stale; the message says what to do.
             RecipeError: no such method.
         """
         again = "calibrate the graph that is being quantized again"
@@ -152,6 +148,7 @@ class Ranges(Displayed):
                 f"ranges are stale: of graph {self.model[:12]}, not {model[:12]};"
                 f" {again}"
             )
+        # Imported ranges pass for any method and recording.
         asked = method
         if not method == self.method == IMPORTED:
             asked = OBSERVERS.text(OBSERVERS.parse(method), defaults=True)
@@ -171,7 +168,7 @@ class Ranges(Displayed):
 
 
 def _outliers(seen: Statistics) -> dict[str, float]:
-    """Return the crest factors that are too large, each to three digits."""
+    """Return the crest factors above the limit, rounded to three digits."""
     if not seen.tensors:
         return {}
     root = np.sqrt(seen.mean_squares.astype(np.float64).mean(axis=0))

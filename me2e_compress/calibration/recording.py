@@ -1,4 +1,4 @@
-"""Write a recording: a folder of frames, whole or not there."""
+"""Write a recording, a folder of frames, atomically."""
 
 import dataclasses
 import json
@@ -25,12 +25,12 @@ PROGRESS = "progress.json"
 
 @dataclasses.dataclass(frozen=True)
 class Begin:
-    """Where a recording goes on.
+    """Where a recording resumes.
 
     Attributes:
-        frame: the first frame that is missing; a scene begins there.
-        place: of that scene among those that its source tries, some of which may give
-            no frame.
+        frame: the first missing frame; a scene begins there.
+        place: number of that scene among those that its source tries; some may give no
+            frame.
     """
 
     frame: int = 0
@@ -38,7 +38,7 @@ class Begin:
 
 
 Source: TypeAlias = Callable[[Begin], Iterable[Frame]]
-"""Makes the frames from the beginning of a scene on."""
+"""Yields the frames from the beginning of a scene on."""
 
 
 def write_recording(
@@ -48,29 +48,27 @@ def write_recording(
     key: str = "",
     pixels: Mapping[str, PixelInput] | None = None,
 ) -> Path:
-    """Write a folder that `CalibrationSet` reads, all or nothing.
+    """Write a folder that `CalibrationSet` reads, atomically.
 
-    One ``000000.npz`` a frame, keyed by input name, ``000000.future.json`` where it is
-    known what happened next, and ``scenes.json``, which says where scenes begin. A
-    folder that holds an earlier recording of ours is replaced. The same frames give
-    the same bytes. Whole scenes of a run that was killed wait beside the folder, and
-    the same run goes on from them, in a folder that only such a run fills.
+    It has one ``000000.npz`` a frame, keyed by input name, ``000000.future.json`` where
+    the future is known, and ``scenes.json`` with the starts of scenes. An earlier
+    recording in the folder is replaced. The same frames give the same bytes. Complete
+    scenes of a killed run are kept in a separate folder beside it, and the same run
+    resumes from them.
 
     Args:
-        folder: To write.
-        source: Of the frames; the first starts a scene.
-        about: What ``scenes.json`` also says: the model, the seed.
-        key: What else decides the frames; a run goes on only from one of the same.
-        pixels: By name, the inputs that the source yields as bytes.
-
-    Returns:
-        The folder.
+        folder: the folder to write.
+        source: yields the frames; the first starts a scene.
+        about: further entries of ``scenes.json``: the model, the seed.
+        key: what else determines the frames; only a run with the same key resumes.
+        pixels: the inputs that the source yields as bytes, by name.
 
     Raises:
-        FramesError: No frames, or a folder holds something else.
+        FramesError: there are no frames, or a folder holds something else.
     """
     _check_replaceable(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
+    # Write into a hidden folder first; it may hold an earlier run.
     partial = folder.with_name(f".{folder.name}.partial")
     _check_replaceable(partial, PROGRESS)
     draft = _Draft(partial, _with_pixels(about, pixels or {}), key)
@@ -91,20 +89,14 @@ def write_recording(
 def _with_pixels(
     about: Mapping[str, str | int], pixels: Mapping[str, PixelInput]
 ) -> dict[str, object]:
-    """Say in the index which inputs are bytes; nothing where none is."""
+    """Return the index entries, with the inputs stored as bytes if there are any."""
     if not pixels:
         return dict(about)
     return {**about, "pixels": PixelInputs(inputs=dict(pixels)).model_dump(mode="json")}
 
 
 class _Draft:
-    """A recording that is being made.
-
-    Args:
-        folder: that it is made in.
-        about: see :func:`write_recording`.
-        key: likewise.
-    """
+    """A recording in progress; see :func:`write_recording`."""
 
     def __init__(self, folder: Path, about: Mapping[str, object], key: str) -> None:
         self.folder, self.about = folder, dict(about)
@@ -114,7 +106,7 @@ class _Draft:
         self.count = 0
 
     def resume(self) -> Begin:
-        """Keep the whole scenes of an earlier run that made the same; else begin."""
+        """Keep the complete scenes of an earlier run of the same frames, if any."""
         kept = self._kept()
         if kept is None:
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -138,7 +130,7 @@ class _Draft:
         return (scenes, places) if whole else None
 
     def write(self, frame: Frame) -> None:
-        """Write a frame; where a scene begins, those before are whole."""
+        """Write a frame; where a scene begins, the ones before it are complete."""
         if frame.starts_scene:
             self.scenes.append(self.count)
             self.places.append(frame.place)
@@ -153,7 +145,7 @@ class _Draft:
         self.count += 1
 
     def finish(self) -> None:
-        """Write the index: the folder is a recording now."""
+        """Write the index, which makes the folder a recording."""
         index = {"scenes": self.scenes, **self.about, "count": self.count}
         with drafts.naming(self.folder / INDEX):
             (self.folder / INDEX).write_text(json.dumps(index, indent=1) + "\n")
@@ -163,7 +155,7 @@ class _Draft:
 
 
 def _check_replaceable(folder: Path, mark: str = INDEX) -> None:
-    """Refuse a folder that something else is in than frames, and the mark of ours."""
+    """Refuse a folder that is not empty and holds anything but our frames."""
     if folder.is_symlink() and mark == PROGRESS:
         raise FramesError(f"{folder} is a link: frames that are unfinished go there")
     if not folder.exists():
@@ -175,6 +167,7 @@ def _check_replaceable(folder: Path, mark: str = INDEX) -> None:
         return
     if mark not in names:
         raise FramesError(f"{folder} is not empty, and no recording: it has {names[0]}")
+    # Everything inside must have been written by us.
     for name in names:
         number = name.removesuffix(FUTURE).removesuffix(".npz")
         ours = name in (INDEX, PROGRESS) or name.startswith(f".{PROGRESS}.")
@@ -183,7 +176,7 @@ def _check_replaceable(folder: Path, mark: str = INDEX) -> None:
 
 
 def _write_npz(path: Path, arrays: Mapping[str, Array]) -> None:
-    """Like numpy.savez_compressed, at a fast level; the same frame, the same bytes."""
+    """Write like numpy.savez_compressed, at a fast level, reproducibly."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, value in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy")

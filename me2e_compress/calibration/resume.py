@@ -1,4 +1,4 @@
-"""The progress of a long calibration, on disk, so that a kill costs a few frames."""
+"""Checkpoints of a long calibration, so that it can resume after a kill."""
 
 import dataclasses
 import io
@@ -24,8 +24,8 @@ class CalibrationState:
 
     Attributes:
         done: frames seen.
-        results: what they gave so far, by name.
-        state: what recurrent inputs hold for the next frame.
+        results: results so far, by name.
+        state: values of the recurrent inputs for the next frame.
     """
 
     done: int = 0
@@ -35,11 +35,11 @@ class CalibrationState:
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationCheckpoint:
-    """One file that holds the progress of a calibration.
+    """The file of a calibration's progress.
 
     Attributes:
         path: the file; None keeps nothing.
-        key: what it is the progress of: digest of the graph, tensors, frames, ...
+        key: identifies the calibration: digest of the graph, tensors, frames, ...
         every: frames between two writes.
     """
 
@@ -48,7 +48,7 @@ class CalibrationCheckpoint:
     every: int = 8
 
     def read(self) -> CalibrationState:
-        """Read the progress; nothing is done where there is no file.
+        """Read the progress; an empty one if there is no file.
 
         Raises:
             FramesError: the file is of another calibration, or cannot be read.
@@ -73,7 +73,7 @@ class CalibrationCheckpoint:
         )
 
     def write(self, progress: CalibrationState) -> None:
-        """Write the progress, all or nothing."""
+        """Write the progress atomically."""
         if self.path is None:
             return
         state = {_STATE + name: array for name, array in progress.state.items()}
@@ -94,7 +94,7 @@ class CalibrationCheckpoint:
         return self.path is not None and (done % self.every == 0 or done == total)
 
     def clear(self) -> None:
-        """Remove the file of a calibration that is finished."""
+        """Remove the file of a finished calibration."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 

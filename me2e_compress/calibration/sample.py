@@ -1,4 +1,4 @@
-"""Part of a recording: frames drawn by seed, one shard of many, or those held out."""
+"""Parts of a recording: random samples, shards, and held-out frames."""
 
 import dataclasses
 import itertools
@@ -18,8 +18,8 @@ class FrameSubset:
 
     Attributes:
         whole: the recording.
-        places: which of its frames.
-        share: which shard of what it is; None if it is not a shard.
+        places: indices of its frames.
+        share: which shard of which sample; None if it is not a shard.
     """
 
     whole: CalibrationSet
@@ -28,23 +28,22 @@ class FrameSubset:
 
     @property
     def fingerprint(self) -> str:
-        """That of the whole recording, against which later frames are checked."""
+        """The fingerprint of the whole recording, to check later frames against."""
         return self.whole.fingerprint
 
     @property
     def scenes(self) -> tuple[int, ...]:
-        """Indices of those of these frames that begin a scene."""
+        """Positions among these frames where a scene begins."""
         starts = {0, *self.whole.scenes}
         return tuple(
             at for at, place in enumerate(self.places) if not at or place in starts
         )
 
     def __len__(self) -> int:
-        """Count the frames."""
         return len(self.places)
 
     def __getitem__(self, index: int) -> Frame:
-        """Read one frame; its index is the place in the whole recording."""
+        """Read one frame; its index is that in the whole recording."""
         frame = self.whole[self.places[index]]
         return frame if index else dataclasses.replace(frame, starts_scene=True)
 
@@ -54,19 +53,13 @@ class FrameSubset:
 
 
 def draw(whole: CalibrationSet, count: int, seed: int) -> FrameSubset:
-    """Draw ``count`` frames, scene by scene without replacement.
+    """Draw ``count`` frames by ``seed``, scene by scene without replacement.
 
-    Scenes stay whole, since recurrent state grows along them; only the last one drawn
-    is cut, at its end. A recording of fewer frames is taken as it is: no frame counts
-    twice.
-
-    Args:
-        whole: the recording.
-        count: how many frames.
-        seed: same seed, same frames.
+    Scenes stay complete, since recurrent state grows along them; only the last one
+    drawn is cut at its end. A shorter recording is taken whole: no frame counts twice.
 
     Raises:
-        FramesError: fewer than one frame was asked for.
+        FramesError: ``count`` is below 1.
     """
     if count < 1:
         raise FramesError(f"{count} frames were asked for; at least 1 is needed")
@@ -79,22 +72,16 @@ def draw(whole: CalibrationSet, count: int, seed: int) -> FrameSubset:
 def hold_out(whole: CalibrationSet, most: int) -> tuple[FrameSubset, FrameSubset]:
     """Split a recording: frames to calibrate on, and frames to measure on.
 
-    A quarter of the frames is measured on, ``most`` of them at most and one at least.
-    They are the last ones; where scenes are short enough, none of theirs is calibrated
+    A quarter of the frames is for measuring, at least one and at most ``most``. They
+    are the last ones; where scenes are short enough, none of their scene is calibrated
     on, since neighbours in a scene look alike. A recording of one frame is both.
-
-    Args:
-        whole: the recording.
-        most: largest number of frames to measure on, above 0.
-
-    Returns:
-        The two parts.
     """
     frames = len(whole)
     if frames == 1:
         return FrameSubset(whole, (0,)), FrameSubset(whole, (0,))
     count = max(1, min(most, frames // 4))
     cut = frames - count
+    # Move the cut to the start of a scene if that leaves enough.
     scene = max(start for start in whole.scenes if start <= cut)
     if scene >= frames / 2:
         cut = scene
@@ -105,12 +92,7 @@ def hold_out(whole: CalibrationSet, most: int) -> tuple[FrameSubset, FrameSubset
 
 
 def shard(part: FrameSubset, number: int, count: int) -> FrameSubset:
-    """Return one of ``count`` parts with about as many scenes each.
-
-    Args:
-        part: the frames to divide.
-        number: which, from 1.
-        count: how many there are.
+    """Return part ``number`` (from 1) of ``count``, with about as many scenes each.
 
     Raises:
         FramesError: no such shard, or fewer scenes than shards.

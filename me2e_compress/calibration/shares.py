@@ -1,4 +1,4 @@
-"""Which shard of a draw statistics are, and whether shards are complete."""
+"""Identify the shards of a sample, and check that they are complete."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,12 +8,12 @@ from me2e_compress.errors import FramesError
 
 @dataclasses.dataclass(frozen=True)
 class Share:
-    """One shard's share of the frames that were drawn.
+    """One shard of the sampled frames.
 
     Attributes:
-        number: which shard, from 1.
-        count: how many there are.
-        drawn: places in the recording of the frames of all of them.
+        number: number of the shard, from 1.
+        count: number of shards.
+        drawn: indices in the recording of the frames of all shards.
     """
 
     number: int
@@ -22,15 +22,13 @@ class Share:
 
 
 def check_whole(shares: Sequence[Share | None]) -> None:
-    """Check that shards are all those of one draw.
+    """Check that shards are all those of one sample.
 
-    Args:
-        shares: of the shards; None for statistics that are not a shard; all None is
-            accepted.
+    None stands for statistics that are not a shard; all None is accepted.
 
     Raises:
-        FramesError: only some are shards, they are of different draws or of another
-            number of shards, or one is missing.
+        FramesError: only some are shards, their samples or counts differ, or one is
+            missing.
     """
     known = [each for each in shares if each is not None]
     if not known:
@@ -38,6 +36,7 @@ def check_whole(shares: Sequence[Share | None]) -> None:
     if len(known) < len(shares):
         raise FramesError("some of the files are shards, others a whole calibration")
     first = known[0]
+    # All must belong to one sample.
     for each in known[1:]:
         if each.count != first.count:
             raise FramesError(

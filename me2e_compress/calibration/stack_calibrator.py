@@ -1,4 +1,4 @@
-"""Calibration of all files of a stack in one streaming pass of the whole."""
+"""Calibrate all files of a stack in one streaming pass of the whole."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -30,12 +30,12 @@ from me2e_compress.runtime.stack.stack_session import PartRun, StackSession
 
 @dataclasses.dataclass(frozen=True)
 class StackCalibrator:
-    """Measures the ranges of every file of a stack.
+    """Measure the ranges of every file of a stack.
 
     Attributes:
-        method: as :class:`~me2e_compress.calibration.calibrator.Calibrator` has it.
-        threads: within an operator; 0 for every core.
-        provider: what runs the files.
+        method: as in :class:`~me2e_compress.calibration.calibrator.Calibrator`.
+        threads: threads within an operator; 0 takes every core.
+        provider: the execution provider.
     """
 
     method: str = "max-min"
@@ -55,12 +55,9 @@ class StackCalibrator:
         Args:
             stack: how the files are joined.
             models: the float graph of every file, by label.
-            tensors: which to measure in each; none of a file that stays float.
-            frames: of the stack.
-            progress: called as ``progress(frames done, frames)``, passes counted.
-
-        Returns:
-            By label the ranges of every file.
+            tensors: tensors to measure in each; empty for a file that stays float.
+            frames: the frames of the stack.
+            progress: called with frames done and all frames, of all passes.
 
         Raises:
             FramesError: a frame does not fit, or makes a tensor NaN or infinite; or a
@@ -89,7 +86,7 @@ class _Job:
     progress: Progress | None
 
     def extremes(self) -> dict[str, Statistics]:
-        """Measure smallest, largest and mean square of every tensor, by frame."""
+        """Measure minimum, maximum and mean square of every tensor and frame."""
         rows = {label: list[Readings]() for label in self.models}
         places = {label: list[int]() for label in self.models}
 
@@ -99,6 +96,7 @@ class _Job:
             rows[label].append(readings)
             places[label].append(place)
 
+        # A file may run at only some of the frames.
         self._pass({label: Extremes() for label in self.models}, 0, take)
         for label, each in rows.items():
             if not each:
@@ -115,7 +113,7 @@ class _Job:
         }
 
     def counts(self, seen: Mapping[str, Statistics]) -> dict[str, Statistics]:
-        """Count the magnitudes of every tensor, all frames together."""
+        """Count the magnitudes of every tensor over all frames."""
         totals = {
             label: np.zeros((len(each.tensors), BINS), np.int64)
             for label, each in seen.items()
@@ -163,11 +161,7 @@ class _Job:
 
 
 class _ProbedStack(StackSession):
-    """A stack whose files tell what their probes read.
-
-    Attributes:
-        taken: by label, the readings of the latest frame.
-    """
+    """A stack with probes; ``taken`` has the latest readings by label."""
 
     def __init__(
         self,
@@ -185,7 +179,7 @@ class _ProbedStack(StackSession):
         first: bool = False,
         parts: Collection[str] | None = None,
     ) -> Iterator[PartRun]:
-        """Run file after file, and keep what the probes read."""
+        """Run the files in order, and keep the readings of their probes."""
         for each in super().runs(feeds, first=first, parts=parts):
             empty = np.empty(0, np.float32)
             self.taken[each.label] = each.values.get(READINGS, empty).astype(np.float32)

@@ -1,7 +1,7 @@
-"""Inputs that are constants of a graph, which frames may hold all the same.
+"""Inputs that became constants of a graph, but may still be in its frames.
 
-``static-geometry`` makes a graph of one vehicle's camera matrices. A recording of that
-vehicle still fits it; one of another vehicle does not, and nothing else would say so.
+``static-geometry`` builds a graph for one vehicle's camera matrices. A recording of
+that vehicle still fits it; one of another vehicle does not, and only this check tells.
 """
 
 import hashlib
@@ -14,11 +14,11 @@ from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Array
 
 STATIC_INPUTS = "me2e.static_inputs"
-"""Metadata of a graph: a digest of every input that became constant, as JSON."""
+"""Metadata key of a graph: JSON with a digest of every input that became constant."""
 
 
 def static_inputs(model: ir.Model) -> dict[str, str]:
-    """Read which inputs are constants, and the digests of what they hold."""
+    """Read the digests of inputs that became constants."""
     try:
         found = json.loads(model.metadata_props.get(STATIC_INPUTS, "{}"))
     except (ValueError, RecursionError):
@@ -27,18 +27,14 @@ def static_inputs(model: ir.Model) -> dict[str, str]:
 
 
 def enter_static(model: ir.Model, arrays: Mapping[str, Array]) -> None:
-    """Write that inputs are constants from now on."""
+    """Record that inputs are now constants."""
     known = static_inputs(model)
     known |= {name: digest_of(array) for name, array in arrays.items()}
     model.metadata_props[STATIC_INPUTS] = json.dumps(known, sort_keys=True)
 
 
 def check_static(name: str, array: Array, digest: str, where: str) -> None:
-    """Check that a frame holds what the graph was made for.
-
-    Raises:
-        FramesError: it holds something else.
-    """
+    """Raise a FramesError if a frame's array differs from the graph's constant."""
     if digest_of(array) != digest:
         raise FramesError(
             f"{where}: {name} is not the one that the graph was made for"

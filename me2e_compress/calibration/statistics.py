@@ -1,4 +1,4 @@
-"""Statistics of every tensor on every frame: enough for any range, in a few MB."""
+"""Statistics of every tensor on every frame, from which ranges are computed."""
 
 import dataclasses
 import functools
@@ -17,33 +17,33 @@ from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes
 
 BINS = 2048
-"""Bins of a histogram of magnitudes, from 0 to the next power of two: at least 1,024
-of them in use, 8 for each of the 127 int8 steps. (TensorRT takes 2,048 to the largest
-magnitude itself, onnxruntime's percentile as many on both sides of zero.)"""
+"""Bins of a histogram of magnitudes, from 0 to the next power of two: at least 1,024 of
+them in use, 8 for each of the 127 int8 steps. (TensorRT divides the range up to the
+largest magnitude into 2,048, onnxruntime's percentile each side of zero.)"""
 
 _SMALLEST = -100
 """Least exponent of a histogram: below, float32 cannot hold bins per unit."""
 
 _KEPT = ("model", "source", "tensors", "frames", "measured", "counts", "share")
-"""What a file of statistics holds."""
+"""The arrays in a file of statistics."""
 
 Floats: TypeAlias = npt.NDArray[np.float32]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Statistics:
-    """Statistics that a calibration collected; shards of one recording can be merged.
+    """Statistics of a calibration; shards of one recording can be merged.
 
     Attributes:
         model: digest of the graph.
         source: fingerprint of the recording.
-        tensors: their names.
-        frames: places in the recording of the frames that were seen.
+        tensors: names of the tensors.
+        frames: indices of the frames in the recording.
         measured: float32 [frames, tensors, 3]: smallest and largest element, mean
             square; infinity, minus infinity and 0 where a tensor had no element.
         counts: int64 [tensors, bins] over all frames: how many magnitudes lie in each
-            bin of [0, 2^exponent); None where no histogram was asked for.
-        share: which shard of what it is; None if it is not a shard.
+            bin of [0, 2^exponent); None without histograms.
+        share: which shard of which sample; None if it is not a shard.
     """
 
     model: str
@@ -56,9 +56,10 @@ class Statistics:
 
     @functools.cached_property
     def readings(self) -> Floats:
-        """What was measured; where a tensor had no element, that of the frame before.
+        """The measurements, filled in where a tensor had no element.
 
-        Before its first element that of the first frame that had one; 0 if none had.
+        The value is that of the last frame with an element, else of the first such
+        frame; 0 if there is none.
         """
         empty = no_element(self.measured)
         if not empty.any():
@@ -96,11 +97,7 @@ class Statistics:
         return np.maximum(np.frexp(self.reach)[1], _SMALLEST).astype(np.int64)
 
     def counted(self) -> npt.NDArray[np.int64]:
-        """Return the histograms.
-
-        Raises:
-            FramesError: none were collected.
-        """
+        """Return the histograms; FramesError if none were collected."""
         if self.counts is None:
             raise FramesError(
                 "these statistics hold no histograms: calibrate again with a method"
@@ -109,7 +106,7 @@ class Statistics:
         return self.counts
 
     def save(self, path: Path) -> None:
-        """Write an ``.npz``, all or nothing; equal statistics give equal bytes."""
+        """Write an ``.npz`` atomically; equal statistics give equal bytes."""
         content = io.BytesIO()
         np.savez(
             content,
@@ -135,6 +132,7 @@ class Statistics:
         held: dict[str, npt.NDArray[Any]] = load_arrays(path, "saved statistics")
         if missing := [name for name in _KEPT if name not in held]:
             raise FramesError(f"{path}: not saved statistics (no {missing[0]})")
+        # Check shapes and values before they are used.
         counts, names, frames = (held[name] for name in ("counts", "tensors", "frames"))
         fits = counts.size == 0 or counts.shape == (names.size, BINS)
         measured = held["measured"]
@@ -155,27 +153,24 @@ class Statistics:
 
 
 def no_element(measured: Floats) -> npt.NDArray[np.bool_]:
-    """Return which tensors had no element to measure: bool [...].
-
-    Args:
-        measured: float32 [..., 3], as :class:`Statistics` keeps it.
-    """
+    """Return which tensors had no element to measure, from float32 [..., 3]."""
     return np.asarray((measured[..., 0] == np.inf) & (measured[..., 1] == -np.inf))
 
 
 def merge(parts: Sequence[Statistics]) -> Statistics:
     """Merge the shards of one calibration: equal to one run over all frames.
 
-    Bit for bit, histograms too: their bins are powers of two wide, so that those of a
-    shard of smaller reach fall whole into those of the joint one.
+    The result is the same bit for bit, histograms too: their bin widths are powers of
+    two, so that the bins of a shard with smaller reach lie within the joint ones.
 
     Raises:
         FramesError: no shard, one missing, a frame in two of them, or shards of
-            different graphs, recordings, tensors, kinds or draws.
+            different graphs, recordings, tensors, kinds or samples.
     """
     if not parts:
         raise FramesError("no shards to merge")
     first = parts[0]
+    # Shards must be of one calibration.
     for each in parts[1:]:
         for what in ("model", "source", "tensors"):
             if getattr(each, what) != getattr(first, what):
@@ -186,6 +181,7 @@ def merge(parts: Sequence[Statistics]) -> Statistics:
         if (each.counts is None) != (first.counts is None):
             raise FramesError("only some of the shards have histograms")
     check_whole([each.share for each in parts])
+    # Put the frames in order; none may occur twice.
     places = [(place, part, row) for part in parts for row, place in _rows(part)]
     places.sort(key=lambda each: each[0])
     frames = tuple(place for place, _, _ in places)
@@ -197,6 +193,7 @@ def merge(parts: Sequence[Statistics]) -> Statistics:
     )
     if first.counts is None:
         return joint
+    # Bring all histograms to the same bins.
     counts = sum(_widened(part, joint.exponents) for part in parts)
     return dataclasses.replace(joint, counts=np.asarray(counts, np.int64))
 
@@ -222,7 +219,7 @@ def _span(part: Statistics) -> str:
 def _widened(
     part: Statistics, exponents: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.int64]:
-    """Return the histograms over wider bins: 2^k of the old fall into one new."""
+    """Return the histograms over wider bins: 2^k old bins form one new bin."""
     wide = np.zeros_like(part.counted())
     steps = np.minimum(exponents - part.exponents, BINS.bit_length() - 1).tolist()
     for at, step in enumerate(steps):

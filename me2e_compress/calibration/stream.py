@@ -1,4 +1,4 @@
-"""One pass over the frames with a probe on every watched tensor."""
+"""Run one pass over the frames with a probe on every watched tensor."""
 
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,7 +21,7 @@ READINGS = "me2e_readings"
 """Name of the output that the probes write: float32 [tensors x width of the probe]."""
 
 Readings: TypeAlias = npt.NDArray[np.float32]
-"""What the probes read in one frame: float32 [tensors, width of the probe]."""
+"""Readings of the probes in one frame: float32 [tensors, width of the probe]."""
 
 
 class FrameSource(Protocol):
@@ -47,11 +47,11 @@ class FrameSource(Protocol):
 
 
 class Recording(FrameSource, Protocol):
-    """Recorded frames: all of a folder, some of them, or what a part is fed."""
+    """Recorded frames: all of a folder, some of them, or the inputs of a part."""
 
     @property
     def scenes(self) -> Sequence[int]:
-        """Indices of those of these frames that begin a scene."""
+        """Positions among these frames where a scene begins."""
         ...
 
     def __iter__(self) -> Iterator[Frame]:
@@ -66,17 +66,10 @@ def stream(
     begin: int = 0,
     state: Mapping[str, Array] | None = None,
 ) -> Iterator[tuple[Readings, dict[str, Array]]]:
-    """Run a model with probes over frames, its own recurrent state fed forward.
+    """Run a model with probes over frames; yield each frame's readings and next state.
 
-    Args:
-        session: of :func:`probed_session`.
-        frames: the recording.
-        width: of the probe.
-        begin: the first frame to run.
-        state: what recurrent inputs hold there, if it is not the first of a scene.
-
-    Yields:
-        For every frame what the probes read, and the state for the next frame.
+    ``session`` comes from :func:`probed_session`, ``width`` is that of its probe.
+    ``state`` holds the recurrent inputs at frame ``begin`` if no scene starts there.
     """
     rest = (frames[index] for index in range(begin, len(frames)))
     wanted = [READINGS, *session.recurrent.values()]
@@ -101,15 +94,13 @@ def probed_session(
 
     onnxruntime optimizes the graph with its probes; then the nodes are put into an
     order in which every watched tensor is freed as early as without them. A provider
-    that compiles parts of the graph puts them into an order of its own.
-
-    Raises:
-        GraphError: no such tensor, or onnxruntime cannot run the graph.
+    that compiles parts of the graph uses an order of its own.
     """
     probed = insert_probes(model, tensors, probe)
     run = partial(Session, threads=threads, frugal=True, provider=provider)
     if not optimize or provider.native != CPU.native:
         return run(probed, optimize=optimize)
+    # Write the optimized graph, reorder it, and run it as it is.
     with tempfile.TemporaryDirectory(prefix="me2e-probed-") as folder:
         path = Path(folder) / "optimized.onnx"
         Session(probed, threads=1, rewritten=path, provider=provider)
@@ -122,15 +113,9 @@ def probed_session(
 
 
 def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.Model:
-    """Return a copy of a graph with probes, each right behind the tensor's producer.
+    """Return a copy of a graph with a probe right after each tensor's producer.
 
-    Args:
-        model: the graph; it stays as it is.
-        tensors: float tensors to watch, by name.
-        probe: what is measured of each.
-
-    Returns:
-        The copy; its last output is :data:`READINGS`.
+    The last output of the copy is :data:`READINGS`.
 
     Raises:
         GraphError: the graph has no such tensor.
@@ -144,6 +129,7 @@ def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.M
         for at, name in enumerate(tensors)
         for reading in _watch(copy.graph, known[name], probe, at)
     ]
+    # Join all readings into one output.
     joined = ir.node("Concat", readings, {"axis": 0}, name=READINGS)
     joined.outputs[0].name = READINGS
     joined.outputs[0].dtype = ir.DataType.FLOAT
@@ -154,12 +140,11 @@ def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.M
 
 
 def schedule_probes(model: ir.Model) -> None:
-    """Move the nodes of every probe to the earliest place, in place.
+    """Move the nodes of every probe to the earliest position, in place.
 
     onnxruntime runs nodes in the order of the file (``Session(frugal=True)``). Its
-    optimizations append what they write to the end: the change back from a blocked
-    layout that a probe reads would come last, and keep the tensors of a whole backbone
-    in memory until then.
+    optimizations append new nodes at the end: the conversion from a blocked layout that
+    a probe reads would come last, and keep the tensors of a whole backbone in memory.
     """
     # What the model's own outputs need keeps its order; the rest waits for its inputs.
     nodes = list(model.graph)
@@ -220,7 +205,7 @@ def _watch(
 
 
 def _needed(values: Sequence[ir.Value]) -> set[ir.Node]:
-    """Return the nodes that some values are computed by."""
+    """Return the nodes that compute some values."""
     found: set[ir.Node] = set()
     pending = [node for value in values if (node := value.producer()) is not None]
     while pending:
@@ -232,7 +217,7 @@ def _needed(values: Sequence[ir.Value]) -> set[ir.Node]:
 
 
 def _sources(node: ir.Node) -> set[ir.Value]:
-    """Return what must be computed before a node can run."""
+    """Return the values that a node needs before it can run."""
     return {v for v in _reads(node) if v.producer() is not None or v.is_graph_input()}
 
 

@@ -1,4 +1,4 @@
-"""The ``me2e-compress`` command, one short file each; the only room that prints."""
+"""The ``me2e-compress`` command, one file per command; the only package that prints."""
 
 import os
 import sys
@@ -14,7 +14,7 @@ RESUMES = {
     **dict.fromkeys(("calibrate", "evaluate", "sensitivity", "study"), AGAIN),
     "frames": f"{AGAIN} after the last whole scene, if there is one",
 }
-"""Commands that go on where they were interrupted, and what to do for that."""
+"""What to do to resume a command that was interrupted."""
 
 
 def main() -> int:
@@ -25,11 +25,10 @@ def main() -> int:
 
 
 def run_in_order(run: Callable[[], None], again: str = "") -> int:
-    """Run a command line; errors of ours are one line and code 1, signals another.
+    """Run a command line; our own errors are one line and code 1, signals other codes.
 
-    Args:
-        run: reads ``sys.argv``, and ends by itself or by ``SystemExit``.
-        again: what to do after an interruption; empty says nothing.
+    `run` reads ``sys.argv``, and returns or raises ``SystemExit``; `again` says how to
+    go on after an interruption.
     """
     try:
         with signals_in_order():
@@ -64,6 +63,7 @@ def _run(run: Callable[[], None]) -> int:
         told = explained(error)
         if isinstance(told, ImportError):
             raise  # of no optional package: a defect of ours, which needs its traceback
+        # an error of the user's is one line, without a traceback
         line = printable(" ".join(_told(told).split()))
         errors.print(f"me2e-compress: {line}", soft_wrap=True, markup=False)
         return 1
@@ -71,7 +71,7 @@ def _run(run: Callable[[], None]) -> int:
 
 
 def _check_place() -> None:
-    """Refuse names that are not UTF-8, which no report can hold, or to be nowhere."""
+    """Refuse file names that are not UTF-8, and a current folder that is gone."""
     try:
         Path.cwd()
     except OSError as error:
@@ -82,7 +82,7 @@ def _check_place() -> None:
 
 
 def _told(error: Exception) -> str:
-    """Return what an error says; one of the system names a file before it, if any."""
+    """Return an error's message; a system error is preceded by its file, if any."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{os.fsdecode(error.filename)}: {error.strerror}"
     return str(error)

@@ -1,4 +1,4 @@
-"""All commands together; the code of each is imported when it is named."""
+"""All commands together; the code of each is imported when it is called."""
 
 import importlib
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ class CommandEntry:
     """What is known of a command before its code is imported.
 
     Attributes:
-        panel: Of ``--help``, under which it stands.
-        name: As it is called; also of its file and its function.
-        help: The first line of its docstring.
-        extra: Of the package, which its work takes; empty for none.
-        function: Where it is not called like the command.
+        panel: the panel of ``--help`` that lists it.
+        name: the command's name, also of its file and its function.
+        help: the first line of its docstring.
+        extra: extras of the package that its work needs, or empty.
+        function: the function, where it is not called like the command.
     """
 
     panel: str
@@ -31,13 +31,13 @@ class CommandEntry:
     function: str = ""
 
     def line(self) -> str:
-        """Return what the list of commands says of it."""
+        """Return the command's line in the list of commands."""
         if self.extra and missing_module(self.extra):
             return f"{self.help} Needs the extra {self.extra}."
         return self.help
 
     def load(self) -> Any:
-        """Import the command, as Click knows it; its options need no extra."""
+        """Import the command as a Click command; its options need no extra."""
         alone = _app()
         home = importlib.import_module(f"me2e_compress.cli.commands.{self.name}")
         alone.command(self.name)(getattr(home, self.function or self.name))
@@ -156,11 +156,11 @@ _ENTRIES = (
 )
 
 COMMANDS = {entry.name: entry for entry in _ENTRIES}
-"""In the order in which ``--help`` lists them."""
+"""Commands in the order in which ``--help`` lists them."""
 
 
 class LazyGroup(TyperGroup):
-    """Commands that are names and lines of help until one of them is called."""
+    """A group whose commands are only names and help until one is called."""
 
     def resolve_command(
         self, ctx: Any, args: list[str]
@@ -169,6 +169,7 @@ class LazyGroup(TyperGroup):
         name, known, rest = super().resolve_command(ctx, args)
         if name is None:
             return name, known, rest
+        # only the command that is called is imported
         loaded = COMMANDS[name].load()
         common = [each for each in self.params if each.name in COMMON]
         loaded.params = [*loaded.params, *common]  # before and after the command's name
@@ -247,7 +248,7 @@ def _options(
 
 
 def _not_imported() -> None:
-    """Stand for a command in the list of commands."""
+    """Stand in for a command in the list of commands."""
 
 
 app = build_app()

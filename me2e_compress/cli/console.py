@@ -1,4 +1,4 @@
-"""What every command prints with."""
+"""Printing for all commands: results, tables, progress, JSON."""
 
 import dataclasses
 import json
@@ -35,19 +35,19 @@ WIDE = 120
 
 @contextmanager
 def listening(*, stages: bool = False) -> Iterator[Listener]:
-    """Show progress on stderr, and warnings as lines there; neither if quiet.
+    """Show progress and warnings on stderr; nothing if quiet.
 
-    On a terminal it is a bar with the time that is left, elsewhere a line now and then.
-
-    Args:
-        stages: where there is no terminal, print every new stage as a line.
+    On a terminal progress is a bar with the time left, elsewhere a line now and then,
+    and one for every new stage if `stages` is set.
     """
     if is_quiet():
         yield SILENT
         return
+    # a log gets lines, since it cannot show a bar
     if not errors.is_terminal:
         yield Listener(ProgressLines(tell, stages=stages).on_progress, _warn)
         return
+    # a terminal shows one bar, which starts again with every stage
     bar = Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=20),
@@ -78,7 +78,7 @@ def _warn(line: str) -> None:
 
 
 def tell(line: str) -> None:
-    """Print a line on stderr, as it stands; nothing if quiet."""
+    """Print a line on stderr without markup; nothing if quiet."""
     if not is_quiet():
         errors.print(printable(line), soft_wrap=True, markup=False)
 
@@ -86,16 +86,14 @@ def tell(line: str) -> None:
 def show(
     found: Result, as_json: bool = False, tables: Sequence[Table] | None = None
 ) -> None:
-    """Print a result: its tables and lines, or one JSON document.
+    """Print a result as one JSON document, or as tables and lines.
 
-    Args:
-        found: the result.
-        as_json: print all of it, for programs.
-        tables: instead of its own.
+    `tables` are printed instead of the result's own.
     """
     if as_json:
         print_json(found.document())
         return
+    # tables first, so that the verdict stays in sight at the end
     for each in found.tables() if tables is None else tables:
         print_table(each)
     if tables is None and is_verbose():
@@ -108,16 +106,18 @@ def show(
 
 
 def say(line: str) -> None:
-    """Print a line as it stands."""
+    """Print a line without markup."""
     console.print(printable(line), soft_wrap=True, markup=False)
 
 
 def print_table(content: Table) -> None:
-    """Print a table and its note; intervals too, where they fit.
+    """Print a table and its note, with intervals where they fit.
 
-    Where its words do not fit side by side, a row is a few lines: no name is broken.
+    Where the words do not fit side by side, a row becomes a few lines, so that no name
+    is broken.
     """
     content = content.printable()
+    # intervals are shown if the terminal is wide, or the table narrow
     intervals = _is_wide() or _room(content, intervals=True) >= 0
     widths = _widths(content, intervals)
     console.print(Text(content.title, "bold"), soft_wrap=True)
@@ -125,6 +125,7 @@ def print_table(content: Table) -> None:
         _print_rows(content)
     else:
         console.print(_grid(content, widths, intervals))
+    # what the table leaves out is said below it
     if content.note:
         console.print(Text(content.note, "dim"))
     if not intervals and any(cell.detail for row in content.rows for cell in row):
@@ -134,7 +135,7 @@ def print_table(content: Table) -> None:
 
 
 def _room(content: Table, *, intervals: bool) -> int:
-    """Return how many columns of the terminal a table leaves; below 0: too few."""
+    """Return how many columns of the terminal a table leaves; below 0 means too few."""
     return console.width - _frame(content) - sum(_longest(content, intervals, False))
 
 
@@ -144,7 +145,7 @@ def _frame(content: Table) -> int:
 
 
 def _longest(content: Table, intervals: bool, words: bool) -> list[int]:
-    """Return the longest line, or word, of every column."""
+    """Return the length of the longest line, or word, of every column."""
     columns = [
         [name, *(_text(row[at], intervals).plain for row in content.rows)]
         for at, name in enumerate(content.columns)
@@ -159,12 +160,13 @@ def _longest(content: Table, intervals: bool, words: bool) -> list[int]:
 
 
 def _widths(content: Table, intervals: bool) -> list[int] | None:
-    """Share the terminal among columns so that no word breaks; None if it is narrow."""
+    """Share the terminal among columns so that no word breaks; None if too narrow."""
     least = _longest(content, intervals, True)
     most = _longest(content, intervals, False)
     spare = console.width - _frame(content) - sum(least)
     if spare < 0:
         return None
+    # the columns share what the longest words leave over
     wanted = [high - low for low, high in zip(least, most, strict=True)]
     # who wants little gets all of it, so that only long sentences wrap
     for done, at in enumerate(sorted(range(len(wanted)), key=wanted.__getitem__)):
@@ -174,7 +176,6 @@ def _widths(content: Table, intervals: bool) -> list[int] | None:
 
 
 def _grid(content: Table, widths: Sequence[int], intervals: bool) -> Shown:
-    """Make a table whose first columns are words and the rest numbers."""
     made = Shown()
     made.show_edge = made.pad_edge = _is_wide()  # four characters that numbers can use
     for at, (name, width) in enumerate(zip(content.columns, widths, strict=True)):
@@ -186,7 +187,7 @@ def _grid(content: Table, widths: Sequence[int], intervals: bool) -> Shown:
 
 
 def _print_rows(content: Table) -> None:
-    """Print each row as its name and, indented, what is told of it."""
+    """Print each row as its name and, indented, its other cells."""
     alone = len(content.columns) == 2
     for first, *others in content.rows:
         console.print(Text(first.text), soft_wrap=True)
@@ -207,12 +208,12 @@ def _text(cell: Cell, wide: bool) -> Text:
 
 
 def print_json(data: object) -> None:
-    """Print one JSON document on stdout; what is not a finite number is null."""
+    """Print one JSON document on stdout; numbers that are not finite become null."""
     sys.stdout.write(json.dumps(_plain(data), indent=2, allow_nan=False) + "\n")
 
 
 def _plain(value: object) -> object:
-    """Turn data into what JSON knows: no dataclasses, paths, NaN, infinities."""
+    """Turn dataclasses, paths, NaN and infinities into what JSON can hold."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return _plain(dataclasses.asdict(value))
     if isinstance(value, Mapping):

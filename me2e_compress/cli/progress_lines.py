@@ -10,14 +10,9 @@ EVERY_S = 10.0
 
 
 class ProgressLines:
-    """Writes where a long run stands, seldom enough for a log.
+    """Writes the progress of a long run, seldom enough for a log.
 
-    A run of less than `EVERY_S` writes nothing.
-
-    Args:
-        write: is given each line.
-        stages: write every new stage too, at once.
-        clock: seconds that pass.
+    A run of less than `EVERY_S` writes nothing, unless every new stage is written too.
     """
 
     def __init__(
@@ -32,7 +27,7 @@ class ProgressLines:
         self._begun = self._said = clock()
 
     def on_progress(self, stage: str, done: int, total: int, what: str) -> None:
-        """Write a line, if it is time for one; as a listener is called."""
+        """Write a line if it is time for one; to be called by a listener."""
         now = self._clock()
         if stage != self._stage:
             self._stage, self._begun = stage, now
@@ -48,7 +43,7 @@ class ProgressLines:
 
 
 def _left(seconds: float, done: int, total: int) -> str:
-    """Say how long the rest takes at the pace so far; nothing where none is known."""
+    """Return how long the rest takes at the pace so far; empty if not known."""
     if not 0 < done < total:
         return ""
     return f"{duration(seconds / done * (total - done))} left"

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM end a command in order, and soon, whatever it is doing."""
+"""Make Ctrl-C and SIGTERM end a command in order, and soon, whatever it is doing."""
 
 import contextlib
 import os
@@ -11,23 +11,23 @@ from types import FrameType
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
 """Exit codes after Ctrl-C and after SIGTERM, as shells count them."""
 DEAF_S = 5.0
-"""What native code may take until Python hears of a signal; then the process ends."""
+"""Seconds that native code may delay a signal; after that the process ends."""
 _LOST: dict[type[BaseException], signal.Signals] = {
     KeyboardInterrupt: signal.SIGINT,
     SystemExit: signal.SIGTERM,
 }
-"""What signals raise, by what they are."""
+"""The signal behind each exception that a handler raises."""
 _MOMENT_S = 0.02
 
 
 @contextlib.contextmanager
 def signals_in_order() -> Iterator[None]:
-    """Make SIGTERM an exit like Ctrl-C: processes and drafts are cleared away.
+    """Make SIGTERM an exit like Ctrl-C, so that processes and drafts are cleaned up.
 
-    What is raised while Python clears something away, or in a callback of native code,
-    is lost. Python tells of it; the signal is then sent once more, a moment later.
-    Native code that does not come back, such as a loop without end in a graph, hears
-    nothing: the process ends all the same, and leaves what a kill leaves.
+    An exception raised in a finalizer, or in a callback of native code, is lost; Python
+    reports it to `sys.unraisablehook`, and the signal is sent again a moment later.
+    Native code that never returns, such as an endless loop in a graph, blocks the
+    handler: the process then exits all the same, and leaves what a kill leaves.
     """
     heard = threading.Event()
 
@@ -44,6 +44,7 @@ def signals_in_order() -> Iterator[None]:
         else:
             threading.Timer(_MOMENT_S, os.kill, (os.getpid(), number)).start()
 
+    # install the handlers and the hook for lost exceptions
     hook, sys.unraisablehook = sys.unraisablehook, again
     before = {signal.SIGTERM: signal.signal(signal.SIGTERM, leave)}
     # what is started in the background ignores Ctrl-C, and goes on doing so
@@ -53,6 +54,7 @@ def signals_in_order() -> Iterator[None]:
         with _ended_where_unheard(heard):
             yield
     finally:
+        # restore what was there before
         for number, handler in before.items():
             signal.signal(number, handler)
         sys.unraisablehook = hook
@@ -60,7 +62,8 @@ def signals_in_order() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _ended_where_unheard(heard: threading.Event) -> Iterator[None]:
-    """Watch for signals in a thread: Python writes their numbers into a pipe."""
+    """Exit if a signal is not handled within `DEAF_S`."""
+    # Python writes signal numbers into a pipe even while native code runs
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
 
@@ -71,6 +74,7 @@ def _ended_where_unheard(heard: threading.Event) -> Iterator[None]:
                 os.write(2, b"me2e-compress: interrupted\n")
                 os._exit(128 + number[0])
 
+    # a thread watches the pipe until it is closed
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()
     before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)

@@ -1,10 +1,10 @@
-"""How much is printed: the options ``-q`` and ``-v``."""
+"""The amount of output, set by the options ``-q`` and ``-v``."""
 
 import enum
 
 
 class Verbosity(enum.Enum):
-    """What is printed besides results and errors."""
+    """How much is printed besides results and errors."""
 
     QUIET = enum.auto()
     NORMAL = enum.auto()
@@ -15,7 +15,7 @@ _chosen = Verbosity.NORMAL
 
 
 def set_verbosity(wanted: Verbosity) -> None:
-    """Choose how much is printed, until the next choice."""
+    """Set how much is printed, until the next call."""
     global _chosen
     _chosen = wanted
 

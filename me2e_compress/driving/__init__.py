@@ -1,1 +1,1 @@
-"""The contract of driving: what a policy sees and says, and what a decision costs."""
+"""The driving contract: observations, answers and the latency of a decision."""

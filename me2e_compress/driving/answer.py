@@ -1,4 +1,4 @@
-"""What a policy may answer, checked and in one form."""
+"""Check a policy's answer, and bring it into one form."""
 
 import numpy as np
 import numpy.typing as npt
@@ -13,18 +13,18 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.trajectory import Trajectory
 
 PLAN_TIMES_S = (1 + np.arange(PLAN_SHAPE[0])) * (PLAN_STEP_US / 1e6)
-"""When the waypoints of a `Plan` are to be reached."""
+"""Times of the waypoints of a `Plan`, seconds."""
 
 RANGES = {"throttle": (0.0, 1.0), "steer": (-1.0, 1.0), "brake": (0.0, 1.0)}
-"""Of `PedalsAndWheel`."""
+"""Ranges of the controls in `PedalsAndWheel`."""
 
 
 def checked(answer: object) -> Trajectory | PedalsAndWheel:
     """Return a policy's answer, a plan with the times of its waypoints.
 
     Raises:
-        EvaluationError: It is neither waypoints nor controls, of another shape, not
-            finite, or a control out of its range.
+        EvaluationError: It has another form or shape, is not finite, or is out of
+            range.
     """
     if isinstance(answer, PedalsAndWheel):
         return _in_range(answer)
@@ -45,11 +45,7 @@ def timed(plan: Plan | Trajectory) -> Trajectory:
 
 
 def six_waypoints(answer: object) -> npt.NDArray[np.float64]:
-    """Return a plan as six waypoints every 0.5 s, others read off between its own.
-
-    Raises:
-        EvaluationError: See :func:`checked`; or the policy answers controls.
-    """
+    """Return a plan as six waypoints every 0.5 s, interpolated if need be."""
     found = checked(answer)
     if isinstance(found, PedalsAndWheel):
         raise EvaluationError("the policy answers controls: there is no plan")

@@ -24,7 +24,7 @@ class Axes(StrEnum):
         return np.array(_TO_EGO[self], np.float64)
 
     def projection(self, lidar2img: npt.ArrayLike) -> npt.NDArray[np.float32]:
-        """Turn [n, 4, 4] of the ego frame into that of this frame."""
+        """Convert [n, 4, 4] projections of the ego frame to this frame."""
         turn = np.eye(4)
         turn[:3, :3] = self.to_ego
         return np.asarray(np.asarray(lidar2img, np.float64) @ turn, np.float32)

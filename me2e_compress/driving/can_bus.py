@@ -1,4 +1,4 @@
-"""The CAN bus of an observation: how the ego moves, and moved since it last decided."""
+"""The CAN bus of an observation: the ego's motion and its recent change."""
 
 import math
 
@@ -12,11 +12,9 @@ from me2e_compress.driving.ego_kinematics import EgoKinematics
 def can_bus_between(
     now: EgoKinematics, last: EgoKinematics | None
 ) -> npt.NDArray[np.float32]:
-    """Return float32 [18], laid out as `Observation` says.
+    """Return float32 [18], laid out as in `Observation`.
 
-    Args:
-        now: At this decision.
-        last: At the decision before; None at the first.
+    ``last`` is the state at the previous decision, None at the first.
     """
     bus = np.zeros(CAN_BUS_SIZE, np.float64)
     bus[3], bus[6] = math.cos(now.heading / 2), math.sin(now.heading / 2)

@@ -1,8 +1,7 @@
-"""UniAD's collision optimisation: the plan is pushed off the ground that will be taken.
+"""UniAD's collision optimisation: pushes the plan away from ground predicted occupied.
 
-It runs after the network, on the host, and only where ground near the plan is taken; so
-it takes time in critical frames and none elsewhere, which makes the tail of UniAD's
-latency.
+It runs on the host after the network, and only if cells near the plan are occupied: in
+critical frames alone, which makes the tail of UniAD's latency.
 """
 
 import math
@@ -27,31 +26,29 @@ class CollisionOptimizer(HostStage):
     """Keeps the plan near itself and away from cells that will be occupied.
 
     UniAD's ``CollisionNonlinearOptimizer`` (OpenDriveLab/UniAD, planning head): over
-    the six waypoints p, with r the network's and o the occupied cells within a radius
-    of r at the same time and s the sigma, it minimises ::
+    the six waypoints p, with the network's waypoints r, the occupied cells o within a
+    radius of r at the same time and the sigma s, it minimises ::
 
         sum |p - r|^2 + weight * sum exp(-|p - o|^2 / (2 s^2)) / (sqrt(2 pi) s)
 
-    from r on. There it is built in CasADi and solved by IPOPT, here by SciPy with its
-    exact gradient: the same minimum at a fraction of the time, so a latency for UniAD's
-    is charged by iterations and cells rather than measured.
+    starting at r. UniAD builds it in CasADi and solves it with IPOPT; here SciPy solves
+    it with its exact gradient: the same minimum in a fraction of the time. So a latency
+    for UniAD's is charged by iterations and cells rather than measured.
 
     Attributes:
-        output: Of the network: probabilities [1, T, rows, columns] that a cell is
-            taken when waypoint t is reached (later waypoints take the last), the first
-            row farthest ahead, the first column farthest left.
+        output: The network's occupancy output: probabilities [1, T, rows, columns] that
+            a cell is occupied when waypoint t is reached (later waypoints take the
+            last), the first row farthest ahead, the first column farthest left.
         front_m: x of the outer edge of the first row, ego frame; that of ``highway``.
         left_m: y of the outer edge of the first column.
         cell_m: Side of a cell.
         threshold: Probability above which a cell is occupied; ours.
         radius_m: From the waypoint to the centre of a cell that counts; UniAD's.
         sigma_m: Width of a cell's repulsion; UniAD's.
-        weight: Of a cell of 0.5 m, as UniAD's is; other cells weigh by their area.
-        solver: Of SciPy; ``SLSQP`` takes less time, seldom much less but then by
+        weight: Weight of a cell of 0.5 m, as UniAD's is; other cells weigh by their
+            area.
+        solver: SciPy's method; ``SLSQP`` is faster, mostly by a little, sometimes by
             far: ``benchmarks/bench_host_stage.py``.
-
-    Raises:
-        EvaluationError: A number that is not positive, or a threshold beyond 0 to 1.
     """
 
     name: ClassVar[str] = "collision-optimizer"
@@ -66,7 +63,6 @@ class CollisionOptimizer(HostStage):
     solver: Literal["SLSQP", "L-BFGS-B"] = "SLSQP"
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         for option in ("cell_m", "radius_m", "sigma_m", "weight"):
             value = getattr(self, option)
             if not 0.0 < value < math.inf:
@@ -81,11 +77,7 @@ class CollisionOptimizer(HostStage):
     def work(
         self, plan: Floats, outputs: Mapping[str, npt.NDArray[np.generic]]
     ) -> HostWork:
-        """Return the plan off occupied cells; the same one where none are near.
-
-        Raises:
-            EvaluationError: The network has no such output, or of another shape.
-        """
+        """Return the plan moved off occupied cells; the same plan if none are near."""
         from scipy.optimize import minimize  # takes a second to import
 
         cells, step = self.near(plan, self._occupancy(outputs))
@@ -100,14 +92,10 @@ class CollisionOptimizer(HostStage):
     def near(
         self, plan: Floats, occupancy: Floats
     ) -> tuple[Floats, npt.NDArray[np.intp]]:
-        """Return the occupied cells near the waypoint of their time.
+        """Return the occupied cells [N, 2] near their waypoint, and its index [N].
 
-        Args:
-            plan: [6, 2].
-            occupancy: [T, rows, columns].
-
-        Returns:
-            Centres [N, 2] in the ego frame, and the waypoint [N] that each is near.
+        The plan is [6, 2] in the ego frame, the occupancy [T, rows, columns]; a cell of
+        time t is compared with waypoint t.
         """
         times = np.minimum(np.arange(len(plan)), len(occupancy) - 1)
         step, row, column = np.nonzero(occupancy[times] > self.threshold)
@@ -134,14 +122,9 @@ class CollisionOptimizer(HostStage):
 
 @dataclass(frozen=True)
 class _Problem:
-    """The objective, and its gradient.
+    """The objective and its gradient, for waypoints [6, 2] and cells [N, 2].
 
-    Attributes:
-        reference: [6, 2], the network's waypoints.
-        cells: [N, 2].
-        step: [N], the waypoint that a cell is near.
-        sigma: Metres.
-        weight: Of a cell.
+    ``step`` [N] is the waypoint that each cell is near, ``weight`` that of one cell.
     """
 
     reference: Floats

@@ -1,4 +1,4 @@
-"""Where the ego is and how it moves."""
+"""Pose and motion of the ego."""
 
 from dataclasses import dataclass
 
@@ -7,15 +7,9 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class EgoKinematics:
-    """Where the ego is and how it moves, in a right-handed world (x east, y north).
+    """Pose and motion of the ego in a right-handed world, x east, y north.
 
-    Args:
-        x: Metres.
-        y: Metres.
-        heading: Radians counter-clockwise from east.
-        speed_mps: Forward.
-        acceleration_mps2: In the ego frame.
-        angular_velocity_radps: In the ego frame.
+    The heading is in radians counter-clockwise from east; vectors are in the ego frame.
     """
 
     x: float

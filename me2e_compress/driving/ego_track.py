@@ -1,4 +1,4 @@
-"""Where the ego has been on this route, as its decisions saw it."""
+"""The ego's past poses on this route, one per decision."""
 
 from bisect import bisect_right
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ class EgoTrack:
     )
 
     def note(self, time_us: int, motion: EgoKinematics | None) -> None:
-        """Count a decision, and keep where the ego is at it if that is known."""
+        """Count a decision, and keep the ego's pose if it is known."""
         self.decisions += 1
         if motion is not None:
             state = (motion.x, motion.y, motion.heading, motion.speed_mps)
@@ -38,8 +38,8 @@ class EgoTrack:
     def at(self, times_us: npt.NDArray[np.floating]) -> Floats:
         """Return [n, 4] of n times: x, y (m), heading (rad, unwrapped), speed (m/s).
 
-        Between decisions it is interpolated; before the first one the ego stood where
-        it then was, at the speed that it had. At least one pose must have been noted.
+        Interpolates between decisions, constant before the first; needs one pose or
+        more.
         """
         # what is older than all of them is not looked at: a route has thousands
         first = max(0, bisect_right(self._times_us, float(np.min(times_us))) - 1)

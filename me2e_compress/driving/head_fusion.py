@@ -9,32 +9,32 @@ from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
 from me2e_compress.driving.waypoint_pid import PidOptions, Place, WaypointPid
 
 BRAKES = 0.5
-"""More brake than this lets the throttle go: both agents'."""
+"""More brake than this releases the throttle, in both agents."""
 
 SLOW_MPS = 1.5
 SLOW_IN_TURN_MPS, TURN_STEER = 1.0, 0.07
 CREEPING, STARTING = 0.05, 0.5
-"""Bench2DriveZoo's agent: the most throttle when faster than that, and when not."""
+"""Most throttle of Bench2DriveZoo's agent above that speed, and below it."""
 
 
 class FusionOptions(BaseModel):
-    """How the two are fused.
+    """How the two heads are fused.
 
-    ``tcp`` (OpenDriveLab/TCP, tcp_agent.py): one head leads, the control head while
-    the ego turns, else the trajectory head, and the other has a share. The ego turns
-    where more than so many of the latest steers were larger than so much.
+    ``tcp`` (OpenDriveLab/TCP, tcp_agent.py): one head leads, and the other has a share.
+    The control head leads while the ego turns, else the trajectory head; the ego turns
+    if more than ``turning_more_than`` of the latest steers exceed ``turning_steer``.
     ``bench2drive`` (Bench2DriveZoo, branch tcp/admlp, ``merge_ctrl_traj``): the mean of
-    both, the stronger brake, which is then full, and next to no throttle above walking
-    pace.
+    both, except that any braking becomes full braking, and above walking pace the
+    throttle is close to none.
 
     Attributes:
         rule: ``tcp`` or ``bench2drive``.
-        share: Of the head that does not lead.
-        turning_steer: So much.
-        turning_more_than: So many,
-        turning_window: of these.
+        share: Weight of the head that does not lead.
+        turning_steer: Steers above this count as turning.
+        turning_more_than: The ego turns if more steers than this count.
+        turning_window: How many of the latest steers are looked at.
         max_throttle: Upper limit.
-        pid: Follows the trajectory.
+        pid: Controller that follows the trajectory.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -49,11 +49,7 @@ class FusionOptions(BaseModel):
 
 
 class HeadFusion:
-    """Fuses one decision after the other; it remembers steers and errors.
-
-    Args:
-        options: How.
-    """
+    """Fuses one decision after the other; it remembers steers and errors."""
 
     def __init__(self, options: FusionOptions) -> None:
         self.options = options
@@ -77,16 +73,9 @@ class HeadFusion:
         speed_mps: float,
         node: Place,
     ) -> PedalsAndWheel:
-        """Return what drives.
+        """Return the fused controls.
 
-        Args:
-            plan: Of the trajectory head.
-            control: Of the control head.
-            speed_mps: Of the ego.
-            node: The target point, metres to the right and forward.
-
-        Raises:
-            EvaluationError: The plan has one waypoint.
+        ``node`` is the target point, metres to the right and forward.
         """
         followed = self._pid.control(plan, speed_mps, node)
         if self.options.rule == "bench2drive":

@@ -1,4 +1,4 @@
-"""A stage behind the network, on the host: what it promises, and its names.
+"""Stages that run on the host after the network: their interface and their names.
 
 To add one: write its class, then add it to the table of names.
 """
@@ -19,12 +19,10 @@ __all__ = ["HOST_STAGES", "HostStage", "HostWork"]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HostWork:
-    """What a host stage made of a plan, and what it took.
+    """The plan [6, 2] that a host stage made, and the work it took.
 
-    Attributes:
-        plan: float64 [6, 2], as the policy contract has it; it drives.
-        iterations: Of its solver; 0 where it had nothing to do.
-        cells: Occupied cells that it took into account.
+    ``iterations`` of its solver are 0 if there was nothing to do; ``cells`` are the
+    occupied cells taken into account.
     """
 
     plan: npt.NDArray[np.float64]
@@ -34,13 +32,10 @@ class HostWork:
 
 @dataclass(frozen=True)
 class HostStage(abc.ABC):
-    """Changes the plan on the host, when the network has run; its fields are options.
+    """Changes the plan on the host after the network has run; its fields are options.
 
-    Its time is part of the decision: a measured latency holds it, and
-    `me2e_compress.driving.layered_latency.HostStageLatency` charges its iterations.
-
-    Class attributes:
-        name: What the command line and studies call it.
+    A measured latency includes its time, and `HostStageLatency` of
+    `me2e_compress.driving.layered_latency` charges its iterations.
     """
 
     name: ClassVar[str]
@@ -51,15 +46,13 @@ class HostStage(abc.ABC):
         plan: npt.NDArray[np.float64],
         outputs: Mapping[str, npt.NDArray[np.generic]],
     ) -> HostWork:
-        """Return the plan that drives.
+        """Return the plan that drives, from the network's plan and outputs.
 
-        Args:
-            plan: [6, 2], of the network, metres in the ego frame; one of other times
-                is read off at these.
-            outputs: Of the network, by name.
+        The plan is [6, 2], metres in the ego frame, interpolated at the contract's
+        times.
 
         Raises:
-            EvaluationError: The network lacks an output, or it has another form.
+            EvaluationError: An output is missing or has another form.
         """
 
 

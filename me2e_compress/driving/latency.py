@@ -1,4 +1,4 @@
-"""How long a decision takes on the vehicle, and who says so."""
+"""Latency sources: how long a decision takes on the vehicle."""
 
 import functools
 import hashlib
@@ -39,17 +39,13 @@ class FixedLatency(LatencySource):
     """The same time for every decision.
 
     Attributes:
-        latency_us: Microseconds.
-
-    Raises:
-        EvaluationError: A negative latency.
+        latency_us: Microseconds, not negative.
     """
 
     name: ClassVar[str] = "fixed"
     latency_us: int = 0
 
     def __post_init__(self) -> None:
-        """Check the latency."""
         if self.latency_us < 0:
             raise EvaluationError(
                 f"latency fixed: {self.latency_us} us: must be 0 or more"
@@ -75,7 +71,7 @@ class NoLatency(LatencySource):
         return lambda _: 0
 
     def to_json(self) -> dict[str, Any]:
-        """Return the microseconds, none."""
+        """Return zero microseconds."""
         return {"fixed_us": 0}
 
 
@@ -85,16 +81,12 @@ class FrameRate(LatencySource):
 
     Attributes:
         fps: Decisions a second.
-
-    Raises:
-        EvaluationError: A rate that is not positive.
     """
 
     name: ClassVar[str] = "fps"
     fps: float
 
     def __post_init__(self) -> None:
-        """Check the rate."""
         check_positive("fps", self.fps)
 
     def on_route(self, route: str) -> Charge:
@@ -103,7 +95,7 @@ class FrameRate(LatencySource):
         return lambda _: period_us
 
     def to_json(self) -> dict[str, Any]:
-        """Return the microseconds."""
+        """Return the period in microseconds."""
         return {"fixed_us": round(1e6 / self.fps)}
 
 
@@ -112,16 +104,13 @@ class TraceLatency(LatencySource):
     """Latencies recorded before, often on another device.
 
     Attributes:
-        trace: File that `profile` wrote; or the samples themselves, microseconds in
-            the order of the recording. Without it, in a study, each model's own.
+        trace: File that `profile` wrote; or the samples themselves, microseconds in the
+            order of the recording. Without it, in a study, each model's own.
         in_order: Replay them in order from the first on every route, which keeps the
             bursts, and start over at the end; else draw them with replacement.
         scale: Speed ratio between the recording device and the one imagined.
-        seed: Of the draws; each route has its own stream, whatever drives before it.
-
-    Raises:
-        EvaluationError: No such file, not a trace, a negative seed, or a scale that is
-            not positive.
+        seed: Seed of the draws; each route has its own stream, so the order of routes
+            does not matter.
     """
 
     name: ClassVar[str] = "trace"
@@ -131,7 +120,7 @@ class TraceLatency(LatencySource):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse what nothing can be drawn from, before anything drives."""
+        """Check the options before anything drives."""
         check_positive("trace: scale", self.scale)
         if self.seed < 0:
             raise EvaluationError(f"latency: seed {self.seed}: must be 0 or more")
@@ -140,7 +129,7 @@ class TraceLatency(LatencySource):
 
     @functools.cached_property
     def samples_us(self) -> tuple[int, ...]:
-        """Microseconds, read once: other processes are sent them with the source."""
+        """Microseconds, read once: the source is sent to other processes with them."""
         if isinstance(self.trace, Path):
             return LatencyTrace.load(self.trace).samples_us
         if self.trace is None:
@@ -149,7 +138,7 @@ class TraceLatency(LatencySource):
 
     @property
     def measured(self) -> int | None:
-        """Samples of the trace, however often one is drawn."""
+        """The number of samples in the trace, however often one is drawn."""
         return None if self.lacks_trace else len(self.samples_us)
 
     @property
@@ -164,7 +153,7 @@ class TraceLatency(LatencySource):
         return replace(self, trace=samples_us, scale=scale * self.scale)
 
     def on_route(self, route: str) -> Charge:
-        """Charge what the trace says next."""
+        """Charge the next sample of the trace."""
         scaled = [round(sample * self.scale) for sample in self.samples_us]
         if self.in_order:
             replay = cycle(scaled)
@@ -189,9 +178,6 @@ class MeasuredLatency(LatencySource):
 
     Attributes:
         scale: Speed ratio between this machine and the one imagined.
-
-    Raises:
-        EvaluationError: A scale that is not positive.
     """
 
     name: ClassVar[str] = "measured"
@@ -199,11 +185,10 @@ class MeasuredLatency(LatencySource):
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the scale."""
         check_positive("measured: scale", self.scale)
 
     def on_route(self, route: str) -> Charge:
-        """Charge what was measured."""
+        """Charge the measured time."""
         return lambda facts: round(facts.measured_us * self.scale)
 
     def to_json(self) -> dict[str, Any]:
@@ -216,12 +201,8 @@ def parse_latency(
 ) -> LatencySource:
     """Build the latency source of a text, e.g. ``fps:10`` or ``trace:FILE``.
 
-    Args:
-        text: Name and options, see `LATENCY_SOURCES`.
-        in_order: One of these three at its default leaves what the text says; of a
-            source that is made of another they are the other's.
-        scale: Positive, whatever the source.
-        seed: 0 or more; a source that draws nothing has no use for it.
+    ``in_order``, ``scale`` (positive) and ``seed`` (0 or more) override the text unless
+    they are at their defaults; in a layered source they apply to the source below.
 
     Raises:
         EvaluationError: No such source, or an option that it refuses or has not.
@@ -236,7 +217,7 @@ def parse_latency(
 
 
 def _with_options(source: LatencySource, options: dict[str, object]) -> LatencySource:
-    """Give options to the source, or to the one that it is made of."""
+    """Give options to the source, or to the one below it."""
     fields = type(source).__dataclass_fields__
     inner = getattr(source, "source", None)
     if isinstance(inner, LatencySource):

@@ -1,4 +1,4 @@
-"""What a latency source promises, and what it is told of a decision.
+"""The interface of latency sources, what they know of a decision, and their names.
 
 To add one: write its class, then add it to the table of names.
 """
@@ -19,14 +19,14 @@ from me2e_compress.registry import Registry
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DecisionFacts:
-    """What a decision took here and what it saw: a simulator tells, no model is asked.
+    """What a decision took here and what it saw, as the simulator tells it.
 
     Attributes:
         measured_us: Microseconds that it took on this machine.
-        agents_m: float64 [N, 2], where other road users are, whatever hides them:
-            metres in the ego frame, x forward, y left; None where nobody tells.
-        host_iterations: Of the solver of a policy's host stage; 0 without one, or
-            where it had nothing to do.
+        agents_m: float64 [N, 2], positions of other road users, occluded or not, metres
+            in the ego frame, x forward, y left; None if the simulator does not tell.
+        host_iterations: Solver iterations of a policy's host stage; 0 without one, or
+            if it had nothing to do.
         host_cells: Occupied cells that the host stage took into account.
     """
 
@@ -37,18 +37,15 @@ class DecisionFacts:
 
 
 Charge = Callable[[DecisionFacts], int]
-"""From what is known of a decision to the microseconds it takes on the vehicle."""
+"""Maps the facts of a decision to the microseconds it takes on the vehicle."""
 
 
 @dataclass(frozen=True)
 class LatencySource(abc.ABC):
     """Says what each decision of a route costs; its fields are its options.
 
-    An option of this type takes another source, or its text.
-
-    Class attributes:
-        name: What the command line and studies call it.
-        measures: True if it depends on this machine, now: such routes must run alone.
+    An option of this type takes another source, or its text. ``measures`` is True if
+    the source measures on this machine: such routes must run alone.
     """
 
     name: ClassVar[str]
@@ -56,7 +53,7 @@ class LatencySource(abc.ABC):
 
     @abc.abstractmethod
     def on_route(self, route: str) -> Charge:
-        """Return the clock of one route; it depends on nothing but its identity."""
+        """Return the clock of a route; it depends only on the route's name."""
 
     @abc.abstractmethod
     def to_json(self) -> dict[str, Any]:
@@ -64,7 +61,7 @@ class LatencySource(abc.ABC):
 
     @property
     def measured(self) -> int | None:
-        """How many measurements its latencies are drawn from; None: it draws none."""
+        """The number of measurements that it draws from; None if it draws none."""
         return None
 
     @property
@@ -73,11 +70,9 @@ class LatencySource(abc.ABC):
         return False
 
     def with_trace(self, samples_us: tuple[int, ...], scale: float) -> "LatencySource":
-        """Return it with these latencies where it lacks them; else itself.
+        """Return it with these samples (microseconds, in order) if it lacks them.
 
-        Args:
-            samples_us: Microseconds, in the order of the recording.
-            scale: What they are multiplied by, beside its own.
+        ``scale`` multiplies them in addition to the source's own.
         """
         return self
 
@@ -122,10 +117,6 @@ LATENCY_SOURCES: Registry[LatencySource] = Registry(
 
 
 def check_positive(what: str, value: float) -> None:
-    """Check an option of a latency source.
-
-    Raises:
-        EvaluationError: It is not a positive number.
-    """
+    """Check an option of a latency source."""
     if not 0.0 < value < float("inf"):
         raise EvaluationError(f"latency {what} {value:g} is not a positive number")

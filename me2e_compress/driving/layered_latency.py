@@ -1,9 +1,8 @@
-"""Latencies made of others: held to a frame rate, or longer where there is more to do.
+"""Latency sources on top of others: a frame limiter, costs that depend on the scene.
 
-A spike in a critical frame is what hurts (the paper's finding on multi-frame
-stability), and a trace that is drawn without regard to the scene has its spikes
-anywhere. These sources put them where the work is; they draw nothing, so what they are
-made of decides whether a drive is reproducible.
+A latency spike hurts most in a critical frame (the paper's finding on multi-frame
+stability), but a recorded trace has its spikes anywhere. These sources put spikes where
+the work is. They draw nothing themselves.
 """
 
 import abc
@@ -28,28 +27,23 @@ class LayeredLatency(LatencySource):
     """A source on top of another: derive a frozen dataclass with further options.
 
     Attributes:
-        source: What it adds to: another source, or its text.
+        source: The source below: another latency source, or its text.
     """
 
     source: LatencySource
 
     @abc.abstractmethod
     def layered(self, latency_us: int, facts: DecisionFacts) -> int:
-        """Return the microseconds that a decision takes in all.
-
-        Args:
-            latency_us: What the source below says.
-            facts: What is known of the decision.
-        """
+        """Return a decision's microseconds, given those of the source below."""
 
     @property
     def measures(self) -> bool:  # type: ignore[override]
-        """Whether the source below depends on this machine, now."""
+        """Whether the source below measures on this machine."""
         return self.source.measures
 
     @property
     def measured(self) -> int | None:
-        """How many measurements the source below draws from."""
+        """The number of measurements that the source below draws from."""
         return self.source.measured
 
     @property
@@ -72,18 +66,14 @@ class LimitedLatency(LayeredLatency):
     """A frame limiter: max(latency, 1 / fps).
 
     Attributes:
-        source: What is limited: another source, or its text.
+        source: The latency that is limited: another source, or its text.
         fps: The most decisions a second.
-
-    Raises:
-        EvaluationError: A rate that is not positive.
     """
 
     name: ClassVar[str] = "limited"
     fps: float
 
     def __post_init__(self) -> None:
-        """Check the rate."""
         check_positive("limited: fps", self.fps)
 
     def layered(self, latency_us: int, facts: DecisionFacts) -> int:
@@ -91,26 +81,25 @@ class LimitedLatency(LayeredLatency):
         return max(latency_us, round(1e6 / self.fps))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the period in microseconds, and what is limited."""
+        """Return the period in microseconds, and the source below."""
         return {"limit_us": round(1e6 / self.fps), "of": self.source.to_json()}
 
 
 @dataclass(frozen=True)
 class AgentsLatency(LayeredLatency):
-    """Another source's latency, and so much more for every road user in view.
+    """Another source's latency plus a constant for every road user in view.
 
     Jitter is that of the source below: a trace has its own.
 
     Attributes:
-        source: What a decision takes without anybody in view.
-        per_agent_us: Microseconds for each of them.
+        source: The latency without anybody in view: another source, or its text.
+        per_agent_us: Microseconds for each road user in view.
         range_m: How far the policy looks, from the centre of the ego to theirs.
         fov_deg: Field of view, half of it on each side of straight ahead; 360 is all
             round, as six cameras look.
 
     Raises:
-        EvaluationError: A negative cost, a range that is not positive, or a field of
-            view of nothing or of more than a circle; in a drive, a simulator that does
+        EvaluationError: An option is out of its range; in a drive, the simulator does
             not tell where others are.
     """
 
@@ -120,7 +109,6 @@ class AgentsLatency(LayeredLatency):
     fov_deg: float = 360.0
 
     def __post_init__(self) -> None:
-        """Check the options."""
         if self.per_agent_us < 0:
             raise EvaluationError(
                 f"latency agents: per_agent_us {self.per_agent_us}: must be 0 or more"
@@ -132,15 +120,11 @@ class AgentsLatency(LayeredLatency):
             )
 
     def layered(self, latency_us: int, facts: DecisionFacts) -> int:
-        """Charge for those in view."""
+        """Charge for the road users in view."""
         return latency_us + self.per_agent_us * self.in_view(facts)
 
     def in_view(self, facts: DecisionFacts) -> int:
-        """Count the road users within range and field of view.
-
-        Raises:
-            EvaluationError: The simulator does not tell where they are.
-        """
+        """Count the road users within range and field of view."""
         if facts.agents_m is None:
             raise EvaluationError(
                 "latency agents: what drives here does not tell where others are"
@@ -151,7 +135,7 @@ class AgentsLatency(LayeredLatency):
         return int(np.count_nonzero(near & ahead))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the options, and what is added to."""
+        """Return the options, and the source below."""
         return {
             "per_agent_us": self.per_agent_us,
             "range_m": self.range_m,
@@ -162,19 +146,17 @@ class AgentsLatency(LayeredLatency):
 
 @dataclass(frozen=True)
 class HostStageLatency(LayeredLatency):
-    """Another source's latency, and what a policy's host stage takes beside it.
+    """Another source's latency plus that of a policy's host stage.
 
-    For a trace or a rate that knows the network alone. It charges what the stage did,
-    not what the clock here says: such a drive is the same everywhere.
+    Use it with a trace or a rate that covers the network alone. It charges the counted
+    work of the stage, not the clock of this machine, so a drive is the same everywhere.
 
     Attributes:
-        source: What the network takes.
+        source: The network's latency: another source, or its text.
         per_iteration_us: Microseconds for each iteration of the stage's solver.
-        per_cell_us: For each occupied cell that it took into account.
-        per_call_us: For each decision in which it had something to do.
-
-    Raises:
-        EvaluationError: A negative cost.
+        per_cell_us: Microseconds for each occupied cell that the stage took into
+            account.
+        per_call_us: Microseconds for each decision in which the stage had work to do.
     """
 
     name: ClassVar[str] = "host-stage"
@@ -183,7 +165,6 @@ class HostStageLatency(LayeredLatency):
     per_call_us: int = 0
 
     def __post_init__(self) -> None:
-        """Check the options."""
         costs = self.per_iteration_us, self.per_cell_us, self.per_call_us
         if min(costs) < 0:
             raise EvaluationError(
@@ -201,7 +182,7 @@ class HostStageLatency(LayeredLatency):
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return the options, and what is added to."""
+        """Return the options, and the source below."""
         return {
             "per_iteration_us": self.per_iteration_us,
             "per_cell_us": self.per_cell_us,

@@ -1,4 +1,4 @@
-"""A policy that runs an ONNX file, in whichever world it drives."""
+"""A policy that runs an ONNX file."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +10,7 @@ from me2e_compress.driving.adapter.outputs import ModelOutputs
 from me2e_compress.driving.adapter.recurrent import FirstValues, answers_by_input
 from me2e_compress.driving.answer import PLAN_TIMES_S, six_waypoints
 from me2e_compress.driving.contract import Answer, Observation, RouteInfo, Trajectory
-from me2e_compress.driving.host_stage import HostStage
+from me2e_compress.driving.host_stage import HostStage, HostWork
 from me2e_compress.driving.ports import fits
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.runtime.any_session import AnySession
@@ -23,22 +23,12 @@ from me2e_compress.runtime.stack.stack_session import open_session
 class OnnxPolicy:
     """Runs an ONNX graph or a stack of several, on one thread that does not spin.
 
-    Inputs ``img`` float [1, 6, 3, H, W], ``lidar2img`` [1, 6, 4, 4], ``can_bus`` [18],
-    ``command`` int64 [1] and ``timestamp`` float [1], seconds since the route began, of
-    which a model may lack any; recurrent inputs ``X`` answered by ``X_out``, zeros at
-    the start of a route; output ``plan`` [1, 6, 2]. An `Adapter` maps other names and
-    layouts, first values, waypoints of any number and spacing, and controls.
-
-    Attributes:
-        session: The loaded graph.
-        adapter: How its ports relate to the contract.
-        inputs: How it is fed.
-        outputs: How its answer is read.
-        recurrent: Recurrent input to the output that answers it.
-        first: What these hold where a route begins.
-        stage: Changes the plan on the host; None leaves it as the network has it.
-        host_iterations: Of that stage, for the latest plan.
-        host_cells: That the stage took into account, for the latest plan.
+    Inputs are ``img`` float [1, 6, 3, H, W], ``lidar2img`` [1, 6, 4, 4], ``can_bus``
+    [18], ``command`` int64 [1] and ``timestamp`` float [1], seconds since the route
+    began; a model may lack any of them. A recurrent input ``X`` is answered by the
+    output ``X_out`` and zero at the start of a route. The output is ``plan`` [1, 6, 2].
+    An `Adapter` maps other names and layouts, first values, waypoints of any number and
+    spacing, and controls. ``stage`` changes the plan on the host.
     """
 
     session: AnySession
@@ -62,17 +52,10 @@ class OnnxPolicy:
         provider: Provider = CPU,
         stage: HostStage | None = None,
     ) -> Self:
-        """Load a model and run it once on zeros.
-
-        Args:
-            path: The file, or the TOML of a stack of several.
-            adapter: How its ports relate to the contract; None where they keep it.
-            provider: What runs it.
-            stage: Changes the plan on the host; None leaves it.
+        """Load a file, or the TOML of a stack of several, and run it once on zeros.
 
         Raises:
             EvaluationError: It cannot be run, or does not keep the contract.
-            ProviderError: The provider is not there.
         """
         try:
             session = open_session(path, threads=1, provider=provider)
@@ -85,13 +68,7 @@ class OnnxPolicy:
     def of(
         cls, session: AnySession, adapter: Adapter, stage: HostStage | None = None
     ) -> Self:
-        """Drive a graph that is open, and run it once on zeros; see :meth:`open`.
-
-        Raises:
-            EvaluationError: It does not keep the contract.
-            FramesError: It cannot be fed.
-            GraphError: A node of the model failed.
-        """
+        """Drive a graph that is open, and run it once on zeros; see :meth:`open`."""
         recurrent = recurrent_of(session, adapter)
         inputs = ModelInputs.of(session, adapter, recurrent)
         outputs = ModelOutputs.of(session, adapter)
@@ -111,7 +88,7 @@ class OnnxPolicy:
 
     @property
     def normalization(self) -> ImageNormalization | None:
-        """How the images are normalised; None where they are not."""
+        """How the images are normalised; None if they are not."""
         return self.inputs.normalization
 
     @property
@@ -120,7 +97,7 @@ class OnnxPolicy:
         return self.inputs.image_size
 
     def reset(self, route: RouteInfo | None) -> None:
-        """Begin a route: recurrent inputs hold their first values again."""
+        """Begin a route: recurrent inputs return to their first values."""
         self._begins = True
         known = self.session.first_state(self.first.held)
         self.inputs.reset()
@@ -129,13 +106,7 @@ class OnnxPolicy:
         self._state = {**self.first.zeros, **own}
 
     def plan(self, observation: Observation) -> Answer:
-        """Run the model once.
-
-        Raises:
-            EvaluationError: It needs images and there are none, or the host stage lacks
-                an output.
-            GraphError: A node of the model failed.
-        """
+        """Run the model once."""
         feeds = self.feeds(observation)
         if self._begins:
             self._state |= self.first.at(feeds)
@@ -150,17 +121,18 @@ class OnnxPolicy:
     def _changed(
         self, plan: Trajectory, stage: HostStage, outputs: dict[str, Array]
     ) -> Trajectory:
-        """Let the host change the plan, as six waypoints every 0.5 s."""
+        """Run the host stage on the plan, as six waypoints every 0.5 s."""
         work = stage.work(six_waypoints(plan), outputs)
+        if not isinstance(work, HostWork):
+            kind = type(work).__name__
+            raise EvaluationError(
+                f"{stage.name}: work returned {kind}: it must be a HostWork"
+            )
         self.host_iterations, self.host_cells = work.iterations, work.cells
         return Trajectory(work.plan, PLAN_TIMES_S)
 
     def feeds(self, observation: Observation) -> dict[str, Array]:
-        """Lay an observation out as the graph takes it, recurrent inputs left out.
-
-        Raises:
-            EvaluationError: It needs images and there are none.
-        """
+        """Convert an observation to the graph's inputs, without recurrent ones."""
         return self.inputs.feeds(observation)
 
     def _dry_run(self) -> None:

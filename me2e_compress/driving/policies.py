@@ -1,4 +1,4 @@
-"""Who drives, by name: data that any process can open a policy from.
+"""Policies by name: data from which any process can open a policy.
 
 To add a policy: write its class, then add it to this table.
 """
@@ -37,11 +37,7 @@ class SizedPolicy(Policy, Protocol):
 
 @dataclass(frozen=True)
 class Driver(abc.ABC):
-    """What opens a policy: derive a frozen dataclass, its fields are options.
-
-    Class attributes:
-        name: What the command line and studies call it.
-    """
+    """Opens a policy: derive a frozen dataclass whose fields are the options."""
 
     name: ClassVar[str]
 
@@ -54,19 +50,19 @@ class Driver(abc.ABC):
         """
 
     def resolved(self) -> "Driver":
-        """Return the driver that this one is another name for; else itself."""
+        """Return the driver that this one is an alias of; else itself."""
         return self
 
     @property
     def label(self) -> str:
-        """What tables and pictures call it."""
+        """The name in tables and pictures."""
         return POLICIES.text(self)
 
     def fingerprint(self) -> str:
         """Return what identifies the policy in results.
 
-        That is its text and digests of the files that its options name; where more
-        decides what it does, its own method says so.
+        Override it if more than its text and the files in its options decide what it
+        does.
         """
         values = (getattr(self, field.name) for field in fields(self))
         files = [value for value in values if isinstance(value, Path)]
@@ -89,10 +85,10 @@ POLICIES: Registry[Driver] = Registry(
 )
 
 MODEL = "onnx"
-"""The policy that a path means."""
+"""The policy of a text that is a path."""
 
 PYTHON = "python"
-"""The policy that ``package.module:function`` means."""
+"""The policy of a text ``package.module:function``."""
 
 _MEMBERS = ("needs_images", "privileged", "reset", "plan")
 _FACTORY = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
@@ -104,8 +100,7 @@ def driver_named(text: str, adapter: Path | None = None) -> Driver:
     Args:
         text: ``expert``, ``blind:8``, ``onnx{path=M.onnx, adapter=A.toml}``,
             ``highway`` for the driver that ships, the name of another package's policy,
-            ``package.module:function`` for what a Python function makes, or else a
-            path.
+            ``package.module:function`` for a Python function's result, or else a path.
         adapter: TOML file that adapts a model; a policy without models ignores it.
 
     Raises:
@@ -130,10 +125,10 @@ def driver_named(text: str, adapter: Path | None = None) -> Driver:
 
 
 def opened(driver: Driver) -> Policy:
-    """Open a driver's policy, and look that it is one.
+    """Open a driver's policy, and check that it has the members of `Policy`.
 
     Raises:
-        EvaluationError: It cannot be opened, or lacks a member of `Policy`.
+        EvaluationError: It cannot be opened, or lacks a member.
     """
     policy = driver.open()
     if lacks := [member for member in _MEMBERS if not hasattr(policy, member)]:

@@ -1,4 +1,4 @@
-"""The ports of a graph: whether a shape fits, and what is fed to them."""
+"""The ports of a graph: fit of shapes, and conversion of arrays."""
 
 import numpy as np
 
@@ -20,11 +20,7 @@ def image_size(port: SessionPort) -> tuple[int, int]:
 
 
 def zeros(name: str, port: SessionPort) -> Array:
-    """Return the first value of a recurrent input.
-
-    Raises:
-        EvaluationError: Its shape is open.
-    """
+    """Return the first value of a recurrent input."""
     shape = tuple(side for side in port.shape if isinstance(side, int))
     if len(shape) != len(port.shape):
         raise EvaluationError(
@@ -35,7 +31,7 @@ def zeros(name: str, port: SessionPort) -> Array:
 
 
 def fed(array: Array, port: SessionPort) -> Array:
-    """Return an array with the number of dimensions and the type of a port."""
+    """Return an array with the rank and type of a port."""
     missing = len(port.shape) - array.ndim
     sides = (1,) * missing + array.shape if missing >= 0 else array.shape[-missing:]
     return array.reshape(sides).astype(DTYPES[port.type], copy=False)

@@ -1,4 +1,4 @@
-"""A policy that a Python function makes, without a package of its own."""
+"""A policy made by a Python function, without a package of its own."""
 
 import hashlib
 import importlib
@@ -23,28 +23,19 @@ class PythonDriver(Driver):
     Attributes:
         factory: ``package.module:function``, called without arguments; it returns a
             policy or a driver. Modules are looked for in the working folder, too.
-
-    Raises:
-        EvaluationError: A text of another form.
     """
 
     name: ClassVar[str] = "python"
     factory: str
 
     def __post_init__(self) -> None:
-        """Check the form."""
         if _FACTORY.fullmatch(self.factory) is None:
             raise EvaluationError(
                 f"{self.factory!r} is not of the form package.module:function"
             )
 
     def open(self) -> Policy:
-        """Import the module and make the policy.
-
-        Raises:
-            EvaluationError: It cannot be imported, has no such function, or that
-                raises.
-        """
+        """Import the module and make the policy."""
         module, name = self.factory.split(":")
         _look_here()
         try:

@@ -11,7 +11,10 @@ skips no decision: `LatencyModel`.
 from collections import deque
 from dataclasses import dataclass, field
 from enum import StrEnum
+from numbers import Integral
 from typing import Generic, Protocol, TypeVar
+
+from me2e_compress.errors import EvaluationError
 
 DT_US = 50_000
 """Step of the benchmark's simulators: 20 Hz."""
@@ -74,7 +77,7 @@ def skipped_decisions(latency_us: int, dt_us: int = DT_US) -> int:
         latency_us: How long the inference took, microseconds.
         dt_us: Step of the simulated world, microseconds.
     """
-    return max(0, latency_us // dt_us - 1)
+    return max(0, _whole(latency_us) // dt_us - 1)
 
 
 @dataclass
@@ -132,7 +135,16 @@ def delayed_frames(latency_us: int, dt_us: int = DT_US) -> int:
         latency_us: How long the inference took, microseconds.
         dt_us: Step of the simulated world, microseconds.
     """
-    return -(-latency_us // dt_us)
+    return -(-_whole(latency_us) // dt_us)
+
+
+def _whole(latency_us: int) -> int:
+    if not isinstance(latency_us, Integral) or latency_us < 0:
+        raise EvaluationError(
+            f"a latency source charged {latency_us!r}: it must be whole microseconds,"
+            " 0 or more"
+        )
+    return latency_us
 
 
 @dataclass

@@ -1,8 +1,8 @@
 """Waypoints to throttle, brake and steering, as Bench2Drive's VAD and UniAD agents do.
 
 Two PID controllers over sliding windows: one steers towards a waypoint some metres
-ahead, one presses the throttle towards the mean speed of the plan. The defaults are
-those of TCP (OpenDriveLab/TCP, TCP/config.py and model.py ``control_pid``), which
+ahead, one drives the speed towards the mean speed of the plan. The defaults are those
+of TCP (OpenDriveLab/TCP, TCP/config.py and model.py ``control_pid``), which
 Bench2DriveZoo's ``team_code/pid_controller.py`` repeats; forks tune them, so each is an
 option.
 """
@@ -20,32 +20,32 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.trajectory import Trajectory
 
 Place = tuple[float, float]
-"""Metres to the right and forward."""
+"""A position: metres to the right and forward."""
 
 
 class PidOptions(BaseModel):
     """Gains and limits.
 
     Attributes:
-        turn_kp: Of the angle to the aim, a quarter turn being 1.
-        turn_ki: Of its mean over the window.
-        turn_kd: Of its change since the last decision.
-        turn_window: Decisions; at 20 Hz, 40 are 2 s.
-        speed_kp: Of the speed that is missing, m/s.
-        speed_ki: Of its mean over the window.
-        speed_kd: Of its change since the last decision.
-        speed_window: Decisions.
+        turn_kp: Gain of the angle to the aim, a quarter turn being 1.
+        turn_ki: Gain of the angle's mean over the window.
+        turn_kd: Gain of the angle's change since the last decision.
+        turn_window: Length in decisions; at 20 Hz, 40 are 2 s.
+        speed_kp: Gain of the missing speed, m/s.
+        speed_ki: Gain of its mean over the window.
+        speed_kd: Gain of its change since the last decision.
+        speed_window: Length in decisions.
         max_throttle: Upper limit.
         brake_speed_mps: A plan slower than this brakes.
-        brake_ratio: So does one that is this many times slower than the ego.
-        clip_delta_mps: The most missing speed that is looked at.
-        aim_m: The waypoint aimed at is that whose middle with the next is nearest to
-            this far away.
-        angle_threshold: The route's node takes the waypoint's place where its angle
-            and that of the plan's end differ by more, quarter turns,
-        node_within_m: and it is less far ahead than this; or where its angle is the
+        brake_ratio: So does a plan that is slower than the ego by this factor.
+        clip_delta_mps: Upper limit of the missing speed.
+        aim_m: The aim is the waypoint whose midpoint with the next one is nearest to
+            this distance.
+        angle_threshold: The route's node replaces the waypoint if its angle differs
+            from that of the plan's end by more than this, in quarter turns,
+        node_within_m: and it is less far ahead than this; or if its angle is the
             smaller one.
-        coast_above_mps: Faster than this the throttle is let go; UniAD's agent has 5,
+        coast_above_mps: Above this speed the throttle is released; UniAD's agent has 5,
             VAD's no such limit.
     """
 
@@ -70,11 +70,7 @@ class PidOptions(BaseModel):
 
 
 class WaypointPid:
-    """Follows one plan after the other; its windows count decisions, not seconds.
-
-    Args:
-        options: Gains and limits.
-    """
+    """Follows one plan after the other; its windows count decisions, not seconds."""
 
     def __init__(self, options: PidOptions) -> None:
         self.options = options
@@ -84,16 +80,11 @@ class WaypointPid:
     def control(
         self, plan: Plan | Trajectory, speed_mps: float, node: Place
     ) -> PedalsAndWheel:
-        """Return what follows from one plan.
+        """Return the controls that follow a plan of two waypoints or more.
 
-        Args:
-            plan: Two waypoints or more, metres, x forward, y left.
-            speed_mps: Of the ego.
-            node: The next node of the route, metres to the right and forward.
-
-        Raises:
-            EvaluationError: The plan has one waypoint, which has no speed.
+        ``node`` is the next node of the route, metres to the right and forward.
         """
+        # mean speed of the plan, its waypoints as (right, forward)
         asked, trajectory = self.options, timed(plan)
         forward, left = trajectory.points.T
         waypoints = np.stack([-left, forward], axis=1).astype(np.float64)
@@ -102,6 +93,7 @@ class WaypointPid:
         steps = np.hypot(*np.diff(waypoints, axis=0).T)
         wanted_mps = float(np.mean(steps) / np.mean(np.diff(trajectory.times_s)))
         steer = self._steering(waypoints, node)
+        # throttle towards that speed; brake where the plan is slow or the ego too fast
         missing = min(max(wanted_mps - speed_mps, 0.0), asked.clip_delta_mps)
         self._misses.append(missing)
         gains = asked.speed_kp, asked.speed_ki, asked.speed_kd
@@ -128,7 +120,7 @@ class WaypointPid:
 
 
 def _quarter_turns(right: float, forward: float) -> float:
-    """Return an angle from straight ahead to the right; behind to the left above 2."""
+    """Return the angle from straight ahead to the right; up to 3 behind to the left."""
     return 1.0 - math.atan2(forward, right) / (math.pi / 2)
 
 

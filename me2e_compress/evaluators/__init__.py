@@ -1,4 +1,4 @@
-"""What drives a compressed model, or reads how it drove.
+"""Evaluators: they drive a compressed model, or read how it drove.
 
 To add an evaluator: write its class, then add it to this table.
 """

@@ -24,12 +24,9 @@ Watch: TypeAlias = Callable[[dict[str, Array], dict[str, Array], Frame], None]
 class OutputFidelity:
     """One output, all frames pooled.
 
-    Attributes:
-        name: of the output.
-        sqnr_db: 10 log10(sum a^2 / sum (a - b)^2) in dB; infinite where they are equal.
-        error: max|a - b| / max|a|; infinite where a is zero and b is not.
-        discrete: whether it holds whole numbers or booleans, such as labels: their
-            SQNR says little.
+    ``sqnr_db`` is 10 log10(sum a^2 / sum (a - b)^2), infinite where they are equal;
+    ``error`` is max|a - b| / max|a|, infinite where a is zero and b is not. The SQNR of
+    ``discrete`` outputs (whole numbers or booleans, such as labels) says little.
     """
 
     name: str
@@ -40,12 +37,7 @@ class OutputFidelity:
 
 @dataclasses.dataclass(frozen=True)
 class Displacement:
-    """Displacement of the waypoints, Euclidean, over all frames and waypoints.
-
-    Attributes:
-        mean_m: mean, metres.
-        max_m: largest, metres.
-    """
+    """Euclidean displacement of the waypoints, metres, over all frames."""
 
     mean_m: float
     max_m: float
@@ -56,15 +48,14 @@ class Fidelity:
     """The result of comparing two models over a recording.
 
     Attributes:
-        outputs: those that both models have, in the first model's order.
+        outputs: outputs that both models have, in the first model's order.
         missing: outputs of the first model that the second lacks.
-        plan: how far the plan moved; None where it was not measured.
-        plan_reason: why not; empty where it was.
+        plan: displacement of the plan; None if it was not measured, for `plan_reason`.
         frames: how many were compared.
-        plan_output: the output that holds the plan; empty where it was not measured.
-        agents: outputs that are sets of agents, matched; None where there are none.
-        same_choice: share of frames on which both choose the same candidate of a
-            scored plan; None where no scores choose it.
+        plan_output: the output that holds the plan; empty if it was not measured.
+        agents: outputs that are sets of agents, matched; None if there are none.
+        same_choice: share of frames on which both choose the same candidate of a scored
+            plan; None if no scores choose it.
     """
 
     outputs: tuple[OutputFidelity, ...]
@@ -79,12 +70,9 @@ class Fidelity:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Reference:
-    """Answers of a reference model, to compare many others with.
+    """A reference model with its answers, to compare many other models with.
 
-    Attributes:
-        session: the model.
-        frames: the recording.
-        answers: its outputs on every frame, all in memory.
+    ``answers`` holds its outputs on every frame, all in memory.
     """
 
     session: AnySession
@@ -100,9 +88,8 @@ class Reference:
     def compare(self, other: AnySession, frames: Frames | None = None) -> Fidelity:
         """Compare another model with it, as :func:`compare` does.
 
-        Args:
-            other: the model; the reference itself, to see what other frames change.
-            frames: what it is shown; None shows it the same.
+        ``frames`` replaces the recording for the other model; to see what other frames
+        change, pass the reference model itself.
         """
         shown = self.frames if frames is None else frames
         return _compare(self.session, iter(self.answers), other, shown)
@@ -113,17 +100,12 @@ def compare(
 ) -> Fidelity:
     """Run two models over the same frames, each with its own recurrent state.
 
-    All arithmetic is float64. One frame is in memory at a time.
-
-    Args:
-        a: the reference.
-        b: what was made of it.
-        frames: the recording.
-        watch: is shown the outputs of both on every frame.
+    All arithmetic is float64. One frame is in memory at a time. ``a`` is the reference;
+    ``watch`` is shown the outputs of both on every frame.
 
     Raises:
-        EvaluationError: no common output, no frame, an output changes its shape, or
-            is not finite; the message names it.
+        EvaluationError: no common output, no frame, or an output that changes its shape
+            or is not finite.
         FramesError: a frame does not fit one of the models.
     """
     here, there = itertools.tee(frames)
@@ -142,12 +124,14 @@ def _compare(
         raise EvaluationError(
             f"no output in common: {', '.join(a.outputs)} and {', '.join(b.outputs)}"
         )
+    # what can be compared: single outputs, the plan, sets of agents
     tallies = {name: _Tally(name) for name in shared}
     adapter, reason = common_adapter(a, b)
     named = SetOutputs.of(a.metadata, {name: a.outputs[name].shape for name in shared})
     sets = None if named is None else SetTally(named)
     moved, chosen = list[Float64](), list[bool]()
     count = 0
+    # frame by frame, with one frame in memory
     there, along = itertools.tee(frames)
     runs = zip(answers, replay(b, there, shared), along, strict=True)
     for left, right, frame in runs:
@@ -178,12 +162,7 @@ def _compare(
 
 
 def common_adapter(a: AnySession, b: AnySession) -> tuple[PlanAdapter | None, str]:
-    """Return how the plan of both is read; else None and the reason.
-
-    Raises:
-        GraphError: the metadata of the first is malformed, or its plan has several
-            modes and nothing picks one.
-    """
+    """Return how the plan of both models is read; else None and the reason."""
     adapter = PlanAdapter.of(a.metadata, list(a.outputs))
     if adapter is None:
         return None, "the model does not say which output is its plan"
@@ -200,11 +179,11 @@ def common_adapter(a: AnySession, b: AnySession) -> tuple[PlanAdapter | None, st
 
 
 MODES_RANK = 4
-"""Of a plan with modes: [1, modes, n, 2]."""
+"""Rank of a plan with modes: [1, modes, n, 2]."""
 
 
 class _Tally:
-    """Sums of one output."""
+    """Sums over frames of one output."""
 
     def __init__(self, name: str) -> None:
         self.name = name

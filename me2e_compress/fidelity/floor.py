@@ -1,4 +1,4 @@
-"""The floor under fidelity: what fell below it, and which outputs it cannot judge."""
+"""The floor of fidelity: what falls below it, and which outputs it cannot judge."""
 
 import dataclasses
 import math
@@ -16,7 +16,7 @@ PLAN_FLOOR_M = 0.5
 """A car 1.9 m wide in the middle of a lane of 3.5 m still keeps 0.3 m to its lines."""
 
 MOST_EXCESS = 1e6
-"""What an output has that ought to be zero and is not."""
+"""Excess of an output that should be zero and is not."""
 
 STEPS = 127
 """Int8's grid has so many steps on either side of zero."""
@@ -26,11 +26,8 @@ STEPS = 127
 class Shortfall:
     """One figure below the floor.
 
-    Attributes:
-        output: of the model; the one that holds the plan is judged in metres.
-        value: what was measured: dB, or metres of the mean displacement.
-        unit: ``dB`` or ``m``.
-        excess: amplitude of the noise over the largest that the floor allows, above 1.
+    ``value`` is in dB, or for the plan the mean displacement in metres; ``excess`` is
+    the noise amplitude over the largest that the floor allows, above 1.
     """
 
     output: str
@@ -39,7 +36,6 @@ class Shortfall:
     excess: float
 
     def __str__(self) -> str:
-        """Return output, value and unit."""
         return f"{self.output} {shown(self.value, self.unit)}"
 
 
@@ -57,11 +53,9 @@ class Floor:
     plan_m: float = PLAN_FLOOR_M
 
     def excess(self, found: Fidelity, output: str) -> float:
-        """Return the noise of an output over what is allowed: above 1 is too much.
+        """Return an output's noise over what is allowed: above 1 is too much.
 
-        Args:
-            found: what was measured.
-            output: of the model; one that was not compared has no noise.
+        An output that was not compared has no noise.
         """
         if found.plan is not None and output == found.plan_output:
             return found.plan.mean_m / self.plan_m
@@ -72,12 +66,7 @@ class Floor:
     def shortfalls(
         self, found: Fidelity, unsteady: Collection[str] = ()
     ) -> tuple[Shortfall, ...]:
-        """List what is below the floor, the worst first.
-
-        Args:
-            found: what was measured.
-            unsteady: outputs that are not judged.
-        """
+        """List what is below the floor, the worst first, without unsteady outputs."""
         below = []
         for each in found.outputs:
             excess = self.excess(found, each.name)
@@ -90,25 +79,22 @@ class Floor:
         return tuple(sorted(below, key=lambda each: -each.excess))
 
     def __str__(self) -> str:
-        """Return both limits."""
         return f"{self.sqnr_db:g} dB, {self.plan_m:g} m of plan"
 
 
 def shown(value: float, unit: str) -> str:
-    """Write a figure with its unit: dB to a tenth, metres to the centimetre."""
+    """Format a figure with its unit: dB to a tenth, metres to the centimetre."""
     return f"{value:z.1f} dB" if unit == "dB" else f"{value:.2f} {unit}"
 
 
 def unsteady_outputs(reference: Reference, floor: Floor) -> dict[str, float]:
     """Find the outputs that fall below the floor although nothing was compressed.
 
-    The model itself is shown its frames again, their largest float input (the images,
-    as a rule) rounded to int8: less than int8 anywhere in the graph does. An output
-    that this puts below the floor chooses between candidates that are nearly equal;
-    its SQNR counts the choices and says little of the graph.
-
-    Returns:
-        Its SQNR then, dB, by output; of the plan the displacement, metres.
+    The model runs on its frames again, their largest float input (usually the images)
+    rounded to int8, which is a smaller change than int8 anywhere in the graph. An
+    output that this puts below the floor chooses between candidates that are nearly
+    equal; its SQNR counts the choices and says little of the graph. Returns the SQNR by
+    output, dB; for the plan the displacement, metres.
     """
     session = reference.session
     rounded = reference.compare(
@@ -119,7 +105,7 @@ def unsteady_outputs(reference: Reference, floor: Floor) -> dict[str, float]:
 
 @dataclasses.dataclass(frozen=True)
 class _Rounded:
-    """Frames whose largest float input, states apart, lies on int8's grid."""
+    """Frames whose largest float input, states excepted, is rounded to int8's grid."""
 
     frames: Frames
     states: tuple[str, ...]

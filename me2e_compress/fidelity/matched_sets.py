@@ -1,8 +1,8 @@
-"""Agents as sets: each of one model's is held against the other's nearest.
+"""Agents as sets: each of one model's is compared with the other's nearest.
 
-A detector that keeps its strongest peaks puts them in the order of their strength;
-rounding swaps two of nearly the same, and a comparison slot by slot takes one car for
-another. Only sure agents count here: the rest of the slots come and go.
+A detector that keeps its strongest peaks sorts them by strength; rounding swaps two of
+nearly the same strength, so a comparison slot by slot compares different cars. Only
+sure agents count here: the rest of the slots come and go.
 """
 
 import math
@@ -35,12 +35,8 @@ Ints: TypeAlias = npt.NDArray[np.int64]
 class SetOutputs(pydantic.BaseModel):
     """Outputs [1, agents, ...] whose rows belong together, in no order.
 
-    Queries that are learned, as in DETR, keep their slots: compare those slot by slot.
-
-    Attributes:
-        boxes: x and y come first in a row, metres.
-        scores: [1, agents] probabilities.
-        others: more outputs with a row an agent.
+    Rows of ``boxes`` begin with x and y, metres; ``scores`` are probabilities [1,
+    agents]. Learned queries, as in DETR, keep their slots: compare those slot by slot.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -53,13 +49,9 @@ class SetOutputs(pydantic.BaseModel):
     def of(
         cls, metadata: Mapping[str, str], shapes: Mapping[str, Sequence[object]]
     ) -> Self | None:
-        """Read it from a model's metadata; else outputs of the default names are one.
+        """Read it from a model's metadata; else look for outputs of the default names.
 
-        Returns:
-            Which outputs; None if the model has none, or lacks one of them.
-
-        Raises:
-            GraphError: the metadata is malformed.
+        Returns None if the model has no such metadata, or lacks one of the outputs.
         """
         text = metadata.get(SETS)
         try:
@@ -86,13 +78,11 @@ def _read(text: str) -> object:
 class SetFidelity:
     """Sure agents of the first model against those of the second, all frames pooled.
 
-    Attributes:
-        agents: that the first model is sure of.
-        found: of them, those with an agent of the second within 2 m.
-        kept: of those, where the second is sure as well.
-        added: that the second is sure of, and the first has none within 2 m.
-        centre_m: mean distance of the centres of those found, metres; None without.
-        sqnr_db: by output, over those found, as slot by slot; infinite where equal.
+    Of the ``agents`` that the first model is sure of, ``found`` have one of the second
+    within 2 m, and for ``kept`` of these the second is sure as well; ``added`` are
+    those that the second is sure of without one of the first within 2 m. ``centre_m``
+    is the mean distance of those found (None without), ``sqnr_db`` is over them, by
+    output.
     """
 
     agents: int
@@ -115,9 +105,10 @@ class SetTally:
     power: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, left: Mapping[str, Array], right: Mapping[str, Array]) -> None:
-        """Match one frame: the assignment whose distances are the smallest in sum."""
+        """Match one frame: the assignment with the smallest sum of distances."""
         from scipy.optimize import linear_sum_assignment  # takes long to import
 
+        # sure agents of the first model to the nearest of the second, each used once
         named = self.outputs
         places, others = (each[named.boxes][0, :, :2] for each in (left, right))
         sure, secure = (each[named.scores][0] >= SURE for each in (left, right))
@@ -129,10 +120,12 @@ class SetTally:
         picked, columns = linear_sum_assignment(np.minimum(away[rows], SAME_M))
         near = away[rows[picked], columns] < SAME_M
         mine, theirs = rows[picked][near], columns[near]
+        # found, kept and added agents
         self.away_m += away[mine, theirs].tolist()
         self.kept += int(secure[theirs].sum())
         new = np.setdiff1d(np.flatnonzero(secure), theirs)
         self.added += int((away[:, new].min(axis=0, initial=np.inf) >= SAME_M).sum())
+        # signal and noise of matched rows
         for name in (named.boxes, named.scores, *named.others):
             one = np.asarray(left[name][0][mine], np.float64)
             gap = one - np.asarray(right[name][0][theirs], np.float64)
@@ -141,7 +134,7 @@ class SetTally:
             sums[1] += float(np.vdot(gap, gap))
 
     def result(self) -> SetFidelity:
-        """Return what was found."""
+        """Return the figures of all frames."""
         found = len(self.away_m)
         return SetFidelity(
             *(self.agents, found, self.kept, self.added),

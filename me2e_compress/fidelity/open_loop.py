@@ -1,4 +1,4 @@
-"""Plans of two models against what was really driven, frame by frame."""
+"""Plans of two models against the recorded drive, frame by frame."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -24,12 +24,11 @@ _COMMAND = "command"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class JudgedPlans:
-    """Both plans of one frame.
+    """Both plans of one frame of a scene.
 
-    Attributes:
-        scene: that it is of.
-        apart_m: [2, 6] how far each plan is from where the ego went, step by step.
-        hits: [2, 6] 1 where its box touches another's; None where they are not known.
+    ``apart_m`` [2, 6] is each plan's distance from the recorded position, step by step;
+    ``hits`` [2, 6] is 1 where its box touches another's, None where boxes are not
+    known.
     """
 
     scene: int
@@ -40,15 +39,10 @@ class JudgedPlans:
 class OpenLoopTally:
     """Distances and collisions, frame by frame.
 
-    Args:
-        adapter: how the plan is read. Where neither an input nor scores pick its mode,
-            the recorded command does.
-
-    Attributes:
-        judged: the plans of every frame whose next three seconds are known.
-        left_out: how many frames there are besides.
-        reach_s: how far all plans reach, at most the three seconds.
-        reason: why nothing is judged; empty where something may be.
+    Where neither an input nor scores pick the plan's mode, the recorded command does.
+    ``judged`` holds the plans of every frame whose next three seconds are known,
+    ``left_out`` counts the others; ``reach_s`` is how far all plans reach, at most
+    three seconds; ``reason`` says why nothing is judged, if so.
     """
 
     def __init__(self, adapter: PlanAdapter) -> None:
@@ -90,8 +84,8 @@ class OpenLoopTally:
 def _hits(plans: list[Floats], driven: Floats, future: RecordedFuture) -> Floats | None:
     """Return [2, 6]: 1 where a plan's box touches another; None if none are known.
 
-    Where the recorded drive touches a box itself (boxes are not exact) nobody is
-    blamed, as in UniAD and VAD.
+    Steps where the recorded drive itself touches a box (boxes are not exact) do not
+    count, as in UniAD and VAD.
     """
     if future.agents is None:
         return None
@@ -109,8 +103,8 @@ def _hits(plans: list[Floats], driven: Floats, future: RecordedFuture) -> Floats
 def ego_boxes(path: Floats, future: RecordedFuture) -> Floats:
     """Return the boxes of the ego along a path: x, y, heading, length, width [6, 5].
 
-    It looks where it comes from the waypoint before; where it hardly moves, it looks
-    as before.
+    Its heading is the direction from the waypoint before; if it hardly moves, the
+    heading stays.
     """
     heading, last, found = future.forward, np.zeros(2), list[list[float]]()
     ahead, left = _turned(np.array(future.centre), -future.forward)
@@ -129,7 +123,7 @@ def _turned(vector: Floats, angle: float) -> Floats:
 
 
 def _touches(box: Floats, others: Floats) -> bool:
-    """Return whether a box overlaps one of others [n, 5]: no axis parts them."""
+    """Return whether a box overlaps one of others [n, 5]: no axis separates them."""
     own, theirs = _axes(box[None]), _axes(others)
     axes = np.concatenate([np.broadcast_to(own, theirs.shape), theirs], axis=1)
     reach = np.abs(axes @ own[0].T) @ (box[3:] / 2)

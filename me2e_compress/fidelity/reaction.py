@@ -11,20 +11,12 @@ from me2e_compress.runtime.session import Session, replay
 def plan_reaction(
     session: Session, frame: Frame, other: Frame, *, image: str = "img", camera: int = 0
 ) -> float:
-    """Measure how far the plan moves when one camera's image is exchanged.
+    """Return how far the plan moves when one camera's image is exchanged.
 
     A network whose plan ignores its cameras scores perfectly in every comparison; this
-    tells it apart.
-
-    Args:
-        session: the model; its recurrent state starts from zeros.
-        frame: what it sees.
-        other: the frame whose image the camera shows instead.
-        image: the input that holds the images, [1, cameras, 3, H, W].
-        camera: which of them, from 0.
-
-    Returns:
-        |plan' - plan| / |plan|, Euclidean over all waypoints.
+    detects it. Camera ``camera`` of the input ``image``, [1, cameras, 3, H, W], shows
+    the image of ``other`` instead; the recurrent state starts from zeros. The result is
+    |plan' - plan| / |plan|, Euclidean over all waypoints.
 
     Raises:
         EvaluationError: the model has no plan, or the frame no such camera.

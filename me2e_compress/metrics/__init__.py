@@ -1,1 +1,1 @@
-"""Scores of episodes: they never see a simulator, a model or a pass."""
+"""Scores of driven episodes, independent of any simulator, model or pass."""

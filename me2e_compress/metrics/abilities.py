@@ -21,10 +21,9 @@ JUNCTION_MARGIN_M = 8.0
 def mastered(episode: Episode, ability: str) -> bool:
     """Return whether a route counts as a success for one of its abilities.
 
-    A route counts if it succeeded. For Traffic_Signs it also counts if the ego passed
-    its first junction by more than 8 m without running a stop sign or a red light,
-    whatever happened later (ability_benchmark.py of Bench2Drive 0.0.4; version 0.0.3
-    adds the two up instead and halves the sum).
+    For Traffic_Signs a failed route also counts if the ego passed its first junction by
+    more than 8 m without running a stop sign or a red light (ability_benchmark.py of
+    Bench2Drive 0.0.4; version 0.0.3 adds the two counts and halves the sum).
     """
     if episode.succeeded:
         return True

@@ -1,12 +1,12 @@
-"""Bench2Drive's abilities by the rules of its two tools, which differ in one of them.
+"""Success rates of Bench2Drive's abilities, by the rules of its two tools.
 
 Both count, for each ability, the successes among the evaluated routes that test it;
-routes without a record are left out of the count. For Traffic_Signs a route also
-*passes the junction* (J) if its completion exceeds (c + 8) / n, with n the points of
-its dense route and c the first of them on a junction, and no stop sign or red light was
-run. With S for a success, over N routes (tools/ability_benchmark.py):
+routes without a record are not counted. For Traffic_Signs a route also *passes the
+junction* (J) if its completion exceeds (c + 8) / n, where n is the number of points of
+its dense route and c the index of the first one on a junction, and if it ran no stop
+sign or red light. With S for a success, over N routes (tools/ability_benchmark.py):
 
-* 0.0.3 adds the two up: sum(S + J) / 2 N;
+* 0.0.3 adds the two: sum(S + J) / 2 N;
 * 0.0.4 takes either: sum(S or J) / N.
 """
 
@@ -33,11 +33,8 @@ def ability_rates(
 ) -> dict[str, Estimate]:
     """Return the rate of each ability in percent, and their arithmetic mean.
 
-    Args:
-        episodes: Evaluated routes.
-        rules: Of which tool.
-        junctions: (c + 8) / n by route; where it decides and is not there, the rate
-            of Traffic_Signs is None, and so is the mean.
+    ``junctions`` holds (c + 8) / n by route. If a value that matters is missing, the
+    rate of Traffic_Signs is None, and so is the mean.
     """
     rates = {
         ability: _rate([one for one in episodes if ability in one.abilities])
@@ -51,12 +48,7 @@ def ability_rates(
 def passes_the_junction(
     episode: Episode, junctions: Mapping[str, float]
 ) -> bool | None:
-    """Return J of a route; None where the place of its junction decides and is unknown.
-
-    Args:
-        episode: The route.
-        junctions: (c + 8) / n by route.
-    """
+    """Return J of a route; None if it depends on an unknown junction."""
     if any(each.kind in _BROKEN for each in episode.infractions):
         return False
     if episode.completion_percent <= 0.0:
@@ -68,21 +60,24 @@ def passes_the_junction(
 def _signs(
     episodes: Sequence[Episode], rules: Rules, junctions: Mapping[str, float]
 ) -> Estimate:
-    """Count Traffic_Signs; 0.0.4 asks for the junction of failed routes alone."""
+    """Rate Traffic_Signs; 0.0.4 needs the junctions of failed routes only."""
     either = rules == "0.0.4"
     asked = [one for one in episodes if not (either and success(one))]
+    # no rate if a junction that matters is unknown
     passed = {one.route: passes_the_junction(one, junctions) for one in asked}
     unknown = [route for route, each in passed.items() if each is None]
     if unknown:
         others = f" and {len(unknown) - 1} others" if len(unknown) > 1 else ""
         reason = f"where the junction is on {unknown[0]}{others} is not known"
         return Estimate(Measure(None, "%", reason), None, None, len(episodes))
+    # successes and passed junctions, by the rules of the version
     good = sum(success(one) for one in episodes)
     if either:
         return _share(good + sum(bool(each) for each in passed.values()), episodes)
     counted = good + sum(bool(each) for each in passed.values())
     if not episodes:
         return _share(0, episodes)
+    # the share; half a success has no binomial interval
     # half a success has no binomial interval
     rate = 100.0 * counted / (2 * len(episodes))
     return Estimate(Measure(rate, "%"), None, None, len(episodes))

@@ -1,14 +1,14 @@
-"""Bench2Drive's own arithmetic, to the digit, kept apart from ours.
+"""Bench2Drive's own arithmetic, reproduced exactly and kept apart from ours.
 
 What its tools compute (tools/efficiency_smoothness_benchmark.py, branches 0.0.3 and
-0.0.4) differs from what their names say; the published tables were made with it, so
-it is repeated here, faults included:
+0.0.4) differs from what their names say. The published tables were made with it, so it
+is reproduced here with its faults:
 
 * comfort compares degrees per second with a bound in radians per second, never takes
-  the derivative of the yaw rate that it calls yaw acceleration, differentiates with
-  0.1 s where frames are 0.05 s apart, smooths every block of 20 frames on its own and
-  the jerk twice, and takes the derivative of the length of the acceleration;
-* efficiency writes 100 % at check points without traffic and counts the last one
+  the derivative of the yaw rate that it calls yaw acceleration, differentiates with 0.1
+  s although frames are 0.05 s apart, smooths every block of 20 frames on its own and
+  the jerk twice, and differentiates the norm of the acceleration;
+* efficiency reports 100 % at check points without traffic and counts the last one
   twice.
 """
 
@@ -38,8 +38,8 @@ Floats = npt.NDArray[np.float64]
 def success(episode: Episode) -> bool:
     """Return whether a record counts as a success (tools/merge_route_json.py).
 
-    Its status is Completed or Perfect, and every list of infractions but that of low
-    speed is empty; without a status this is `Episode.succeeded`.
+    Its status must be Completed or Perfect, with no infraction but low speed; a record
+    without a status falls back to `Episode.succeeded`.
     """
     if episode.given is None:
         return episode.succeeded
@@ -49,7 +49,7 @@ def success(episode: Episode) -> bool:
 
 
 def efficiency(episode: Episode) -> Measure:
-    """Return the mean of the check points' percentages that are at most 1000 %."""
+    """Return the mean percentage of the check points that are at most 1000 %."""
     kept = [ratio for ratio in speed_ratios(episode) if ratio <= OUTLIER_PERCENT]
     if not kept:
         return Measure(None, PERCENT, "no check point below 1000 %")
@@ -60,7 +60,7 @@ def speed_ratios(episode: Episode) -> tuple[float, ...]:
     """Return the percentages that MinimumSpeedRouteTest would have reported.
 
     A check point is reached when more than a twentieth of the route, counted in whole
-    metres, was passed since the last; the rest counts if more than 95 % is done.
+    metres, was passed since the last one; the rest counts if more than 95 % is done.
     """
     if episode.speed_ratios_percent is not None:
         return episode.speed_ratios_percent
@@ -92,11 +92,12 @@ def _percent(stretch: list[EgoFrame]) -> float:
 def smoothness(episode: Episode) -> Measure:
     """Return the share of smooth blocks of 20 frames ("Driving Smoothness").
 
-    Up to 20 frames are one block; fewer than 3 stop the original with an error.
+    Up to 20 frames form one block; with fewer than 3 the original raises an error.
     """
     frames = episode.frames
     if len(frames) < 3:
         return Measure(None, "ratio", f"{len(frames)} frames, 3 are needed")
+    # columns [4, N]: along, across, norm, yaw rate in degrees per second
     columns = np.array(
         [
             (
@@ -108,6 +109,7 @@ def smoothness(episode: Episode) -> Measure:
             for frame in frames
         ]
     ).T
+    # whole blocks only; the rest is dropped
     length = min(len(frames), BLOCK_FRAMES)
     blocks = len(frames) // length
     cut = columns[:, : blocks * length].reshape(len(columns), blocks, length)
@@ -119,17 +121,16 @@ def smooth_blocks(
 ) -> npt.NDArray[np.bool_]:
     """Return [B] whether all samples of a block lie within the bounds.
 
-    Args:
-        along: [B, N] acceleration along the heading, m/s2.
-        across: [B, N] acceleration across it, m/s2.
-        length: [B, N] length of the acceleration in the plane, m/s2.
-        yaw_rate_degps: [B, N] degrees per second.
+    All arguments are [B, N]: the acceleration along the heading, across it and its norm
+    in the plane (m/s2), and the yaw rate in degrees per second.
     """
+    # the yaw rate is unwrapped as the original does, with radians on degrees
     a_along, a_across, a_length = map(_smoothed, (along, across, length))
     turns = np.round(np.diff(yaw_rate_degps) / (2.0 * np.pi)).cumsum(axis=1)
     turned = np.pad(turns, ((0, 0), (1, 0)))
     yaw_rate = _smoothed(yaw_rate_degps - 2.0 * np.pi * turned)
     yaw_acceleration = yaw_rate
+    # bounds in SI units, which the original compares with degrees
     within = (
         (a_along > -4.05) & (a_along < 2.40),
         np.abs(a_across) < 4.89,

@@ -21,7 +21,7 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """Expert ranges of the six variables, in SI units (the paper's table 1).
+    """Bounds of the six variables, in SI units (the paper's table 1).
 
     They are the 99th percentiles of human drivers that nuPlan's comfort metric uses.
     """
@@ -41,19 +41,17 @@ BOUNDS = Bounds()
 def comfort(episode: Episode, bounds: Bounds = BOUNDS) -> Measure:
     """Return the share of segments of 20 frames in which every frame is smooth.
 
-    Equation 7 with all six variables in SI units and the frames' own interval, which
-    is 0.05 s unless a real run recorded fewer:
+    Equation 7 with all six variables in SI units and the frames' own interval, which is
+    0.05 s unless a real run recorded fewer frames:
 
     * accelerations and yaw rate are smoothed (Savitzky-Golay, 7 frames, order 2) over
-      the whole route before it is cut;
-    * the yaw acceleration is the filter's derivative of the yaw rate, the longitudinal
-      jerk that of the longitudinal acceleration, and the jerk is the length of the
-      derivative of the acceleration vector in the plane of the road;
-    * the bounds belong to the range;
-    * an incomplete last segment is dropped;
-    * frames of a stop that blocks the route (at most 0.1 m/s for 60 s, where the route
-      ends; the paper's "more than 60 s" would never come) are smooth whatever the
-      filter makes of them.
+      the whole route before it is cut into segments;
+    * yaw acceleration and longitudinal jerk are the filter's derivatives of yaw rate
+      and longitudinal acceleration; the jerk is the norm of the derivative of the
+      acceleration vector in the plane of the road;
+    * the bounds are inclusive, and an incomplete last segment is dropped;
+    * frames of a stop that blocks the route always count as smooth (at most 0.1 m/s for
+      60 s, where the route ends; the paper's "more than 60 s" never occurs).
     """
     if len(episode.frames) < SEGMENT_FRAMES:
         frames = len(episode.frames)
@@ -62,11 +60,11 @@ def comfort(episode: Episode, bounds: Bounds = BOUNDS) -> Measure:
 
 
 def comfort_in_motion(episode: Episode, bounds: Bounds = BOUNDS) -> Measure:
-    """Return the same share over the segments in which the ego moved.
+    """Return the comfort over the segments in which the ego moved.
 
-    Who stands is comfortable: a driver that is stuck for most of a route scores well
-    by `comfort`. Here a segment counts if the ego was faster than 0.1 m/s in any of
-    its frames.
+    A standing ego is comfortable, so a driver that is stuck for most of a route scores
+    well by `comfort`. Here a segment counts only if the ego was faster than 0.1 m/s in
+    at least one of its frames.
     """
     if len(episode.frames) < SEGMENT_FRAMES:
         return comfort(episode, bounds)
@@ -91,7 +89,7 @@ def stood_most(episodes: Iterable[Episode]) -> tuple[str, ...]:
 
 
 def frame_interval_us(frames: Sequence[EgoFrame]) -> int:
-    """Return the microseconds from one frame to the next, which mostly are the same."""
+    """Return the median interval between two frames, in microseconds."""
     if len(frames) < 2:
         return FRAME_US
     times_us = np.array([frame.time_us for frame in frames])
@@ -99,7 +97,6 @@ def frame_interval_us(frames: Sequence[EgoFrame]) -> int:
 
 
 def _segments(smooth: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Return for each whole segment whether all of its frames are."""
     segments = len(smooth) // SEGMENT_FRAMES
     cut = smooth[: segments * SEGMENT_FRAMES].reshape(segments, SEGMENT_FRAMES)
     return np.asarray(cut.all(axis=1))
@@ -112,6 +109,7 @@ def _moving(frames: Sequence[EgoFrame]) -> npt.NDArray[np.bool_]:
 def smooth_frames(episode: Episode, bounds: Bounds = BOUNDS) -> npt.NDArray[np.bool_]:
     """Return for each of at least 7 frames whether all six variables are in range."""
     frames = episode.frames
+    # smoothed signals need the acceleration in the world for the jerk
     along = np.array([frame.acceleration_mps2 for frame in frames])
     left = np.array([frame.lateral_acceleration_mps2 for frame in frames])
     heading = np.array([frame.heading for frame in frames])
@@ -119,6 +117,7 @@ def smooth_frames(episode: Episode, bounds: Bounds = BOUNDS) -> npt.NDArray[np.b
     east = along * np.cos(heading) - left * np.sin(heading)
     north = along * np.sin(heading) + left * np.cos(heading)
     delta_s = frame_interval_us(frames) / 1e6
+    # every variable against its bounds
     acceleration = _filtered(along)
     jerk_east, jerk_north = (_filtered(each, delta_s, 1) for each in (east, north))
     return (
@@ -142,9 +141,9 @@ def _filtered(values: Floats, delta_s: float = 1.0, derivative: int = 0) -> Floa
 
 
 def _blocked_frames(episode: Episode) -> npt.NDArray[np.bool_]:
-    """Mark the frames of every stop of 60 s, and of the one that ended the route.
+    """Mark the frames of every stop of 60 s, and of the stop that ended the route.
 
-    That one may be a frame short on file: the rule sees steps finer than frames.
+    The last one may be a frame short on file: the rule is checked at finer steps.
     """
     still = [frame.speed_mps <= BLOCKED_SPEED_MPS for frame in episode.frames]
     blocked = np.zeros(len(still), np.bool_)

@@ -1,4 +1,4 @@
-"""How close an episode came to a collision, as a simulator saw it."""
+"""Record of how close an episode came to a collision."""
 
 import math
 from dataclasses import dataclass
@@ -29,14 +29,12 @@ class Encounter:
     """The ego and a moving actor were at the same place, one after the other.
 
     Attributes:
-        actor: Its number in the scene.
-        kind: What it is.
-        time_us: When the second of the two came.
-        pet_s: Post-encroachment time (Allen, Shin and Cooper 1978; SAE J2944): from
-            the moment when the first left a place until the second was there, the
-            shortest over all places; 0 in a collision. In steps of the frames.
-        angle_rad: Between their headings there, 0 (same direction) to pi (oncoming).
-        ego_first: Whether the ego came first.
+        actor: Id of the actor in the scene.
+        time_us: When the second of the two arrived.
+        pet_s: Post-encroachment time (Allen, Shin and Cooper 1978; SAE J2944): from the
+            moment when the first left a place until the second arrived, the minimum
+            over all places; 0 in a collision. A multiple of the frame interval.
+        angle_rad: Angle between their headings, 0 (same direction) to pi (oncoming).
     """
 
     actor: int
@@ -50,15 +48,15 @@ class Encounter:
 @with_config(_STRICT)
 @dataclass(frozen=True, slots=True)
 class ConflictRecord:
-    """The ego against everything around it: one number a frame, one row an encounter.
+    """Distances and times to collision for each frame, and all encounters.
 
     Attributes:
-        nearest_m: Metres from the ego's outline to the nearest actor's, 0 if they
-            overlap, None where nothing else is in the world.
+        nearest_m: Metres from the ego's outline to that of the nearest actor, 0 if they
+            overlap, None if there is no actor.
         ttc_s: Time to collision: seconds until the ego's box and an actor's touch if
-            both keep heading and speed, the smallest of all actors; None where none
-            would within 10 s (`TTC_HORIZON_S`). As nuPlan's and NAVSIM's, but exact
-            where they try steps of 0.1 and 0.3 s, and with what comes from behind.
+            both keep heading and speed, the minimum over all actors; None above 10 s
+            (`TTC_HORIZON_S`). Defined as in nuPlan and NAVSIM, but exact where they try
+            steps of 0.1 and 0.3 s, and including actors from behind.
         encounters: Those of at most 5 s (`PET_HORIZON_S`), in order of time; an actor
             has at most one with crossing or merging paths and one in the ego's
             direction.

@@ -1,4 +1,4 @@
-"""How often a decision takes longer than it may."""
+"""Share of decisions that exceed their latency budget."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -18,19 +18,13 @@ UNSEEN = Measure(None, "ms", "nobody looked at the road")
 
 @dataclass(frozen=True, slots=True)
 class Deadlines:
-    """Latencies held against a budget.
+    """Latencies compared with a budget.
 
     Attributes:
-        budget_ms: What a decision may take.
-        count: Decisions.
-        percentiles_ms: By percent: the latency that so many do not exceed; None where
-            too few were measured for one to lie beyond it.
-        mean_ms: Of all decisions.
-        worst_ms: The longest.
-        over_percent: Share of the decisions that took longer than the budget.
-        critical_ms: Mean of the decisions on frames with a time to collision below
-            1.5 s; a tail that falls into critical frames shows here.
-        other_ms: Mean of those on the other frames.
+        percentiles_ms: By percent; no value if too few samples were measured for it.
+        critical_ms: Mean over the decisions on frames with a time to collision below
+            1.5 s.
+        other_ms: Mean over the decisions on the other frames.
     """
 
     budget_ms: float
@@ -43,7 +37,7 @@ class Deadlines:
     other_ms: Measure = UNSEEN
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain numbers, null where something was not measured."""
+        """Return plain numbers, null for what was not measured."""
         named = {f"p{p:g}_ms": each.value for p, each in self.percentiles_ms.items()}
         return {
             "budget_ms": self.budget_ms,
@@ -62,13 +56,10 @@ def deadlines(
     budget_ms: float = BUDGET_MS,
     measured: int | None = None,
 ) -> Deadlines:
-    """Hold latencies against a budget.
+    """Compare latencies with a budget; a latency of exactly the budget is in time.
 
-    Args:
-        latencies_us: Microseconds, one a decision.
-        budget_ms: What a decision may take; exactly so much is in time.
-        measured: Samples of the trace that they were drawn from; None where each was
-            found for itself.
+    ``measured`` is the number of samples in the trace that the latencies were drawn
+    from; None if each was measured on its own.
     """
     if not latencies_us:
         none = Measure(None, "ms", "no decision was taken")
@@ -94,15 +85,9 @@ def charged(
     budget_ms: float = BUDGET_MS,
     measured: int | None = None,
 ) -> Deadlines | None:
-    """Hold what the decisions of episodes were charged against a budget.
+    """Compare the latencies charged in episodes with a budget; None if all are zero.
 
-    Args:
-        episodes: Of one evaluation.
-        budget_ms: What a decision may take.
-        measured: See :func:`deadlines`.
-
-    Returns:
-        None where decisions cost nothing.
+    ``measured`` is the one of :func:`deadlines`.
     """
     driven = tuple(episodes)
     taken = [each.latency_us for episode in driven for each in episode.decisions]

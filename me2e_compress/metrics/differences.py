@@ -33,26 +33,19 @@ Z = 1.96
 
 
 def shown_by(routes: int) -> float:
-    """Return the smallest difference that so many routes show, in points."""
+    """Return the smallest difference that so many routes can show, in points."""
     return Z * SCATTER / math.sqrt(routes)
 
 
 @dataclass(frozen=True, slots=True)
 class PairedDifference:
-    """Means over routes of "this one minus the reference", each with its intervals.
+    """Means over routes of "this variant minus the reference", in percentage points.
 
     What makes a route hard for both cancels out, so the intervals are narrower than
-    those of the two means suggest. Over these types they are never narrower than what
-    so many routes leave open (`metrics.intervals.unseen_share`): four routes that
-    differ alike say little of a fifth.
-
-    Attributes:
-        driving_score: Percentage points.
-        success_rate: Percentage points.
-        better: Routes with a higher driving score than the reference's.
-        worse: Routes with a lower one.
-        gained: Routes that succeed with this one alone.
-        lost: Routes that succeed with the reference alone.
+    those of the two means suggest. The interval over these scenario types is never
+    narrower than what so few routes can exclude (`metrics.intervals.unseen_share`).
+    ``better`` and ``worse`` count routes by driving score; ``gained`` and ``lost``
+    count routes on which only this variant, or only the reference, succeeds.
     """
 
     driving_score: Estimate
@@ -64,20 +57,20 @@ class PairedDifference:
 
     @property
     def differ(self) -> int:
-        """Routes of another driving score."""
+        """Number of routes whose driving scores differ."""
         return self.better + self.worse
 
     @property
     def unseen_percent(self) -> float:
-        """Share of routes that could differ, with 95 %, if none of these does."""
+        """Upper 95 % bound of the share that could differ if none of these does."""
         return 100.0 * unseen_share(self.driving_score.n)
 
     @property
     def smallest_shown(self) -> float:
-        """Smallest difference of driving scores that so many routes show, in points.
+        """Smallest difference of driving scores that these routes can show, in points.
 
-        Half the width of the interval that the mean would have if routes scattered as
-        those of `SCATTER`, or of its own where that is wider.
+        It is half the width of the interval under the usual scatter (`SCATTER`), or of
+        the actual interval if that is wider.
         """
         score, usual = self.driving_score, shown_by(self.driving_score.n)
         if score.low is None or score.high is None:
@@ -86,9 +79,9 @@ class PairedDifference:
 
     @property
     def verdict(self) -> str:
-        """Say in a word or two what so many routes show of the driving score.
+        """Say in a word or two what these routes show about the driving score.
 
-        Judged as it is shown, to a tenth of a point: what rounds to zero is none.
+        Bounds are rounded to a tenth of a point, as they are printed.
         """
         score = self.driving_score
         if abs(score.value or 0.0) < shown_by(score.n) or score.low is None:
@@ -101,10 +94,10 @@ class PairedDifference:
 
     @property
     def p_value(self) -> float:
-        """Of McNemar's exact test that success is equally frequent (two-sided).
+        """Two-sided p-value of McNemar's exact test that success is equally frequent.
 
-        Only routes on which the two part count; with none of them it is 1. As if
-        routes were independent of each other.
+        Only routes with different outcomes count; without any it is 1. Routes are
+        treated as independent.
         """
         from scipy.stats import binomtest  # takes a second to import
 
@@ -129,14 +122,10 @@ def difference(
 ) -> PairedDifference:
     """Compare two drives route by route; at least one route is needed.
 
-    Args:
-        episodes: One a route.
-        reference: The same routes, in any order.
-        seed: Of the bootstrap.
-
     Raises:
         EvaluationError: The two were not driven on the same routes.
     """
+    # routes must match, whatever their order
     others = {episode.route: episode for episode in reference}
     unpaired = sorted({*others} ^ {episode.route for episode in episodes})
     if unpaired:
@@ -144,6 +133,7 @@ def difference(
             f"route {unpaired[0]} was driven by one of the two only: differences are "
             "taken over the same routes"
         )
+    # one difference per route, with the route's scenario type
     pairs = [(one, others[one.route]) for one in episodes]
     types = [one.scenario for one in episodes]
     scores = [route_score(one).composed - route_score(o).composed for one, o in pairs]
@@ -161,14 +151,16 @@ def difference(
 def _estimate(values: Sequence[float], types: Sequence[str], seed: int) -> Estimate:
     """Return a mean of differences, its interval no narrower than n routes allow.
 
-    That over types drawn anew is no narrower than the one over these types.
+    The interval over types drawn anew is at least as wide as that over these types.
     """
     found = mean_estimate(values, types, POINTS, seed, WIDEST)
     if found.value is None or found.low is None or found.high is None:
         return found
+    # widen the interval over these types
     least, most = unseen_interval(found.value, found.n, WIDEST)
     low = found.low if least is None else min(least, found.low)
     high = found.high if most is None else max(most, found.high)
+    # the interval over new types must contain it
     if found.anew_low is None or found.anew_high is None:
         return dataclasses.replace(found, low=low, high=high)
     return dataclasses.replace(
@@ -178,11 +170,10 @@ def _estimate(values: Sequence[float], types: Sequence[str], seed: int) -> Estim
 
 
 def holm(p_values: Sequence[float]) -> tuple[float, ...]:
-    """Return p-values corrected for how many were looked at (Holm 1979).
+    """Return p-values corrected for multiple comparisons (Holm 1979), in their order.
 
-    With them, the chance that any of the comparisons is called different though none
-    is stays below the level of one. In the order given: the smallest of m is
-    multiplied by m, the next by m - 1, and so on, and none falls below the one before.
+    The smallest of m p-values is multiplied by m, the next by m - 1, and so on; each
+    result is at least as large as the one before, and at most 1.
     """
     order = sorted(range(len(p_values)), key=lambda i: p_values[i])
     found, least = [1.0] * len(p_values), 0.0

@@ -1,4 +1,4 @@
-"""Driving score: completion of the route, times the penalties of infractions."""
+"""Driving score: route completion times the penalties of infractions."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ DIGITS = 6
 
 @dataclass(frozen=True, slots=True)
 class RouteScore:
-    """Scores of one route: route and composed in percent, penalty a factor."""
+    """Scores of one route: route and composed in percent, penalty as a factor."""
 
     route: float
     penalty: float
@@ -21,8 +21,8 @@ class RouteScore:
 def route_score(episode: Episode) -> RouteScore:
     """Return completion, penalty and their product (equation 5, one summand).
 
-    The formula is the leaderboard's (statistics_manager.py of Bench2Drive 0.0.3):
-    every infraction multiplies the completed percentage by its factor.
+    As in the leaderboard (statistics_manager.py of Bench2Drive 0.0.3), every infraction
+    multiplies the completed percentage by its factor.
     """
     penalty = math.prod(infraction.factor for infraction in episode.infractions)
     return composed_of(episode.completion_percent, penalty)

@@ -1,14 +1,14 @@
-"""EER_AV: driving and energy in one score a variant (equations 8 to 11).
+"""EER_AV: driving quality and energy in one score per variant (equations 8 to 11).
 
     Q_i = w_DS x_DS + C (w_DE x_DE + w_DC x_DC - w_E x_E),  C = 0 after a collision
     EER_AV = mean over routes of Q_i, here times 100: points
 
-The x are normalized measures of route i, the w weights by CRITIC. The paper does not
-say how it normalizes; here the smallest value of all routes and variants that are
-compared becomes 0 and the largest 1 (`MIN_MAX`), which is how CRITIC was published
-(1995), and the weights are taken over the same rows. `rankings` says whether
-the order of the variants hangs on that choice. A score belongs to its weights and its
-scales: compare scores of one call, or of calls that share an `EerScale`.
+The x are normalized measures of route i; the weights w come from CRITIC. The paper does
+not say how it normalizes. Here the smallest value of all compared routes and variants
+becomes 0 and the largest 1 (`MIN_MAX`), as in the original CRITIC paper (1995), and the
+weights use the same rows. `rankings` tells whether the order of the variants depends on
+that choice. Scores are comparable only within one call, or between calls that share an
+`EerScale`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,13 +47,10 @@ class Normalization(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class EerScale:
-    """What fixes the scores: x = (value - offset) / span, and the weight of each x.
+    """Normalization and weights: x = (value - offset) / span, and the weight of each x.
 
-    Attributes:
-        normalization: How it was found.
-        weights: Of driving score, efficiency, comfort and energy; they add up to 1.
-        offset: Subtracted from %, %, ratio and joules.
-        span: Divided by.
+    All tuples are in the order driving score, efficiency, comfort, energy; the weights
+    add up to 1, offset and span have the units %, %, ratio and joules.
     """
 
     normalization: Normalization
@@ -67,11 +64,11 @@ class EerResult:
     """EER_AV of variants on the same routes.
 
     Attributes:
-        scores: Points by variant, with its interval over routes (the weights as
-            they are), or the reason why there is none.
-        routes: [n] each, points by route and variant, for paired comparisons.
-        scale: Weights and scales; None where nothing could be scored.
-        left_out: Routes left out of all variants, by the measure that is missing.
+        scores: Points by variant, with an interval over routes for fixed weights, or
+            the reason why there is none.
+        routes: [n] points per route by variant, for paired comparisons.
+        scale: None if nothing could be scored.
+        left_out: Number of routes left out of all variants, by the missing measure.
     """
 
     scores: Mapping[str, Estimate]
@@ -81,7 +78,7 @@ class EerResult:
 
     @property
     def ranking(self) -> tuple[str, ...]:
-        """The variants that have a score, best first."""
+        """Names of the variants that have a score, best first."""
         known = [name for name, each in self.scores.items() if each.value is not None]
         return tuple(sorted(known, key=lambda name: -(self.scores[name].value or 0.0)))
 
@@ -93,46 +90,42 @@ def eer(
     types: Sequence[str] | None = None,
     seed: int = 0,
 ) -> EerResult:
-    """Score variants that drove the same routes.
+    """Score variants that drove the same routes, listed in the same order.
 
-    A route on which a measure of a variant is missing is left out of all. A variant of
-    which a measure is missing on every route has no score, and its reason names the
-    measure; the others are scored without it.
+    A route on which any variant lacks a measure is left out of all. A variant that
+    lacks a measure on every route has no score, and its reason names the measure; the
+    others are scored without it. Weights and scales follow from the routes unless
+    ``scale`` is given. ``types`` are the routes' scenario types for the intervals; None
+    treats each route as its own type.
 
-    By hand, two variants on two routes, none crashed but b on the second:
+    Example: two variants on two routes, only b crashed, on the second:
 
         a: DS 100, 60   DE 100, 80   DC 1.0, 0.5   E 10, 10 J
         b: DS 100, 40   DE 120, 80   DC 0.5, 0.0   E  5,  5 J
 
-    min-max gives a: x = (1, 1/2, 1, 1), (1/3, 0, 1/2, 1); b: (1, 1, 1/2, 0),
-    (0, 0, 0, 0). With weights of 1/4 each a has Q = (1 + 1/2 + 1 - 1) / 4 = 3/8 and
-    (1/3 + 0 + 1/2 - 1) / 4 = -1/24, so 16.7 points; b has 5/8 and, after its
-    collision, 0: 31.3 points.
-
-    Args:
-        variants: Measures by name, all over the same routes in the same order.
-        scale: Weights and scales that are fixed already; else they follow from the
-            routes.
-        normalization: How, where no scale is given.
-        types: Scenario type of every route, for the intervals; None: each is one of
-            its own.
-        seed: Of the bootstrap.
+    min-max gives a: x = (1, 1/2, 1, 1), (1/3, 0, 1/2, 1); b: (1, 1, 1/2, 0), (0, 0, 0,
+    0). With weights of 1/4 each, a has Q = (1 + 1/2 + 1 - 1) / 4 = 3/8 and (1/3 + 0 +
+    1/2 - 1) / 4 = -1/24, so 16.7 points; b has 5/8 and, after its collision, 0: 31.3
+    points.
 
     Raises:
         EvaluationError: The variants differ in the number of routes.
     """
     if len({len(each.driving_score) for each in variants.values()}) > 1:
         raise EvaluationError("EER_AV compares variants on the same routes")
+    # variants and routes that can be scored
     missing = {name: _missing(each) for name, each in variants.items()}
     able = {name: each for name, each in variants.items() if not missing[name]}
     kept, left_out = _kept(able)
     tables = {name: each.table()[kept] for name, each in able.items()}
+    # weights and scales, unless they are given
     reason = "" if kept.any() else "no route has all four measures"
     if not reason and scale is None:
         try:
             scale = scale_of(tables, normalization)
         except EvaluationError as error:
             reason = str(error)
+    # one estimate per variant, or the reason why there is none
     scores, routes = dict[str, Estimate](), dict[str, Floats]()
     for name, measures in variants.items():
         why = missing[name] or reason
@@ -157,16 +150,16 @@ def route_eer(table: Floats, crashed: npt.NDArray[np.bool_], scale: EerScale) ->
 def scale_of(tables: Mapping[str, Floats], normalization: Normalization) -> EerScale:
     """Return offset and span of every measure, and their weights by CRITIC.
 
-    Args:
-        tables: [routes, 4] by variant, nothing missing.
-        normalization: How.
+    The tables are [routes, 4] by variant, without missing values.
 
     Raises:
         EvaluationError: CRITIC finds no weights.
     """
+    # the values that the scale is taken over
     rows = np.concatenate(list(tables.values()))
     if normalization is Normalization.VARIANT_MEANS:
         rows = np.stack([table.mean(axis=0) for table in tables.values()])
+    # offset and span by the normalization
     if normalization is Normalization.Z_SCORE:
         offset, span = rows.mean(axis=0), rows.std(axis=0)
     elif normalization is Normalization.NATURAL:
@@ -197,7 +190,7 @@ def _missing(measures: RouteMeasures) -> str:
 def _kept(
     variants: Mapping[str, RouteMeasures],
 ) -> tuple[npt.NDArray[np.bool_], dict[str, int]]:
-    """Return which routes have all measures of all variants, and why others do not."""
+    """Return which routes have all measures of all variants, and counts of gaps."""
     if not variants:
         return np.zeros(0, np.bool_), {}
     gone = np.any([np.isnan(each.table()) for each in variants.values()], axis=0)

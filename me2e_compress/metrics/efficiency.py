@@ -1,4 +1,4 @@
-"""Driving efficiency: the ego's speed over that of the traffic around it."""
+"""Driving efficiency: the ego's speed relative to the traffic around it."""
 
 from collections.abc import Iterator
 from statistics import fmean
@@ -16,10 +16,10 @@ PERCENT = "%"
 def efficiency(episode: Episode) -> Measure:
     """Return the mean of ego speed over traffic speed at 20 check points, in percent.
 
-    Equation 6: at each check point, every twentieth of the route, the mean speed of
-    the ego since the last one is divided by that of the vehicles near by. Ratios above
-    1000 % are dropped, and so are check points that saw no moving traffic: nothing was
-    measured there. A route that ends within its first 5 % has no efficiency.
+    Equation 6: at each check point, every twentieth of the route, the mean ego speed
+    since the last one is divided by that of nearby vehicles. Ratios above 1000 % and
+    check points without moving traffic are dropped. A route that ends within its first
+    5 % has no efficiency.
     """
     ratios = speed_ratios(episode)
     if episode.completion_percent < 100.0 / CHECKPOINTS:
@@ -33,9 +33,8 @@ def efficiency(episode: Episode) -> Measure:
 def speed_ratios(episode: Episode) -> tuple[float, ...]:
     """Return the ratio at each check point that saw moving traffic, in percent.
 
-    Ratios that the simulator reported itself come first: that of the last stretch,
-    which Bench2Drive writes twice where more than 95 % of the route was passed, is kept
-    once.
+    Ratios reported by the simulator take precedence. Bench2Drive writes the last one
+    twice if more than 95 % of the route was passed; it is kept once.
     """
     if episode.speed_ratios_percent is not None:
         given = episode.speed_ratios_percent
@@ -47,7 +46,7 @@ def speed_ratios(episode: Episode) -> tuple[float, ...]:
 
 
 def _stretches(episode: Episode) -> Iterator[list[EgoFrame]]:
-    """Yield the frames between one check point and the next."""
+    """Yield the frames between two check points."""
     spacing_m = episode.route_length_m / CHECKPOINTS
     passed, stretch = 0, list[EgoFrame]()
     for frame in episode.frames:

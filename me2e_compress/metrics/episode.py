@@ -31,7 +31,7 @@ _STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
 
 
 class Ending(StrEnum):
-    """Why a route was over."""
+    """The reason why a route ended."""
 
     COMPLETED = "completed"
     COLLISION = "collision"
@@ -45,23 +45,19 @@ class Ending(StrEnum):
 @with_config(_STRICT)
 @dataclass(frozen=True, slots=True)
 class EgoFrame:
-    """The ego at one instant, every 50 ms.
+    """The ego at one instant, every 50 ms, in SI units.
+
+    x points east, y north; angles are counter-clockwise from east, in radians.
 
     Attributes:
         time_us: Simulated microseconds since the route began.
-        x: Metres east.
-        y: Metres north.
-        heading: Radians, counter-clockwise from east.
-        speed_mps: Metres per second.
-        acceleration_mps2: Along the ego's heading.
-        lateral_acceleration_mps2: To the ego's left.
-        yaw_rate_radps: Radians per second, counter-clockwise.
-        steering_rad: Angle of the front wheels, left positive; None where a simulator
-            does not tell.
+        acceleration_mps2: Acceleration along the heading.
+        lateral_acceleration_mps2: Acceleration to the left.
+        steering_rad: Angle of the front wheels, left positive; None if not reported.
         route_m: Metres of the route passed; never decreases.
-        traffic_speed_mps: Mean speed of the vehicles near by, None if there are none.
-        acceleration_norm_mps2: Length of the acceleration vector in the plane where a
-            simulator recorded it apart; None if it follows from the two components.
+        traffic_speed_mps: Mean speed of nearby vehicles, None if there are none.
+        acceleration_norm_mps2: Norm of the acceleration in the plane if a simulator
+            recorded it separately; None if it follows from the two components.
     """
 
     time_us: int
@@ -90,14 +86,10 @@ class InferenceRecord:
 @with_config(_STRICT)
 @dataclass(frozen=True, slots=True)
 class Given:
-    """What a simulator itself said of a route; it never mixes with what is computed.
+    """What a simulator itself reported about a route, kept apart from computed values.
 
-    Attributes:
-        status: How the route ended, in the simulator's words: ``Completed``,
-            ``Failed - Agent got blocked``.
-        completion_percent: How much of the route was passed.
-        penalty: The factor of all infractions.
-        composed_percent: The driving score of the route.
+    ``status`` is in the simulator's words, such as ``Failed - Agent got blocked``;
+    ``penalty`` is the product of all factors, ``composed_percent`` the driving score.
     """
 
     status: str
@@ -112,21 +104,16 @@ class Episode:
     """One route driven to its end.
 
     Attributes:
-        route: Identity of the route.
-        scenario: Type of the scenario on it.
         abilities: The abilities it tests, one or two of Bench2Drive's five.
-        route_length_m: Metres.
-        completion_percent: How much of the route was passed, 0 to 100.
-        ending: Why it was over.
+        completion_percent: Share of the route that was passed, 0 to 100.
         failure: How the policy failed, if that ended the route.
         infractions: In order of time.
-        frames: Every 50 ms.
-        decisions: Every inference.
+        decisions: One record per inference.
         junction_m: Metres to the first junction, None if the route has none.
-        speed_ratios_percent: Ego speed over traffic speed at the check points where a
-            simulator reported them itself; None if they follow from the frames.
-        given: What the simulator itself scored; None where it scores nothing.
-        conflicts: How close the ego came to others; None where nobody looked.
+        speed_ratios_percent: Ego speed over traffic speed at the check points, if the
+            simulator reported them; None if they follow from the frames.
+        given: What the simulator itself scored, if anything.
+        conflicts: How close the ego came to others; None if it was not recorded.
     """
 
     route: str
@@ -151,10 +138,10 @@ class Episode:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the whole route was driven without infraction (low speed is none).
+        """Whether the whole route was driven without infractions other than low speed.
 
-        A route that ended otherwise than by its goal is none, whatever its completion:
-        Bench2Drive asks for status Completed or Perfect (merge_route_json.py).
+        A route must also end at its goal, whatever its completion: Bench2Drive asks for
+        status Completed or Perfect (merge_route_json.py).
         """
         whole = self.ending is Ending.COMPLETED and self.completion_percent >= 100.0
         return whole and all(

@@ -1,4 +1,4 @@
-"""Infractions, by the keys of the CARLA leaderboard, and what they cost."""
+"""Infractions, by the keys of the CARLA leaderboard, and their penalties."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -9,7 +9,7 @@ from pydantic import ConfigDict, Field, with_config
 
 
 class InfractionKind(StrEnum):
-    """The keys of `infractions` in a leaderboard record, and one of our own."""
+    """The keys of `infractions` in a leaderboard record, and `GIVE_WAY`, our own."""
 
     COLLISION_PEDESTRIAN = "collisions_pedestrian"
     COLLISION_VEHICLE = "collisions_vehicle"
@@ -29,7 +29,7 @@ class InfractionKind(StrEnum):
 
 
 class Contact(StrEnum):
-    """How the ego and another came together: nuPlan's five types of collision."""
+    """The kind of a contact: nuPlan's five types of collision."""
 
     STANDING_EGO = "the ego stood"
     STANDING_PARTNER = "the other stood"
@@ -70,21 +70,17 @@ GIVE_WAY is ours.
 @with_config(ConfigDict(allow_inf_nan=False, extra="forbid"))
 @dataclass(frozen=True, slots=True)
 class Infraction:
-    """One infraction.
+    """One infraction; values that a simulator does not report are None.
 
     Attributes:
-        kind: Which rule was broken.
-        time_us: When, in simulated microseconds since the route began; None where a
-            simulator does not tell.
-        x: Where the ego was, metres east; None where a simulator does not tell.
+        time_us: Simulated microseconds since the route began.
+        x: Position of the ego, metres east.
         y: Metres north.
-        detail: With whom or against what, in a few words.
-        percent: Of OUTSIDE_ROUTE_LANES the share of the driven way spent outside; of
-            MIN_SPEED the ego's speed over the traffic's, where the simulator told it.
-        contact: How the two came together; only of a collision, None if unknown.
-        at_fault: Whether the ego could have prevented it, as nuPlan judges it; only of
-            a collision, None if unknown.
-        ego_speed_mps: The ego's speed then, None if unknown.
+        detail: The other party or obstacle, in a few words.
+        percent: For OUTSIDE_ROUTE_LANES, the share of the driven way spent outside; for
+            MIN_SPEED, the ego's speed relative to the traffic's.
+        contact: For collisions only.
+        at_fault: Whether the ego could have prevented a collision, as nuPlan judges it.
     """
 
     kind: InfractionKind
@@ -99,7 +95,7 @@ class Infraction:
 
     @property
     def factor(self) -> float:
-        """The factor on the driving score."""
+        """Factor by which it multiplies the driving score."""
         if self.kind is InfractionKind.OUTSIDE_ROUTE_LANES:
             return 1.0 - (self.percent or 0.0) / 100.0
         return PENALTY[self.kind]

@@ -1,7 +1,7 @@
-"""What Bench2Drive makes of records: over all of the set, and over those there.
+"""Bench2Drive's scores of a set of records, over the whole set and over the records.
 
-tools/merge_route_json.py divides by 220 however many records there are, so that a route
-without one counts as zero; both quotients are given here, each under its name.
+tools/merge_route_json.py divides by 220 however many records there are, so that a
+missing route counts as zero; both quotients are given here.
 """
 
 from collections.abc import Sequence
@@ -21,9 +21,8 @@ from me2e_compress.metrics.scores import FULL_SET
 class Quotients:
     """One sum over records, divided in two ways.
 
-    Attributes:
-        over_set: By the number of routes of the whole set: a missing route is zero.
-        over_driven: By the number of records.
+    ``over_set`` divides by the size of the whole set, so that a missing route is zero;
+    ``over_driven`` divides by the number of records.
     """
 
     over_set: Measure
@@ -31,7 +30,7 @@ class Quotients:
 
     @classmethod
     def of(cls, values: Sequence[float], set_size: int, unit: str) -> "Quotients":
-        """Divide the sum of one value a record."""
+        """Divide the sum of one value per record."""
         if not values:
             nothing = Measure(None, unit, "there is no record")
             return cls(nothing, nothing)
@@ -44,21 +43,13 @@ class Quotients:
 
 @dataclass(frozen=True, slots=True)
 class LeaderboardScores:
-    """The scores of a set of records; given and computed ones never mix.
+    """Scores of a set of records, as given by the simulator and as computed here.
 
-    Attributes:
-        penalties: The leaderboard whose rules the computed scores follow.
-        set_size: How many routes the whole set has.
-        driven: How many records there are.
-        given_score: Driving score, percent, of the scores that the simulator wrote.
-        given_completion: Percent, as it wrote it.
-        given_penalty: The factor of all infractions, as it wrote it.
-        score: Driving score, percent, from the lists of infractions.
-        score_without_low_speed: The same without what low speed costs: Bench2Drive
-            writes about 20 check points a route, the leaderboard has 4.
-        penalty: The factor of all infractions, from their lists.
-        success_rate: Percent of records with status Completed or Perfect and no
-            infraction but low speed.
+    Driving scores, completion and success rate are percentages; a penalty is the
+    product of the factors of all infractions. ``score_without_low_speed`` leaves out
+    the penalty of low speed: Bench2Drive writes about 20 check points per route, the
+    leaderboard has 4. A success has status Completed or Perfect and no infraction but
+    low speed.
     """
 
     penalties: Version
@@ -73,7 +64,7 @@ class LeaderboardScores:
     success_rate: Quotients
 
     def to_json(self) -> dict[str, Any]:
-        """Return what was given and what was computed, apart."""
+        """Return given and computed scores, apart."""
         return {
             "given": {
                 "driving_score": self.given_score.to_json(),
@@ -95,13 +86,7 @@ class LeaderboardScores:
 def leaderboard_scores(
     episodes: Sequence[Episode], penalties: Version = "b2d", set_size: int = FULL_SET
 ) -> LeaderboardScores:
-    """Score a set of records as the leaderboard and as Bench2Drive's tools do.
-
-    Args:
-        episodes: One a record.
-        penalties: The leaderboard whose rules the computed scores follow.
-        set_size: How many routes the whole set has.
-    """
+    """Score a set of records as the leaderboard and as Bench2Drive's tools do."""
     given = [each.given for each in episodes if each.given is not None]
     scored = [score_under(each, penalties) for each in episodes]
     unhurried = [_without_low_speed(each, penalties) for each in episodes]

@@ -9,7 +9,7 @@ class Measure:
     """A value and its unit; None means it could not be measured, never zero.
 
     Raises:
-        ValueError: If there is neither a finite value nor a reason, or both.
+        ValueError: There is neither a finite value nor a reason, or both.
     """
 
     value: float | None
@@ -25,17 +25,11 @@ class Measure:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A mean over routes with its confidence interval.
+    """A mean over routes with its 95 % interval.
 
-    Attributes:
-        measure: The mean, or None with the reason.
-        low: Lower bound of the 95 % interval over these scenario types; None where n
-            is too small for one.
-        high: Upper bound.
-        n: How many routes the mean was taken over.
-        anew_low: Lower bound over scenario types drawn anew, which is wider
-            (`metrics.intervals`); None where it was not computed.
-        anew_high: Upper bound.
+    ``low`` and ``high`` bound the interval over these scenario types, ``anew_low`` and
+    ``anew_high`` the wider one over types drawn anew (`metrics.intervals`); they are
+    None if n is too small or they were not computed.
     """
 
     measure: Measure
@@ -51,7 +45,7 @@ class Estimate:
         return self.measure.value
 
     def to_json(self) -> dict[str, float | int | str | None]:
-        """Return a flat object of all fields, value, unit and reason at their side."""
+        """Return a flat object of all fields."""
         return {
             "value": self.measure.value,
             "low": self.low,

@@ -1,4 +1,4 @@
-"""What infractions cost by the rules of each version of the CARLA leaderboard.
+"""Penalties of infractions by the rules of each version of the CARLA leaderboard.
 
 The factors are those of statistics_manager.py of carla-simulator/leaderboard, branches
 leaderboard-1.0, -2.0 and -2.1, and of Bench2Drive's copy of it (0.0.3 and 0.0.4).
@@ -23,10 +23,10 @@ class LeaderboardPenalties:
     """The rules of one version.
 
     Attributes:
-        costs: By kind of infraction: a factor, or where `summed` a summand; a kind
-            that is not named costs nothing.
-        min_speed: What a check point at no speed at all costs; at v % of the traffic's
-            speed it costs (1 - v/100) of that, from 100 % on nothing.
+        costs: Factor by kind of infraction, or summand if `summed`; a kind that is not
+            listed costs nothing.
+        min_speed: Penalty of a check point passed at no speed. At v % of the traffic's
+            speed it is (1 - v/100) times that, and nothing from 100 % on.
         summed: Whether the costs are summands c of 1 / (1 + sum c) instead of factors.
     """
 
@@ -35,9 +35,9 @@ class LeaderboardPenalties:
     summed: bool = False
 
     def penalty(self, episode: Episode) -> float:
-        """Return the factor of all infractions of a route.
+        """Return the combined factor of all infractions of a route.
 
-        Leaving the lanes costs the share of the way driven outside in every version.
+        In every version, leaving the lanes costs the share of the way driven outside.
         """
         outside = math.prod(
             each.factor

@@ -1,20 +1,20 @@
-"""Percentiles of a sample, and of how many samples one can be told."""
+"""Percentiles of a sample, and how many samples they need."""
 
 import math
 from collections.abc import Sequence
 
 
 def too_few(percent: float, count: int) -> str:
-    """Say why so many samples do not tell a percentile; empty where they do.
+    """Say why there are too few samples for a percentile; empty if there are enough.
 
-    At least one of them must lie beyond it, n (1 - q) >= 1. Of fewer, the smallest
-    sample that the share q does not exceed (the inverted distribution function, type 1
-    of Hyndman and Fan 1996) is the largest of all, which is called so: the maximum.
+    At least one sample must lie beyond it, n (1 - q) >= 1. With fewer, the percentile
+    (the inverted distribution function, type 1 of Hyndman and Fan 1996) is just the
+    maximum.
 
     Args:
-        percent: above 0, below 100.
-        count: samples that were measured; of latencies drawn from a trace, those of the
-            trace, however often it was drawn from.
+        percent: Above 0, below 100.
+        count: Measured samples; for latencies drawn from a trace, the length of the
+            trace.
     """
     # 100 / (100 - 99.9) is a little more than 1000 in floating point
     needed = math.ceil(round(100.0 / (100.0 - percent), 6))

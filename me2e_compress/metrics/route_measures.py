@@ -18,14 +18,10 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RouteMeasures:
-    """What one variant did on every route: arrays [routes], in one order of routes.
+    """The measures of one variant on every route: arrays [routes], NaN if not measured.
 
-    Attributes:
-        driving_score: Percent.
-        efficiency: Percent; NaN where it was not measured.
-        comfort: Ratio; NaN where it was not measured.
-        energy_j: Joules for the whole route; NaN where it was not measured.
-        crashed: Whether the ego hit anything.
+    Driving score and efficiency are percentages, comfort is a ratio, the energy is that
+    of the whole route. The driving score is never NaN.
     """
 
     driving_score: Floats
@@ -36,7 +32,7 @@ class RouteMeasures:
 
     @classmethod
     def of_table(cls, table: Floats, crashed: npt.NDArray[np.bool_]) -> Self:
-        """Build them of a table [routes, 4], as `table` returns it."""
+        """Build from a table [routes, 4], as `table` returns it."""
         return cls(table[:, 0], table[:, 1], table[:, 2], table[:, 3], crashed)
 
     def table(self) -> Floats:
@@ -50,20 +46,17 @@ def route_measures(
 ) -> RouteMeasures:
     """Return the measures of driven routes, in their order.
 
-    A frame of the paper's joules a frame is an inference (its window is 100 of them),
-    so a route costs joules a frame times its decisions: frames of the world in which
-    the policy was not asked cost nothing. A real run without a log of decisions has one
-    for each step that the agent recorded, as Bench2Drive's agents do both in one.
+    A frame in the paper's joules per frame is one inference (its window is 100 of
+    them), so a route costs that times its decisions; simulator frames without a
+    decision cost nothing. A real run without a log of decisions has one per recorded
+    step, since Bench2Drive's agents do both at once. ``j_per_frame`` is None if it was
+    not measured.
 
     A driver that never passed the first 5 % of a route, or ended it within 20 frames,
-    has no efficiency or comfort to average (equations 6 and 7 leave the route out);
-    here, where every route has a score (equation 9), that counts as 0, or its failure
-    would be left out with the route. A route on which no traffic was seen moving has
-    no efficiency at all, and neither has one without a record of frames or decisions.
-
-    Args:
-        episodes: One a route.
-        j_per_frame: Joules of one inference; None: not measured.
+    has no efficiency or comfort (equations 6 and 7 leave the route out). Here every
+    route has a score (equation 9), so that counts as 0; otherwise the failure would be
+    left out too. A route without moving traffic has no efficiency, nor has one without
+    recorded frames or decisions.
     """
     return RouteMeasures(
         np.array([route_score(each).composed for each in episodes], np.float64),

@@ -1,7 +1,7 @@
 """All scores of a set of driven routes."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from statistics import fmean
 from typing import Any
 
@@ -11,7 +11,7 @@ from me2e_compress.metrics import bench2drive, comfort, efficiency, surrogate_sa
 from me2e_compress.metrics.abilities import ABILITIES, successes
 from me2e_compress.metrics.ability_rules import MEAN, ability_rates
 from me2e_compress.metrics.driving_score import route_score
-from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.episode import Ending, Episode
 from me2e_compress.metrics.intervals import (
     Bounds,
     Floats,
@@ -30,14 +30,13 @@ PERCENT, SHARE = (0.0, 100.0), (0.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class SafetyScores:
-    """How near the routes came to collisions; None where nobody recorded it.
+    """How near the routes came to collisions; None where it was not recorded.
 
     Attributes:
         ttc_exposure: Percent of the frames with a time to collision below 1.5 s.
         smallest_ttc: Seconds, over routes on which a contact was ever within 10 s.
         smallest_pet: Post-encroachment time, seconds, over routes with crossing paths.
         smallest_distance: Metres between outlines.
-        at_fault_collisions: Percent of the routes.
     """
 
     ttc_exposure: Estimate
@@ -47,7 +46,7 @@ class SafetyScores:
     at_fault_collisions: Estimate
 
     def to_json(self) -> dict[str, Any]:
-        """Return one object a score."""
+        """Return one object per score."""
         return {
             "ttc_exposure": self.ttc_exposure.to_json(),
             "smallest_ttc": self.smallest_ttc.to_json(),
@@ -59,21 +58,18 @@ class SafetyScores:
 
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """Means over the routes that were driven, each with its interval.
+    """Means over the driven routes, each with its interval.
 
     Attributes:
-        driving_score: Percent (equation 5).
         success_rate: Percent of routes completed without an infraction.
-        efficiency: Percent (equation 6).
         comfort: Share of smooth segments (equation 7), SI units.
-        comfort_in_motion: The same, of the segments in which the ego moved.
+        comfort_in_motion: Comfort over the segments in which the ego moved.
         abilities: Mean of the five success rates, percent.
-        each_ability: Success rate of each of the five, percent.
-        bench2drive_efficiency: The same name, Bench2Drive's own arithmetic.
+        bench2drive_efficiency: Efficiency by Bench2Drive's own arithmetic.
         bench2drive_smoothness: Its smoothness, which it also calls comfort.
-        safety: How near the routes came to collisions.
-        routes: How many routes were driven.
-        expected: How many the whole set has; fewer driven means a partial result.
+        expected: Number of routes of the whole set; fewer driven means a partial
+            result.
+        failures: How the policy or the simulator failed, by the route that it ended.
     """
 
     driving_score: Estimate
@@ -88,6 +84,17 @@ class Scores:
     safety: SafetyScores
     routes: int
     expected: int
+    failures: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def failed(self) -> str:
+        """How many routes a failure ended, and one of them; empty if none."""
+        if not self.failures:
+            return ""
+        route, words = next(iter(self.failures.items()))
+        count = f"{len(self.failures)} of {self.routes} routes"
+        why = f"{words} ({route})"
+        return f"{count} ended because the policy or the simulator failed: {why}"
 
     @property
     def partial(self) -> bool:
@@ -95,7 +102,7 @@ class Scores:
         return self.routes < self.expected
 
     def to_json(self) -> dict[str, Any]:
-        """Return one object a score, and how many routes they were taken over."""
+        """Return one object per score, and the number of routes."""
         abilities = {name: each.to_json() for name, each in self.each_ability.items()}
         return {
             "driving_score": self.driving_score.to_json(),
@@ -113,6 +120,7 @@ class Scores:
                 "driven": self.routes,
                 "expected": self.expected,
                 "partial": self.partial,
+                "failed": len(self.failures),
             },
         }
 
@@ -120,13 +128,7 @@ class Scores:
 def score(
     episodes: Sequence[Episode], expected: int = FULL_SET, seed: int = 0
 ) -> Scores:
-    """Score a set of routes.
-
-    Args:
-        episodes: One a route, in any order: it decides nothing but the bootstrap.
-        expected: How many routes the whole set has.
-        seed: Of the bootstrap.
-    """
+    """Score a set of routes; their order affects nothing but the bootstrap."""
     in_motion = comfort.comfort_in_motion
     mean_ability, each_ability = _abilities(episodes, seed)
     return Scores(
@@ -146,6 +148,11 @@ def score(
         safety=_safety(episodes, seed),
         routes=len(episodes),
         expected=expected,
+        failures={
+            each.route: each.failure or each.ending.value
+            for each in episodes
+            if each.ending in (Ending.POLICY_FAILED, Ending.SIMULATOR_FAILED)
+        },
     )
 
 
@@ -207,7 +214,7 @@ def _abilities(
 ) -> tuple[Estimate, dict[str, Estimate]]:
     """Return the mean of the abilities' success rates, and each of them.
 
-    Real runs do not tell where junctions are, which Traffic_Signs asks for.
+    Real runs do not tell where junctions are, which Traffic_Signs needs.
     """
     if any(episode.given is not None for episode in episodes):
         rates = ability_rates(episodes, "0.0.4", {})
@@ -224,10 +231,12 @@ def _mean_ability(
     episodes: Sequence[Episode], outcomes: Mapping[str, tuple[bool, ...]], seed: int
 ) -> Estimate:
     """Return the mean of the abilities' success rates, if all five were driven."""
+    # the mean needs all five abilities
     missing = [name for name in ABILITIES if not outcomes[name]]
     if missing:
         reason = f"no route for {', '.join(missing)} was driven"
         return Estimate(Measure(None, "%", reason), None, None, 0)
+    # [routes, 5] which abilities a route tests, and which it masters
     tests = np.array([[a in e.abilities for a in ABILITIES] for e in episodes])
     good = np.zeros(tests.shape)
     for column, name in enumerate(ABILITIES):
@@ -239,6 +248,7 @@ def _mean_ability(
         np.divide(weights @ good, n, out=rates, where=n > 0)
         return np.asarray(100.0 * np.nanmean(rates, axis=1))
 
+    # resampled routes may test none of an ability: hence nanmean
     value = fmean(100.0 * sum(each) / len(each) for each in outcomes.values())
     here, anew = intervals(mean_rate, _types(episodes), seed, value, PERCENT)
     return Estimate(Measure(value, "%"), *here, len(episodes), *anew)

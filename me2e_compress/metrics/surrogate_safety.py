@@ -1,7 +1,7 @@
 """Surrogate safety measures: how near an episode came to a collision, and its fault.
 
-Contact alone tells drivers apart slowly (few routes end in one); these also see the
-near misses. Each is None where no simulator recorded what it needs.
+Few routes end in a collision, so collisions alone separate drivers slowly; these
+measures also count near misses. Each is None if its input was not recorded.
 """
 
 from collections.abc import Iterable
@@ -45,8 +45,7 @@ def smallest_distance(episode: Episode) -> Measure:
 def smallest_pet(episode: Episode) -> Measure:
     """Return the smallest post-encroachment time of crossing paths, seconds.
 
-    Routes on which the ego shared no place with anybody at 30 degrees or more, 5 s
-    apart or less, have none.
+    Only encounters at 30 degrees or more, at most 5 s apart, count.
     """
     encounters = () if episode.conflicts is None else episode.conflicts.encounters
     crossing = [each.pet_s for each in encounters if each.angle_rad >= CROSSING_RAD]
@@ -54,7 +53,7 @@ def smallest_pet(episode: Episode) -> Measure:
 
 
 def at_fault_collision(episode: Episode) -> bool | None:
-    """Return whether a collision was the ego's fault, None if one's is not known."""
+    """Return whether a collision was the ego's fault, None if unknown."""
     faults = [each.at_fault for each in episode.infractions if each.kind in COLLISIONS]
     if any(faults):
         return True

@@ -14,9 +14,9 @@ STAMP = "me2e.module"
 
 
 def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
-    """Find the module of every node. Linear in nodes, the same every time.
+    """Find the module of every node, deterministically and in linear time.
 
-    The first rule that knows decides:
+    The first rule that applies decides:
 
     0. *stamp*: the node's own metadata, in a graph that was imported before;
     1. *parameter*: names of the initializers that reach it, directly or through
@@ -31,6 +31,7 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
     Raises:
         ModuleMapError: a required pattern matches nothing, or none at all does.
     """
+    # stamps of an earlier import
     nodes = list(model.graph.all_nodes())
     placed = {
         node: Placement(module, "stamp")
@@ -41,6 +42,7 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
     scopes = {node: scope_of(node) for node in nodes}
     if not placed:
         _check(model, modules, scopes)
+    # names of parameters, then scopes
     by_scope = {
         node: module
         for node, scope in scopes.items()
@@ -55,6 +57,7 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
     if everywhere is not None:  # a pattern ``**``: what has no name is its too
         for node in nodes:
             placed.setdefault(node, Placement(everywhere, "scope"))
+    # what is left goes by its neighbours
     known = {node: place.module for node, place in placed.items()}
     if nodes and not known:
         raise ModuleMapError(
@@ -100,23 +103,18 @@ def _spread(
 ) -> dict[ir.Node, str]:
     """Assign the nodes without a name of their own, in a few sweeps over the graph.
 
-    1. A node whose results all end up in one module, whatever glue they pass on the
-       way, prepares that module's input and is of it.
-    2. A node whose results go to several modules, or out of the graph, is of the
+    1. A node whose results all end up in one module, whatever unnamed nodes they pass
+       on the way, prepares that module's input and belongs to it.
+    2. A node whose results go to several modules, or out of the graph, belongs to the
        module it gets its data from: of its producers, the one that comes last.
     3. What reads no data, as constants do, goes with the consumer that comes first.
-    4. What hangs on nothing goes with the node before it (in a subgraph: with the node
-       that holds it), at the very start with the one after.
+    4. A node without such neighbours goes with the node before it (in a subgraph: with
+       the node that holds it), at the very start with the one after.
 
-    Args:
-        nodes: all nodes, in graph order.
-        known: the modules of those with a name; must not be empty.
-        constant: nodes that compute from constants alone, which do not count as
-            producers.
-
-    Returns:
-        The module of every node, those that were known included.
+    ``known`` must not be empty; ``constant`` nodes do not count as producers. Returns
+    the module of every node, known ones included.
     """
+    # sweep 1, then 2: from producers to consumers
     place = {node: index for index, node in enumerate(nodes)}
     found = dict(known) | _single_destinations(nodes, known)
     for node in nodes:
@@ -126,10 +124,12 @@ def _spread(
         heard = [m for m in makers if m in found and m not in constant]
         if heard:
             found[node] = found[max(heard, key=place.__getitem__)]
+    # sweep 3: from consumers to producers
     for node in reversed(nodes):
         heard = [reader for reader in _readers(node) if reader in found]
         if node not in found and heard:
             found[node] = found[min(heard, key=place.__getitem__)]
+    # sweep 4: along the graph's order
     last = next(found[node] for node in nodes if node in found)
     for node in nodes:
         last = found.setdefault(node, last)
@@ -173,12 +173,9 @@ def by_parameter(
 ) -> dict[ir.Node, str]:
     """Return the module of every node that named parameters reach.
 
-    Args:
-        nodes: all nodes, in graph order.
-        modules: the map.
-        by_scope: module of each node by its scope, to recognise merged initializers.
-        constant: the nodes that compute from constants alone.
+    Nodes come in graph order. ``by_scope`` is needed to recognise merged initializers.
     """
+    # from initializers through constant arithmetic to the first nodes that compute
     claims: dict[ir.Value, str | None] = {}
     placed: dict[ir.Node, str] = {}
     for node in nodes:
@@ -206,8 +203,8 @@ def _copied(
 ) -> list[str]:
     """Return the module of a parameter that is stored as a copy of an equal one.
 
-    TorchScript's exporter writes parameters of equal numbers once, and the others as
-    an Identity of it that has their name.
+    TorchScript's exporter writes parameters of equal values once, and the others as an
+    Identity of it that has their name.
     """
     if node.op_type != "Identity" or node not in constant:
         return []

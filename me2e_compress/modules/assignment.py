@@ -1,4 +1,4 @@
-"""The module of every node of a graph, and what told it."""
+"""The module of every node of a graph, and the rule that found it."""
 
 import dataclasses
 from collections import Counter
@@ -23,12 +23,7 @@ class Placement:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Assignment(Displayed):
-    """The module of every node of a graph, nodes in subgraphs included.
-
-    Attributes:
-        modules: the map it was made with.
-        placements: by node, in the order of the graph.
-    """
+    """The module of every node of a graph and its subgraphs, in graph order."""
 
     modules: ModuleMap
     placements: Mapping[ir.Node, Placement]
@@ -40,7 +35,7 @@ class Assignment(Displayed):
         return f"map {self.modules.name}, {len(self.placements)} nodes: {counts}"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return a row a module: its nodes."""
+        """Return a row per module: its nodes."""
         nodes = Counter(place.module for place in self.placements.values())
         rows = [(name, str(nodes[name])) for name in self.modules.names()]
         return (table("Nodes by module", ("module", "nodes"), rows),)
@@ -50,7 +45,7 @@ class Assignment(Displayed):
         return self.placements[node].module
 
     def rule_of(self, node: ir.Node) -> Rule:
-        """Return which rule decided."""
+        """Return the rule that decided."""
         return self.placements[node].rule
 
     def nodes(self, module: str) -> list[ir.Node]:

@@ -17,8 +17,8 @@ def detect(model: ir.Model) -> ModuleMap:
 
     The model's metadata decides (``me2e.stack``: a preset's name, or one followed by
     ``-`` and a variant, as in ``vad-tiny``). Without it, the preset of which the
-    largest share of modules is found in the graph, then the one that claims most of
-    its names; at least half of the modules must be there.
+    largest share of modules is found in the graph, then the one that claims most of its
+    names; at least half of the modules must be there.
 
     Raises:
         ModuleMapError: no preset fits.
@@ -45,16 +45,9 @@ def _detect(stack: str | None, paths: list[str]) -> ModuleMap:
 
 
 def map_of(model: ir.Model, name: str | None) -> ModuleMap:
-    """Load the map that is asked for, or find the preset that fits.
+    """Load the preset or TOML file of a name, or find the preset that fits.
 
     A graph that no preset fits is one module, named ``model``.
-
-    Args:
-        model: The graph.
-        name: A preset or a TOML file; None to look for a preset.
-
-    Raises:
-        ModuleMapError: No such map.
     """
     if name is not None:
         return ModuleMap.load(name)
@@ -69,15 +62,8 @@ def map_of_files(
 ) -> ModuleMap:
     """Load the map of a stack of several files, or find the preset that fits them all.
 
-    What each file must match, another may: none of its patterns is required any more.
-
-    Args:
-        models: The files.
-        stack: What the metadata calls the stack; None where it does not.
-        name: A preset or a TOML file; None to look for a preset.
-
-    Raises:
-        ModuleMapError: No such map, or a required pattern matches nothing in any file.
+    No pattern is required to match in every file, but each in one. ``stack`` is the
+    name in the metadata; ``name`` a preset or a TOML file, None to look for a preset.
     """
     paths = [path for model in models for path in _paths(model)]
     if name is None:

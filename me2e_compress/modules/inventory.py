@@ -1,4 +1,4 @@
-"""What a graph holds: module by module, and against a state dict."""
+"""Count a graph's weights and costs by module, and compare it with a state dict."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -14,21 +14,19 @@ _NOT_WEIGHTS = (*_INTEGERS, ir.DataType.STRING)
 
 @dataclasses.dataclass(frozen=True)
 class Item:
-    """The nodes, weights and cost of one module.
+    """The nodes, weights and cost of one module; None is what nobody counts.
 
     Attributes:
-        module: its name.
-        nodes: its nodes, those in subgraphs included.
+        nodes: number of its nodes, those in subgraphs included.
         parameters: elements of its initializers that hold weights: of any type but
             int32, int64, bool and string, which hold shapes, indices and masks.
         weight_bytes: bytes of all its initializers.
-        macs: multiply-accumulates of the nodes whose count is known: where others are
-            unknown, a lower bound, and None instead of 0; None where nobody counts.
-        unknown_macs_nodes: how many of its nodes are not in ``macs``; None where
-            nobody counts.
-        activation_bytes: what its nodes write in a frame, alike.
-        unknown_activation_nodes: how many of its nodes are not in these, alike.
-        latency_share: of the time of a frame, 0 to 1; None where nobody measured.
+        macs: multiply-accumulates of the nodes whose count is known: a lower bound if
+            others are unknown, and then None instead of 0.
+        unknown_macs_nodes: number of its nodes that are not in ``macs``.
+        activation_bytes: bytes that its nodes write in a frame, bounded like ``macs``.
+        unknown_activation_nodes: number of its nodes that are not in these.
+        latency_share: share of a frame's time, 0 to 1; None if nobody measured.
     """
 
     module: str
@@ -51,13 +49,7 @@ def itemise(
     """Count each module, in the order of the map; modules without nodes are zeros.
 
     An initializer counts once: for the module that its name says, else for the first
-    node that reads it. One that nothing reads and nothing names counts nowhere.
-
-    Args:
-        model: the graph.
-        modules: its map.
-        module_of: the module of a node: an assignment's, or what imported nodes say.
-        macs: counts a node's multiply-accumulates, None where it cannot.
+    node that reads it. One that nothing reads and no name places counts nowhere.
     """
     nodes: dict[str, list[ir.Node]] = {name: [] for name in modules.names()}
     for node in model.graph.all_nodes():
@@ -109,15 +101,11 @@ def _owned(
 
 @dataclasses.dataclass(frozen=True)
 class WeightEntry:
-    """One tensor of the state dict or of the file.
+    """One tensor of the state dict or of the file; ``module`` is None if unknown.
 
-    Attributes:
-        name: its name there.
-        module: the module it counts for; None if nothing tells.
-        elements: how many numbers it holds.
-        kind: in a state dict "batch-norm statistics", "batch-norm counter" or
-            "parameter", which other buffers are called too; in a file "renamed
-            weight", "constant" or "integer constant".
+    ``kind`` is "batch-norm statistics", "batch-norm counter" or "parameter" (other
+    buffers too) in a state dict; "renamed weight", "constant" or "integer constant" in
+    a file.
     """
 
     name: str
@@ -128,12 +116,10 @@ class WeightEntry:
 
 @dataclasses.dataclass(frozen=True)
 class Inventory:
-    """A file against the state dict it was exported from.
+    """A file against its state dict: tensors in both, by name and number of elements.
 
-    Attributes:
-        present: in both, by name and number of elements.
-        missing: in the state dict only: folded, merged or never read.
-        extra: in the file only: renamed, folded together or made by the exporter.
+    ``missing`` tensors are folded, merged or never read; ``extra`` ones are renamed,
+    folded together or made by the exporter.
     """
 
     present: tuple[WeightEntry, ...]
@@ -149,12 +135,9 @@ def inventory(
 ) -> Inventory:
     """Compare a file's initializers with a state dict.
 
-    Args:
-        model: the graph.
-        modules: its map.
-        module_of: the module of a node.
-        state_dict: number of elements by name, buffers included.
+    ``state_dict`` maps names, buffers included, to numbers of elements.
     """
+    # what the file stores
     stored = {
         name: value
         for graph in (model.graph, *model.graph.subgraphs())
@@ -162,6 +145,7 @@ def inventory(
         if value.const_value is not None
     }
     sizes = {name: _elements(value) for name, value in stored.items()}
+    # what the state dict has, by the map's names
     ours = [
         WeightEntry(name, modules.match(name), elements, _kind_in_state_dict(name))
         for name, elements in state_dict.items()

@@ -1,4 +1,4 @@
-"""Module maps: which part of an ME2E stack goes by which names."""
+"""Module maps: the names of the modules of an ME2E stack."""
 
 import dataclasses
 import functools
@@ -24,11 +24,9 @@ WHOLE = "whole"
 class Substitute:
     """What substitutes the result of a scope while a module is ablated.
 
-    Attributes:
-        scope: pattern of the scope, or a module, whose result must no longer depend on
-            the module.
-        by: the scope or module whose result is read in its place; None for zeros.
-        reader: the scope or module that reads it so; None: whoever read it.
+    The result of ``scope``, a pattern or a module, must no longer depend on that
+    module: ``reader`` (None for all readers) reads the result of ``by`` instead, None
+    for zeros.
     """
 
     scope: str
@@ -40,14 +38,10 @@ class Substitute:
 class Module:
     """One module of a stack.
 
-    Attributes:
-        name: e.g. ``bev_encoder``.
-        role: "feature" for backbone, neck and BEV encoder, "prediction" for the rest:
-            what the quantization schemes go by.
-        patterns: its names, as :class:`PathGlob`; each must match something.
-        optional: more names, of other exports of the same stack; they may not match.
-        substitutes: what to re-wire when it is ablated; anything else that reads it
-            reads zeros.
+    The role is "feature" for backbone, neck and BEV encoder, "prediction" for the rest,
+    and quantization schemes choose by it. Each of ``patterns``, as :class:`PathGlob`,
+    must match something; ``optional`` ones, of other exports of the same stack, may
+    not. Whatever ``substitutes`` do not re-wire reads zeros when the module is ablated.
     """
 
     name: str
@@ -61,11 +55,11 @@ class Module:
 class ModuleMap(Displayed):
     """The modules of a stack and the names they go by.
 
-    One list of patterns a module, matched alike against parameter names
-    (``img_neck.lateral_convs.0.conv.weight``) and scopes (``img_neck.fpn_convs.0``).
-    Where several modules match a path, the pattern that reaches deepest into it
-    wins, then the one with more components written out, then the earlier in the file;
-    so a module may own ``head`` and another ``head.planner``.
+    One list of patterns per module is matched against both parameter names
+    (``img_neck.lateral_convs.0.conv.weight``) and scopes (``img_neck.fpn_convs.0``). If
+    several modules match a path, the pattern that reaches deepest into it wins, then
+    the one with more components written out, then the earlier in the file; so a module
+    may own ``head`` and another ``head.planner``.
 
     Attributes:
         name: of the preset, or of the file.
@@ -118,7 +112,7 @@ class ModuleMap(Displayed):
 
     @classmethod
     def parse(cls, text: str | bytes, name: str, origin: str = "map") -> Self:
-        """Read a map from TOML; ``origin`` is what an error message calls it."""
+        """Read a map from TOML; ``origin`` is its name in error messages."""
         try:
             draft = _File.model_validate(documents.from_toml(text))
         except documents.MalformedError as error:
@@ -145,7 +139,7 @@ class ModuleMap(Displayed):
         return f"{self.name}: {', '.join(self.names())}"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return a row a module: its role and the names it goes by."""
+        """Return a row per module: its role and the names it goes by."""
         rows = [
             (each.name, each.role, ", ".join(each.patterns + each.optional))
             for each in self.modules
@@ -157,11 +151,7 @@ class ModuleMap(Displayed):
         return tuple(m.name for m in self.modules if role in (None, m.role))
 
     def module(self, name: str) -> Module:
-        """Return a module by its name.
-
-        Raises:
-            ModuleMapError: the map has no such module.
-        """
+        """Return a module by its name."""
         for module in self.modules:
             if module.name == name:
                 return module

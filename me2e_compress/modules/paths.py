@@ -1,4 +1,4 @@
-"""Dotted paths: those that nodes and weights are named by, and patterns over them."""
+"""Dotted paths of nodes and weights, and patterns over them."""
 
 import ast
 import dataclasses
@@ -17,17 +17,17 @@ class PathGlob:
     """A glob over whole components of a dotted path.
 
     ``pts_bbox_head.transformer.encoder`` matches that path and everything below it;
-    ``*`` and ``?`` are wild within a component (``layers.*.norms``, ``pos_mlp*``).
-    A pattern that begins with ``*.`` or ``**.`` may match anywhere in the path, not
-    only from its root: ``*.cls_branches`` matches ``head.cls_branches.0.weight``.
-    ``**`` alone matches every path.
+    ``*`` and ``?`` are wild within a component (``layers.*.norms``, ``pos_mlp*``). A
+    pattern that begins with ``*.`` or ``**.`` may match anywhere in the path, not only
+    from its root: ``*.cls_branches`` matches ``head.cls_branches.0.weight``. ``**``
+    alone matches every path.
     """
 
     text: str
 
     @functools.cached_property
     def components(self) -> tuple[str, ...]:
-        """The components that are written out, without a leading ``*.``."""
+        """The pattern's components, without a leading ``*.``."""
         parts = tuple(self.text.split("."))
         return parts[1:] if self.anywhere else parts
 
@@ -39,14 +39,11 @@ class PathGlob:
 
     @functools.cached_property
     def _is_plain(self) -> bool:
-        """Whether it is a beginning written out: most are, and many paths are asked."""
+        """Whether it is a literal prefix, the common case, which must be fast."""
         return not self.anywhere and not any(mark in self.text for mark in "*?[")
 
     def reach(self, path: tuple[str, ...]) -> int | None:
-        """Count the components of a path up to the end of the deepest match.
-
-        None if the pattern does not match the path.
-        """
+        """Count a path's components up to the end of the deepest match, if any."""
         if self._is_plain:
             count = len(self.components)
             return count if path[:count] == self.components else None
@@ -91,7 +88,7 @@ def scope_of(node: ir.Node) -> str:
     3. the name of its first output, which tools that rename nodes often keep
        (``/img_neck/Resize_output_0``).
 
-    Empty where there is none: glue of the outermost forward, or renamed by a tool.
+    Empty if there is none: nodes of the outermost forward, or renamed by a tool.
     """
     props = node.metadata_props
     if props:
@@ -107,30 +104,18 @@ def scope_of(node: ir.Node) -> str:
 
 
 def exits(model: ir.Model, pattern: str) -> tuple[ir.Value, ...]:
-    """List the values that a scope gives to the rest of the graph, in graph order.
+    """List the values of a scope that the rest of the graph reads, in graph order.
 
-    Args:
-        model: the graph, its nodes still scoped.
-        pattern: as in a module map, e.g. ``*.motion_decoder``.
-
-    Returns:
-        Values made inside that are read outside or are outputs of the graph; the last
-        one is what the torch module returned, where it returns one tensor.
+    Graph outputs count too. ``pattern`` is one of a module map, e.g.
+    ``*.motion_decoder``. The last value is what the torch module returned, if it
+    returns one tensor.
     """
     glob = PathGlob(pattern)
     return leaving(model, lambda node: _within(glob, scope_of(node)))
 
 
 def leaving(model: ir.Model, holds: Callable[[ir.Node], bool]) -> tuple[ir.Value, ...]:
-    """List the values that some nodes give to the others or to the outputs.
-
-    Args:
-        model: the graph.
-        holds: whether a node is one of them.
-
-    Returns:
-        In graph order.
-    """
+    """List the values of some nodes that others read or the graph outputs."""
     members = {node: None for node in model.graph if holds(node)}
     return tuple(
         value
@@ -144,12 +129,7 @@ def leaving(model: ir.Model, holds: Callable[[ir.Node], bool]) -> tuple[ir.Value
 def entering(model: ir.Model, holds: Callable[[ir.Node], bool]) -> tuple[ir.Value, ...]:
     """List the values that some nodes read of others or of the inputs, not weights.
 
-    Args:
-        model: the graph.
-        holds: whether a node is one of them.
-
-    Returns:
-        In the order in which they are first read.
+    They are in the order in which they are first read.
     """
     members = {node: None for node in model.graph if holds(node)}
     read = dict.fromkeys(value for node in members for value in node.inputs)

@@ -1,7 +1,7 @@
-"""The fused operators: every plugin dialect, body, float64 reference and cost of each.
+"""The fused operators: dialects, body, float64 reference and cost of each.
 
-An operator stands in a graph as one node: in the toolkit's own form, in the domain
-``me2e``, or in the dialect of a plugin library of TensorRT.
+An operator is one node of a graph: in the toolkit's own form, in the domain ``me2e``,
+or in the dialect of a TensorRT plugin library.
 """
 
 from me2e_compress.operators.base import Cost, Operator

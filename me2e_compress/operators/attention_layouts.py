@@ -1,4 +1,4 @@
-"""The two layouts of deformable attention that differ from TensorRT OSS's."""
+"""Two layouts of deformable attention that differ from TensorRT OSS's."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ class JoinedHeads(Dialect):
     """A library whose output is [N, Q, M * D] instead of [N, Q, M, D]."""
 
     def result_to_own(self, call: FusedCall, result: ir.Value, own: Values) -> ir.Value:
-        """Part the heads."""
+        """Split the heads."""
         value, _, _, locations, _ = five(own)
         sizes = (call.size(value, 0), call.size(locations, 1))
         return call.reshape(result, (*sizes, call.size(value, 2), call.size(value, 3)))
@@ -56,21 +56,22 @@ class JoinedHeads(Dialect):
 class RawAttention(Dialect):
     """A library that takes reference points, offsets in pixels and raw weights.
 
-    Of P points, point p stands at reference point p % g, where there are g; the softmax
-    is over all levels and points (BEVFormer_tensorrt,
-    multiScaleDeformableAttnKernel.cu).
+    With g reference points, point p refers to reference point p % g; the softmax is
+    over all levels and points (BEVFormer_tensorrt, multiScaleDeformableAttnKernel.cu).
     """
 
     def inputs_to_own(
         self, call: FusedCall, inputs: Values, attributes: Attributes
     ) -> Values:
-        """Write locations, the softmax and where each level begins."""
+        """Write the locations, the softmax and the start of each level."""
         value, shapes, reference, offsets, weights = five(inputs)
+        # Offsets are in pixels of each level
         levels, group = _levels_and_group(call, shapes, reference, offsets, weights)
         batch, queries, heads = (call.size(offsets, axis) for axis in range(3))
         split = call.reshape(offsets, (batch, queries, heads, levels, -1, group, 2))
         scale = _columns_and_rows(call, shapes, offsets)
         split = call.add("Div", [split, call.unsqueeze(scale, (1, 2))])
+        # Add the reference points, then normalize the weights
         points = call.reshape(reference, (batch, queries, 1, 1, 1, group, 2))
         locations = call.add("Add", [split, points])
         locations = call.reshape(locations, (batch, queries, heads, levels, -1, 2))
@@ -81,7 +82,7 @@ class RawAttention(Dialect):
     def inputs_from_own(
         self, call: FusedCall, inputs: Values, attributes: Attributes
     ) -> Values:
-        """Write offsets from a reference point at 0; take the softmax away.
+        """Write offsets from a reference point at 0, and remove the softmax.
 
         Raises:
             PreconditionError: the weights do not come from a softmax over all levels
@@ -89,10 +90,12 @@ class RawAttention(Dialect):
         """
         value, shapes, _, locations, weights = five(inputs)
         batch, queries, heads = (call.size(locations, axis) for axis in range(3))
+        # Positions 0..1 become pixels
         scale = _columns_and_rows(call, shapes, locations)
         pixels = call.add("Mul", [locations, call.unsqueeze(scale, (1,))])
         offsets = call.reshape(pixels, (batch, queries, heads, -1))
         reference = call.full((batch, queries, 1, 2), 0.0, locations)
+        # The plugin applies the softmax itself
         raw = self._before_softmax(call, weights)
         raw = call.reshape(raw, (batch, queries, heads, -1))
         given = {
@@ -105,7 +108,6 @@ class RawAttention(Dialect):
         return self.in_types(call, given)
 
     def _before_softmax(self, call: FusedCall, weights: ir.Value) -> ir.Value:
-        """Write what the softmax reads in the layout of what it gives."""
         found = before_softmax(call, weights, 2)
         if found is None:
             raise PreconditionError(
@@ -116,7 +118,7 @@ class RawAttention(Dialect):
         return found
 
     def arrays_to_own(self, arrays: Arrays, attributes: Attributes) -> Arrays:
-        """Compute locations, the softmax and where each level begins."""
+        """Compute the locations, the softmax and the start of each level."""
         value, shapes, reference, offsets, raw = (np.asarray(each) for each in arrays)
         count, (batch, queries, heads, _) = len(shapes), offsets.shape
         group = reference.shape[-1] // 2
@@ -137,7 +139,7 @@ class RawAttention(Dialect):
         )
 
     def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
-        """Part the last axes into levels, points and x, y."""
+        """Split the last axes into levels, points and x, y."""
         value, sizes, _, offsets, weights = shapes
         levels = None if sizes is None else sizes[0]
         if offsets is None or weights is None:
@@ -149,7 +151,7 @@ class RawAttention(Dialect):
 
 
 def five(inputs: Values) -> tuple[ir.Value, ir.Value, ir.Value, ir.Value, ir.Value]:
-    """Return the five inputs of a call, none of which may be left out."""
+    """Return the five inputs of a call, none of which may be omitted."""
     one, two, three, four, five = (each for each in inputs if each is not None)
     return one, two, three, four, five
 
@@ -168,7 +170,7 @@ def _levels_and_group(
     offsets: ir.Value,
     weights: ir.Value,
 ) -> tuple[int, int]:
-    """Return how many levels and reference points there are; both must be known."""
+    """Return the numbers of levels and reference points; both must be known."""
     levels, pairs = _tail(shapes, 2)[0], _tail(reference, 1)[0]
     (steps,), (points,) = _tail(offsets, 1), _tail(weights, 1)
     name = f"node {call.node.name}: {call.node.op_type}"
@@ -203,7 +205,7 @@ def _columns_and_rows(call: FusedCall, shapes: ir.Value, like: ir.Value) -> ir.V
 
 
 def _starts(call: FusedCall, shapes: ir.Value) -> ir.Value:
-    """Write where each level begins, [L] int64, from the sizes of all."""
+    """Write the first row of each level, [L] int64."""
     known = array_of(shapes)
     if known is not None:
         areas = known.astype(np.int64).prod(axis=1)

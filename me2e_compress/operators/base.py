@@ -1,4 +1,4 @@
-"""What a fused operator is."""
+"""The base class of fused operators."""
 
 import abc
 import dataclasses
@@ -15,11 +15,11 @@ from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values
 
 @dataclasses.dataclass(frozen=True)
 class Cost:
-    """What one call takes.
+    """The cost of one call; None where shapes are open.
 
     Attributes:
-        macs: multiply-accumulates; None where shapes are open.
-        bytes: read and written, each operand and result once; None likewise.
+        macs: multiply-accumulates.
+        bytes: bytes read and written, each operand and result once.
     """
 
     macs: int | None
@@ -28,15 +28,15 @@ class Cost:
 
 @dataclasses.dataclass(frozen=True)
 class Operator(abc.ABC):
-    """A fused operator: derive a frozen dataclass, and register it.
+    """A fused operator; subclasses are frozen dataclasses that are registered.
 
     Class attributes:
-        name: what registry and reports call it.
+        name: its name in the registry and in reports.
         own: the toolkit's own form, in the domain ``me2e``.
-        dialects: every plugin library's spelling that is known, the preferred of a
-            name first.
-        int8_inputs: which inputs may be int8, of the own form and of every dialect:
-            features alone; positions and attention weights lose too much.
+        dialects: the known spellings of plugin libraries, the preferred of a name
+            first.
+        int8_inputs: indices of the inputs that may be int8, in the own form and every
+            dialect: only features; positions and attention weights lose too much.
     """
 
     name: ClassVar[str]
@@ -46,56 +46,44 @@ class Operator(abc.ABC):
 
     @abc.abstractmethod
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
-        """Write the operator in standard operators, before the call's node.
-
-        Args:
-            call: where to write, and at which opset.
-            inputs: in the own form.
-            attributes: in the own form.
-
-        Returns:
-            The output in the own form.
+        """Write the operator in standard operators; return the output in the own form.
         """
 
     @abc.abstractmethod
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
-        """Compute the operator in the own form in numpy, in float64."""
+        """Compute the operator in the own form, in numpy and float64."""
 
     @abc.abstractmethod
     def output_shape(
         self, shapes: Sequence[Dims | None], attributes: Attributes
     ) -> Dims | None:
-        """Return the shape of the output in the own form; None for open dimensions.
+        """Return the output's shape in the own form; None if even the rank is unknown.
 
-        Args:
-            shapes: of the inputs in the own form; None for an unknown rank.
-            attributes: in the own form.
-
-        Returns:
-            The shape; None if not even the rank is known.
+        Open dimensions are None, as is the shape of an input of unknown rank.
         """
 
     @abc.abstractmethod
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count multiply-accumulates of a call in the own form; None if not known."""
+        """Count the multiply-accumulates of a call in the own form, if known."""
 
     def all_dialects(self) -> tuple[Dialect, ...]:
-        """List the own form, then every library's."""
+        """Return the own form, then every library's."""
         return (self.own, *self.dialects)
 
     def dialect_reference(
         self, dialect: Dialect, inputs: Arrays, attributes: Attributes
     ) -> NdArray:
-        """Compute a call in a dialect in numpy, in float64."""
+        """Compute a call in a dialect, in numpy and float64."""
         own = dialect.arrays_to_own(inputs, attributes)
         result = self.reference(own, dialect.options_to_own(attributes))
         return dialect.result_from_own_array(result)
 
     def cost(self, node: ir.Node, dialect: Dialect) -> Cost:
-        """Return what one call takes, as far as the shapes are known.
+        """Return the cost of one call as far as the shapes are known.
 
         Raises:
-            PreconditionError: it has an attribute that this dialect does not know.
+            PreconditionError: the node has an attribute that this dialect does not
+                know.
         """
         shapes = dialect.shapes_to_own([open_shape(value) for value in node.inputs])
         attributes = dialect.options_to_own(dialect.attributes_of(node))
@@ -105,7 +93,7 @@ class Operator(abc.ABC):
 
 
 def bytes_of(values: Sequence[ir.Value | None]) -> int | None:
-    """Add up the bytes of values; None if a shape or type is not known."""
+    """Return the total bytes of values; None if a shape or type is unknown."""
     total = 0
     for value in values:
         if value is None:

@@ -1,4 +1,4 @@
-"""Scores from weights: what a softmax read, laid out as what it gives is read."""
+"""Recover the input of a softmax from its output."""
 
 import math
 
@@ -12,20 +12,15 @@ _LAYOUT = ("Expand", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze")
 
 
 def before_softmax(call: FusedCall, weights: ir.Value, axes: int) -> ir.Value | None:
-    """Write the layout of weights again, in front of their softmax.
+    """Write the scores of a softmax in the layout of its weights, if there is one.
 
-    Args:
-        call: where to write.
-        weights: each row of their last axes adds up to 1, if they are of a softmax.
-        axes: how many axes are a row.
-
-    Returns:
-        The scores, of the shape of the weights; None if they are of no softmax over
-        whole rows, or a shape on the way to it is not known.
+    The last ``axes`` axes of ``weights`` are one row. Returns None if the weights do
+    not come from a softmax over whole rows, or if a shape on the way is unknown.
     """
     shape = static_shape(weights)
     if shape is None:
         return None
+    # Walk back over layout operators that keep rows whole
     row, chain, source = math.prod(shape[-axes:]), list[ir.Node](), weights
     while node := maker(source, *_LAYOUT):
         read = node.inputs[0]
@@ -33,6 +28,7 @@ def before_softmax(call: FusedCall, weights: ir.Value, axes: int) -> ir.Value | 
             return None
         chain.append(node)
         source = read
+    # The softmax must be over the last axis
     softmax = maker(source, "Softmax")
     scores = None if softmax is None else softmax.inputs[0]
     made = static_shape(source)
@@ -40,6 +36,7 @@ def before_softmax(call: FusedCall, weights: ir.Value, axes: int) -> ir.Value | 
         return None
     if softmax.attributes.get_int("axis", -1) not in (-1, len(made) - 1):
         return None
+    # Repeat the layout operators on its input
     for node in reversed(chain):
         attributes = {name: each.value for name, each in node.attributes.items()}
         scores = call.add(node.op_type, [scores, *node.inputs[1:]], attributes)
@@ -47,12 +44,13 @@ def before_softmax(call: FusedCall, weights: ir.Value, axes: int) -> ir.Value | 
 
 
 def _keeps_rows(node: ir.Node, row: int) -> bool:
-    """Return whether a change of layout leaves every run of numbers of a row whole."""
+    """Return whether a layout operator keeps the numbers of each row together."""
     read, made = static_shape(node.inputs[0]), static_shape(node.outputs[0])
     if read is None or made is None:
         return False
     if node.op_type not in ("Expand", "Transpose"):
         return True
+    # A row consists of the last axes of the input
     kept = next(
         (at for at in range(len(read) + 1) if math.prod(read[len(read) - at :]) == row),
         None,

@@ -49,12 +49,12 @@ _DERRYHUB = "BEVFormer_tensorrt"
 
 @dataclasses.dataclass(frozen=True)
 class BEVPool(Operator):
-    """The sum, for each cell of the ground, of camera features times their depth.
+    """The sum, for each ground cell, of camera features times their depth.
 
     Own form ``me2e::BEVPoolV2``: depth, of any shape; feat [..., C]; ranks_depth and
-    ranks_feat [K] say which element of one goes with which row of the other, ranks_bev
-    [K] to which cell; interval_starts and interval_lengths [I] say which stretches of
-    the K share a cell, each cell once. Output [1, out_height, out_width, C].
+    ranks_feat [K] pair elements of depth with rows of feat, ranks_bev [K] names the
+    cell of each pair; interval_starts and interval_lengths [I] are the runs of pairs
+    that share a cell, each cell once. Output [1, out_height, out_width, C].
     """
 
     name: ClassVar[str] = "bev-pool"
@@ -70,6 +70,7 @@ class BEVPool(Operator):
         depth, feature, of_depth, of_feature, of_cell, starts, lengths = present(inputs)
         kind = feature.dtype or ir.DataType.FLOAT
         channels = call.size(feature, -1)
+        # Multiply paired features and depths
         rows = call.reshape(feature, (-1, channels))
         numbers = call.reshape(depth, (-1, 1))
         rows = call.add("Gather", [rows, of_feature], {"axis": 0})
@@ -78,12 +79,14 @@ class BEVPool(Operator):
         weighted = call.add(
             "Mul", [call.cast(each, ir.DataType.DOUBLE) for each in (rows, numbers)]
         )
+        # Sum each interval as a difference of running sums
         running = call.add("CumSum", [weighted, call.integers(0)])
         running = call.add("Pad", [running, call.integers([1, 0, 0, 0])])
         ends = call.add("Add", [starts, lengths])
         upper = call.add("Gather", [running, ends], {"axis": 0})
         lower = call.add("Gather", [running, starts], {"axis": 0})
         sums = call.cast(call.add("Sub", [upper, lower]), kind)
+        # Scatter the sums to their cells
         cells = call.add("Gather", [of_cell, starts], {"axis": 0})
         cells = call.unsqueeze(call.cast(cells, ir.DataType.INT64), (1,))
         height, width = (number(attributes, name.name) for name in _SIZES)

@@ -1,9 +1,9 @@
-"""Bilinear samples of feature maps that lie behind each other in one tensor.
+"""Bilinear samples of feature maps that are concatenated in one tensor.
 
-A position 0..1 of a map of W columns is column position * W - 0.5; what lies outside of
-the map is zero (``grid_sample`` with ``align_corners=False``, zeros). Once with
-GridSample, where the graph tells the sizes of the maps, once with Gather, which any
-opset has, once by a compiled kernel; and in numpy.
+A position 0..1 of a map of W columns is column position * W - 0.5; outside of the map
+is zero (``grid_sample`` with ``align_corners=False``, zeros). Written with GridSample
+where the sizes of the maps are constants, with Gather for any opset, as a compiled
+kernel, and in numpy.
 """
 
 import functools
@@ -32,25 +32,25 @@ def sample_levels(
     locations: ir.Value,
     weights: ir.Value,
 ) -> ir.Value:
-    """Write the weighted sum of samples of several maps.
+    """Write the weighted sum of samples of several maps, [N, Q, M, D].
+
+    The result has the element type of ``value``.
 
     Args:
         call: where to write.
-        value: [N, S, M, D], the maps one behind the other.
+        value: [N, S, M, D], the maps concatenated.
         sizes: [L, 2], height and width of each map.
-        starts: [L], where each map begins among the S rows.
+        starts: [L], the first of the S rows of each map.
         locations: [N, Q, M, L, P, 2], x and y in 0..1; [N, Q, 1, L, P, 2] where all
-            heads look at the same.
+            heads sample the same positions.
         weights: [N, Q, M, L, P].
-
-    Returns:
-        [N, Q, M, D], of the element type of ``value``.
     """
     kind = value.dtype
     if kind == ir.DataType.FLOAT16:  # onnxruntime's CPU has no kernels for it
         value, locations, weights = (
             call.cast(each, ir.DataType.FLOAT) for each in (value, locations, weights)
         )
+    # Prefer a kernel, then GridSample, then Gather
     known, first = array_of(sizes), array_of(starts)
     if call.compiled and value.dtype in (None, ir.DataType.FLOAT):
         result = _by_kernel(call, value, sizes, starts, locations, weights)
@@ -66,7 +66,7 @@ def sample_levels(
 
 
 def _by_kernel(call: FusedCall, *inputs: ir.Value) -> ir.Value:
-    """Write one node; its kernel takes what :func:`sample_levels` takes."""
+    """Write one node whose kernel takes the inputs of :func:`sample_levels`."""
     value, weights = inputs[0], inputs[-1]
     result = call.add("MultiScaleDeformableAttention", inputs, domain=DOMAIN)
     sizes = [call.known_size(weights, axis) for axis in range(3)]
@@ -82,11 +82,13 @@ def _by_grid_sample(
     locations: ir.Value,
     weights: ir.Value,
 ) -> ir.Value:
+    # One image per head, or all heads as channels if they share
     batch, heads, width = (call.size(value, axis) for axis in (0, 2, 3))
     queries, points = call.size(locations, 1), call.size(locations, 4)
     both = call.product(batch, heads)
     shared = call.size(locations, 2) == 1
     images, channels = (batch, call.product(heads, width)) if shared else (both, width)
+    # GridSample takes positions in -1..1
     scaled = call.add("Mul", [locations, call.numbers(2.0, locations)])
     grids = call.add("Sub", [scaled, call.numbers(1.0, locations)])
     grids = call.transpose(grids, (0, 2, 3, 1, 4, 5))  # [N, M, L, Q, P, 2]
@@ -106,6 +108,7 @@ def _by_grid_sample(
         kept.append(level)
     if not samples:
         return call.full((batch, queries, heads, width), 0.0, value)
+    # Multiply by the weights and sum over levels and points
     weights = call.transpose(weights, (0, 2, 1, 3, 4))  # [N, M, Q, L, P]
     if len(kept) < len(maps):
         weights = call.add("Gather", [weights, call.integers(kept)], {"axis": 3})
@@ -124,7 +127,8 @@ def _by_gather(
     locations: ir.Value,
     weights: ir.Value,
 ) -> ir.Value:
-    """Take the four rows around each position; a row of zeros stands for outside."""
+    """Gather the four rows around each position; a row of zeros stands for outside."""
+    # Pixels around each position, along both axes
     heads, width = call.size(value, 2), call.size(value, 3)
     sizes = call.cast(sizes, ir.DataType.INT64)
     height, columns = (
@@ -133,12 +137,14 @@ def _by_gather(
     )
     x, y = call.split_last(locations, 2)
     axes = [_neighbours(call, at, count) for at, count in ((x, columns), (y, height))]
+    # Row 0 is the row of zeros
     padded = call.add("Pad", [value, call.integers([0, 1, 0, 0, 0, 0, 0, 0])])
     rows = call.reshape(padded, (-1, width))
     base = _first_rows(call, padded, starts)
     many = call.value_of(heads)
     nothing, zero = call.integers(0), call.numbers(0.0, weights)
     parts = []
+    # Add the four corners
     for row, row_inside, row_part in axes[1]:
         for column, inside, part in axes[0]:
             where = call.add("And", [inside, row_inside])
@@ -154,7 +160,6 @@ def _by_gather(
 
 
 def _by_level(call: FusedCall, numbers: ir.Value) -> ir.Value:
-    """Put one number a level [L] along the axes of weights, [L, 1]."""
     return call.unsqueeze(numbers, (1,))
 
 
@@ -165,7 +170,7 @@ def _as(call: FusedCall, count: ir.Value, like: ir.Value) -> ir.Value:
 def _neighbours(
     call: FusedCall, position: ir.Value, count: ir.Value
 ) -> list[tuple[ir.Value, ir.Value, ir.Value]]:
-    """Write the two pixels around a position along one axis: index, inside, share."""
+    """Write index, inside and share of the two pixels around a position on one axis."""
     size = _as(call, count, position)
     scaled = call.add("Mul", [position, size])
     pixel = call.add("Sub", [scaled, call.numbers(0.5, position)])
@@ -189,7 +194,7 @@ def _neighbours(
 
 
 def _first_rows(call: FusedCall, padded: ir.Value, starts: ir.Value) -> ir.Value:
-    """Write where each map of each head begins among the rows, [N, 1, M, L, 1]."""
+    """Write the first row of each map and head, [N, 1, M, L, 1]."""
     batch, length, heads = (call.size(padded, axis) for axis in (0, 1, 2))
     many = call.value_of(heads)
     starts = call.cast(starts, ir.DataType.INT64)
@@ -207,10 +212,9 @@ def _first_rows(call: FusedCall, padded: ir.Value, starts: ir.Value) -> ir.Value
 def sample_levels_array(
     value: Numbers, sizes: Sizes, starts: Sizes, locations: Numbers, weights: Numbers
 ) -> Numbers:
-    """Compute :func:`sample_levels` in numpy; a position that is not finite is outside.
+    """Compute :func:`sample_levels` in numpy, [N, Q, M, D] float64.
 
-    Returns:
-        [N, Q, M, D] float64.
+    A position that is not finite counts as outside.
     """
     batch, _, heads, _ = value.shape
     total = np.zeros((batch, locations.shape[1], heads, value.shape[3]))
@@ -219,10 +223,12 @@ def sample_levels_array(
     for level, ((height, width), start) in enumerate(zip(sizes, starts, strict=True)):
         if not height * width:
             continue
+        # Pixels of this level; far positions are clipped just outside
         size = np.array([width, height], np.float64)
         pixel = locations[:, :, :, level] * size - 0.5
         pixel = np.where(np.isfinite(pixel), pixel, -2.0).clip(-2, size + 1)
         low = np.floor(pixel)
+        # Add the four corners
         for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
             at = low + corner
             inside = ((at >= 0) & (at < size)).all(axis=-1)

@@ -1,4 +1,4 @@
-"""A fused node that is being rewritten: its operands, and nodes put before it."""
+"""Rewrite one fused node: access its operands and insert nodes before it."""
 
 from collections.abc import Mapping, Sequence
 from typing import TypeAlias
@@ -21,17 +21,17 @@ _INT64 = ir.DataType.INT64
 
 
 class FusedCall:
-    """Where a body or a conversion is written: in front of one node.
+    """Inserts the nodes of a body or conversion before one fused node.
 
-    What is added inherits the node's module and origins, and its shape and type are
-    inferred at once, so that whoever adds the next node can ask for them.
+    New nodes inherit the node's module and origins, and their shape and type are
+    inferred at once, so that the next node can depend on them.
 
     Args:
-        node: stands in a graph or in a function; it stays as it is.
-        opset: of ONNX's own operators.
+        node: in a graph or in a function; it is not changed.
+        opset: of the standard operators.
         by: the name of the pass, for the provenance.
-        names: of all values of the model; new ones are entered. None looks at the
-            whole graph, which whoever rewrites many nodes had better do once.
+        names: of all values of the model; new ones are added. None collects them from
+            the whole graph, which is slow for many nodes.
         compiled: whether a body may call compiled kernels.
     """
 
@@ -61,7 +61,7 @@ class FusedCall:
         domain: str = "",
         outputs: int = 1,
     ) -> ir.Value:
-        """Insert a node before the fused one; return its first output."""
+        """Insert a node before the fused one and return its first output."""
         name = fresh_name(f"{self._stem}/{op_type}", self.names)
         made = ir.node(
             op_type, inputs, attributes, domain=domain, name=name, num_outputs=outputs
@@ -74,7 +74,7 @@ class FusedCall:
         return made.outputs[0]
 
     def constant(self, array: Array, name: str = "constant") -> ir.Value:
-        """Add a constant: an initializer, or within a function a Constant node."""
+        """Add a constant: an initializer, or a Constant node within a function."""
         name = f"{self._stem}/{name}"
         if isinstance(self._where, ir.Graph):
             return add_constant(self._where, array, name, self.names)
@@ -85,12 +85,12 @@ class FusedCall:
         return made.outputs[0]
 
     def numbers(self, values: float | Sequence[float], like: ir.Value) -> ir.Value:
-        """Add a constant of the element type of another value."""
+        """Add a constant of another value's element type."""
         kind = like.dtype or ir.DataType.FLOAT
         return self.constant(np.asarray(values, kind.numpy()))
 
     def numbers_of(self, array: Array, like: ir.Value) -> ir.Value:
-        """Add an array in the element type of another value."""
+        """Add an array in another value's element type."""
         kind = like.dtype or ir.DataType.FLOAT
         return self.constant(array.astype(kind.numpy()))
 
@@ -99,7 +99,7 @@ class FusedCall:
         return self.constant(np.asarray(values, np.int64), "sizes")
 
     def sizes(self, values: Sequence[Size], shape: Sequence[int] = (-1,)) -> ir.Value:
-        """Return sizes as one int64 value: a constant where all are known."""
+        """Return sizes as one int64 value, a constant where all are known."""
         known = [size for size in values if isinstance(size, int)]
         if len(known) == len(values):
             return self.constant(np.asarray(known, np.int64).reshape(shape), "sizes")
@@ -114,7 +114,7 @@ class FusedCall:
         return self.constant(known.reshape(shape), "table")
 
     def cast(self, value: ir.Value, kind: ir.DataType) -> ir.Value:
-        """Return a value in another element type; itself where it has that."""
+        """Return a value in another element type; the value itself if it has that."""
         if value.dtype == kind:
             return value
         known = array_of(value)
@@ -123,14 +123,14 @@ class FusedCall:
         return self.add("Cast", [value], {"to": int(kind)})
 
     def size(self, value: ir.Value, axis: int) -> Size:
-        """Return how large a dimension is: a number where the graph knows it."""
+        """Return the size of a dimension: a number where the graph knows it."""
         if (known := self.known_size(value, axis)) is not None:
             return known
         shown = self.add("Shape", [value])
         return self.add("Gather", [shown, self.integers([axis])], {"axis": 0})
 
     def known_size(self, value: ir.Value, axis: int) -> int | None:
-        """Return how large a dimension is, if the graph knows it."""
+        """Return the size of a dimension, if the graph knows it."""
         dim = None if value.shape is None else value.shape[axis]
         return dim if isinstance(dim, int) else None
 
@@ -155,8 +155,9 @@ class FusedCall:
         return self.add("Mul", [computed, self.integers([number])])
 
     def reshape(self, value: ir.Value, sizes: Sequence[Size]) -> ir.Value:
-        """Reshape to sizes of which some may be known at run time only; -1 is left."""
+        """Reshape to sizes, some possibly known only at run time; -1 is allowed."""
         given = [size for size in sizes if isinstance(size, int)]
+        # One size known only at run time may be left to -1
         if len(given) == len(sizes):
             shape = self.integers(given)
         elif len(given) == len(sizes) - 1 and 0 not in given and -1 not in given:
@@ -165,6 +166,7 @@ class FusedCall:
         else:
             parts = [self.value_of(size) for size in sizes]
             shape = self.add("Concat", parts, {"axis": 0})
+        # A literal 0 needs allowzero
         zero = 0 in given and -1 not in given and self.opset >= _ALLOWZERO_OPSET
         result = self.add("Reshape", [value, shape], {"allowzero": 1} if zero else None)
         if result.shape is None:
@@ -172,29 +174,29 @@ class FusedCall:
         return result
 
     def transpose(self, value: ir.Value, order: Sequence[int]) -> ir.Value:
-        """Put the axes of a value in another order."""
+        """Permute the axes of a value."""
         return self.add("Transpose", [value], {"perm": list(order)})
 
     def slice(self, value: ir.Value, start: int, end: int, axis: int) -> ir.Value:
-        """Take a stretch of one axis."""
+        """Take the indices from start to end of one axis."""
         edges = [self.integers([number]) for number in (start, end, axis)]
         return self.add("Slice", [value, *edges])
 
     def counting(self, size: Size) -> ir.Value:
-        """Write 0, 1, ... below a size, int64."""
+        """Write the int64 numbers 0, 1, ... below a size."""
         if isinstance(size, int):
             return self.integers(list(range(size)))
         end = self.add("Squeeze", [size, self.integers([0])])
         return self.add("Range", [self.integers(0), end, self.integers(1)])
 
     def concat(self, values: Sequence[ir.Value], axis: int) -> ir.Value:
-        """Join values along an axis; one alone stays as it is."""
+        """Concatenate values along an axis; a single value is returned unchanged."""
         if len(values) == 1:
             return values[0]
         return self.add("Concat", values, {"axis": axis})
 
     def full(self, sizes: Sequence[Size], number: float, like: ir.Value) -> ir.Value:
-        """Write one number everywhere, of the element type of another value."""
+        """Write a tensor of one number, of another value's element type."""
         kind = like.dtype or ir.DataType.FLOAT
         filling = {"value": ir.tensor(np.full(1, number, kind.numpy()))}
         result = self.add("ConstantOfShape", [self.sizes(sizes)], filling)
@@ -202,14 +204,14 @@ class FusedCall:
         return result
 
     def split_last(self, value: ir.Value, count: int) -> tuple[ir.Value, ...]:
-        """Take the components of the last axis, a handful, each apart."""
+        """Return the few components of the last axis separately."""
         return tuple(
             self.add("Gather", [value, self.integers(index)], {"axis": -1})
             for index in range(count)
         )
 
     def sum(self, value: ir.Value, axes: Sequence[int]) -> ir.Value:
-        """Add up along axes, which go."""
+        """Sum over axes, which are dropped."""
         along = self.integers(list(axes))
         return self.add("ReduceSum", [value, along], {"keepdims": 0})
 
@@ -219,7 +221,7 @@ class FusedCall:
 
 
 _ALLOWZERO_OPSET = 14
-"""Before it, a 0 in a shape stands for the dimension of what is reshaped."""
+"""Before this opset, a 0 in a shape copies the dimension of the input."""
 
 
 def _shape(sizes: Sequence[Size]) -> ir.Shape:
@@ -228,7 +230,7 @@ def _shape(sizes: Sequence[Size]) -> ir.Shape:
 
 
 def names_in(where: ir.Graph | ir.Function) -> set[str]:
-    """Collect the names of all values of a graph or function."""
+    """Return the names of all values of a graph or function."""
     if isinstance(where, ir.Graph):
         return value_names(where)
     values = (value.name or "" for node in where for value in node.outputs)
@@ -236,7 +238,7 @@ def names_in(where: ir.Graph | ir.Function) -> set[str]:
 
 
 def _typed(value: ir.Value) -> bool:
-    """Give a constant type and shape: of a Constant node, files record neither."""
+    """Set a constant's type and shape, which files omit for Constant nodes."""
     known = array_of(value)
     if known is None:
         return False
@@ -246,12 +248,13 @@ def _typed(value: ir.Value) -> bool:
 
 
 def _infer(node: ir.Node, opset: int) -> None:
-    """Infer what a node gives, from the types of its operands and small constants."""
+    """Infer a node's outputs from the types of its operands and small constants."""
     if node.domain or not onnx.defs.has(node.op_type, opset, ""):
         return
     written = ir.to_proto(node)
     types: dict[str, onnx.TypeProto] = {}
     data: dict[str, onnx.TensorProto] = {}
+    # Every input needs a type; integer constants are shown too
     for value in node.inputs:
         if value is None or not value.name:
             continue

@@ -41,9 +41,9 @@ def _operands(
 
 @dataclasses.dataclass(frozen=True)
 class ScaledFeature(Dialect):
-    """SparseDriveV2, whose int8 features come with a scale per channel, a sixth input.
+    """SparseDriveV2, whose int8 features have a scale per channel as a sixth input.
 
-    From the own form it goes with float features, which have no scale.
+    From the own form it takes float features, without a scale.
     """
 
     def inputs_to_own(
@@ -63,11 +63,11 @@ class ScaledFeature(Dialect):
         return (np.asarray(arrays[0]) * arrays[5].astype(np.float64), *arrays[1:5])
 
     def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
-        """Drop that of the scales."""
+        """Drop the shape of the scales."""
         return shapes[:5]
 
     def output_type(self, inputs: Values) -> ir.DataType | None:
-        """Return that of the scales, where there are any."""
+        """Return the type of the scales, if there are any."""
         scaled = len(inputs) > 5 and inputs[5] is not None
         return super().output_type(inputs[5:] if scaled else inputs)
 
@@ -80,10 +80,10 @@ class DeformableAggregation(Operator):
     """A weighted sum of samples of all cameras and levels, for each anchor.
 
     Own form ``me2e::DeformableAggregation``: mc_ms_feat [N, S, C], the maps of all
-    cameras one behind the other; spatial_shape [V, L, 2] (H, W) of V cameras;
-    scale_start_index [V, L]; sampling_location [N, A, P, V, 2] (x, y), of which only
-    those strictly between 0 and 1 count; weights [N, A, P, V, L, G]. Channel c reads
-    group c // (C / G). Output [N, A, C], the sum over points, cameras and levels.
+    cameras concatenated; spatial_shape [V, L, 2] (H, W) of V cameras; scale_start_index
+    [V, L]; sampling_location [N, A, P, V, 2] (x, y), of which only those strictly
+    between 0 and 1 count; weights [N, A, P, V, L, G]. Channel c reads group c // (C /
+    G). Output [N, A, C], the sum over points, cameras and levels.
     """
 
     name: ClassVar[str] = "deformable-aggregation"
@@ -122,6 +122,7 @@ class DeformableAggregation(Operator):
         parts = -1
         if isinstance(width, int) and isinstance(groups, int):
             parts = width // groups
+        # Channel groups are heads; cameras times levels are maps
         value = call.reshape(feature, (batch, call.size(feature, 1), groups, parts))
         maps = call.product(cameras, levels)
         places = call.transpose(at, (0, 1, 3, 2, 4))  # [N, A, V, P, 2]
@@ -130,6 +131,7 @@ class DeformableAggregation(Operator):
         shown = call.sizes(shape)
         places = call.add("Expand", [places, shown])
         places = call.reshape(places, (batch, anchors, 1, maps, points, 2))
+        # Positions outside of an image have no weight
         weights = self._inside(call, at, weights)
         weights = call.transpose(weights, (0, 1, 5, 3, 4, 2))  # [N, A, G, V, L, P]
         weights = call.reshape(weights, (batch, anchors, groups, maps, points))
@@ -144,7 +146,6 @@ class DeformableAggregation(Operator):
         return call.reshape(result, (batch, anchors, width))
 
     def _inside(self, call: FusedCall, at: ir.Value, weights: ir.Value) -> ir.Value:
-        """Take the weights of positions away that are not within their image."""
         sides = []
         for axis in call.split_last(at, 2):
             above = call.add("Greater", [axis, call.numbers(0.0, axis)])

@@ -57,10 +57,10 @@ _MMCV = "MMCVMultiScaleDeformableAttention"
 class DeformableAttention(Operator):
     """A weighted sum of samples of several feature maps, for each query and head.
 
-    Own form ``me2e::MultiScaleDeformableAttention``, inputs as TensorRT OSS's plugin:
-    value [N, S, M, D]; spatial_shapes int32 or int64 [L, 2] (H, W); level_start_index
-    [L]; sampling_locations [N, Q, M, L, P, 2] (x, y) in 0..1; attention_weights
-    [N, Q, M, L, P] after their softmax. Output [N, Q, M, D].
+    Own form ``me2e::MultiScaleDeformableAttention``, inputs as in TensorRT OSS's
+    plugin: value [N, S, M, D]; spatial_shapes int32 or int64 [L, 2] (H, W);
+    level_start_index [L]; sampling_locations [N, Q, M, L, P, 2] (x, y) in 0..1;
+    attention_weights [N, Q, M, L, P] after their softmax. Output [N, Q, M, D].
     """
 
     name: ClassVar[str] = "deformable-attention"
@@ -94,7 +94,7 @@ class DeformableAttention(Operator):
     )  # fmt: skip
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
-        """Sample every level; GridSample where sizes are constant, else Gather."""
+        """Sample every level, with GridSample where sizes are constant, else Gather."""
         return sample_levels(call, *five(inputs))
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:

@@ -61,7 +61,7 @@ _OWN = _options("groups", "deform_groups")
 
 @dataclasses.dataclass(frozen=True)
 class NamedGroups(RenamedAttributes):
-    """A library that names the two counts of groups as it likes, in one order."""
+    """A library with its own names for the two counts of groups, in the same order."""
 
     own_attributes: ClassVar[tuple[Attribute, ...]] = _OWN
 
@@ -76,12 +76,12 @@ _TRT = "ModulatedDeformableConv2dTRT"
 
 @dataclasses.dataclass(frozen=True)
 class DeformableConvolution(Operator):
-    """A convolution whose kernel's elements are moved by offsets, weighted by a mask.
+    """A convolution whose kernel elements are moved by offsets and weighted by a mask.
 
     Own form ``me2e::ModulatedDeformConv2d``: input [N, C, H, W]; offset
     [N, deform_groups * K * 2, F, G] (y, x), for K elements of the kernel; mask
-    [N, deform_groups * K, F, G]; weight [O, C / groups, kernel height, width]; bias [O]
-    or none; ``stride``, ``padding``, ``dilation`` (two each), ``groups``,
+    [N, deform_groups * K, F, G]; weight [O, C / groups, kernel height, width]; optional
+    bias [O]; ``stride``, ``padding``, ``dilation`` (two each), ``groups``,
     ``deform_groups``. Output [N, O, F, G].
     """
 
@@ -131,6 +131,7 @@ class DeformableConvolution(Operator):
         out, part, *elements = weight.shape
         count, places = math.prod(elements), down * across
         parts, groups = number(attributes, "deform_groups"), deep // part
+        # Sample each kernel element at its moved position
         grid = kernel_positions((down, across), (elements[0], elements[1]), attributes)
         moved = offset.reshape(batch, parts, count, 2, places).transpose(0, 4, 2, 1, 3)
         at = (moved + grid)[..., ::-1] + 0.5
@@ -144,6 +145,7 @@ class DeformableConvolution(Operator):
             shares.reshape(shape),
         )
         taken = taken.reshape(batch, places, count, groups, part)
+        # Multiply the samples by the weight, group by group
         matrix = weight.reshape(groups, out // groups, part, count)
         result: NdArray = np.einsum("gock,npkgc->ngop", matrix, taken)
         result = result.reshape(batch, out, down, across)
@@ -157,7 +159,7 @@ class DeformableConvolution(Operator):
         return (offset[0], weight[0], offset[2], offset[3])
 
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count the convolution: output elements times a kernel's numbers."""
+        """Count the convolution: output elements times the numbers of a kernel."""
         shape, weight = self.output_shape(shapes, attributes), shapes[3]
         dims = [*(shape or (None,)), *(weight or (None,))[1:]]
         known = [dim for dim in dims if dim is not None]
@@ -167,10 +169,9 @@ class DeformableConvolution(Operator):
 def kernel_positions(
     out: tuple[int, int], kernel: tuple[int, int], attributes: Attributes
 ) -> NdArray:
-    """Compute where each element of a kernel lies without an offset.
+    """Return the positions of kernel elements without offsets, y and x in pixels.
 
-    Returns:
-        [rows * columns, elements, 1, 2] float64, y and x in pixels.
+    The shape is [rows * columns, elements, 1, 2], float64.
     """
     options = [numbers(attributes, name) for name in _NAMES]
     axes = [
@@ -186,15 +187,7 @@ def kernel_positions(
 
 @dataclasses.dataclass(frozen=True)
 class _Sizes:
-    """The sizes of one call; all but the batch are known.
-
-    Attributes:
-        batch: images.
-        image: channels, height and width.
-        out: channels, height and width.
-        part: channels that one group reads.
-        kernel: height and width.
-    """
+    """The sizes of one call, in the order (channels,) height, width."""
 
     batch: Size
     image: tuple[int, int, int]
@@ -206,7 +199,6 @@ class _Sizes:
     def of(
         cls, call: FusedCall, image: ir.Value, offset: ir.Value, weight: ir.Value
     ) -> "_Sizes":
-        """Read them from the shapes of the inputs."""
         batch, *sizes = (call.size(image, axis) for axis in range(4))
         sizes += (call.size(offset, axis) for axis in (2, 3))
         sizes += (call.size(weight, axis) for axis in range(4))
@@ -223,12 +215,10 @@ class _Sizes:
 
     @property
     def count(self) -> int:
-        """Elements of the kernel."""
         return math.prod(self.kernel)
 
     @property
     def places(self) -> int:
-        """Pixels of the output."""
         return math.prod(self.out[1:])
 
 
@@ -240,17 +230,19 @@ def _by_samples(
     weight: ir.Value,
     attributes: Attributes,
 ) -> ir.Value:
-    """Sample for each element of the kernel; multiply by the weight."""
+    """Sample every element of the kernel and multiply by the weight."""
     sizes = _Sizes.of(call, image, offset, weight)
     (deep, high, wide), part, count = sizes.image, sizes.part, sizes.count
     batch, places = sizes.batch, sizes.places
     parts, groups = number(attributes, "deform_groups"), deep // part
+    # The image as one level, with deform groups as heads
     value = call.reshape(image, (batch, parts, deep // parts, high * wide))
     value = call.transpose(value, (0, 3, 1, 2))  # [N, H*W, parts, C / parts]
     locations = _locations(call, offset, sizes, attributes)
     shape = (batch, places * count, parts, 1, 1)
     shares = call.reshape(mask, (batch, parts, count, places))
     shares = call.reshape(call.transpose(shares, (0, 3, 2, 1)), shape)
+    # Sample with the mask as weight
     taken = sample_levels(
         call,
         value,
@@ -259,6 +251,7 @@ def _by_samples(
         call.reshape(locations, (*shape, 2)),
         shares,
     )
+    # One product per group
     taken = call.reshape(taken, (batch, places, count, groups, part))
     taken = call.transpose(taken, (0, 3, 4, 2, 1))
     taken = call.reshape(taken, (batch, groups, part * count, places))
@@ -269,10 +262,9 @@ def _by_samples(
 def _locations(
     call: FusedCall, offset: ir.Value, sizes: _Sizes, attributes: Attributes
 ) -> ir.Value:
-    """Write where each element of the kernel looks: x and y, 0..1 of the image.
+    """Write the x and y of each kernel element, in 0..1 of the image.
 
-    Returns:
-        [N, F * G, elements, deform_groups, 2].
+    The shape is [N, F * G, elements, deform_groups, 2].
     """
     parts = number(attributes, "deform_groups")
     shape = (sizes.batch, parts, sizes.count, 2, sizes.places)

@@ -1,4 +1,4 @@
-"""A dialect of a fused operator: how one plugin library spells it."""
+"""Dialects of fused operators: how a plugin library spells them."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ INT32 = (ir.DataType.INT32,)
 INTEGERS = (ir.DataType.INT32, ir.DataType.INT64)
 
 PLUGIN_ATTRIBUTES = ("plugin_version", "plugin_namespace")
-"""What TensorRT finds a plugin by besides the operator's name; of no other meaning."""
+"""Attributes by which TensorRT finds a plugin, besides the operator's name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,13 +34,13 @@ class Operand:
     """One input of a fused operator.
 
     Attributes:
-        name: what messages call it.
-        dims: its dimensions, parted by blanks: a number, a letter that stands for one
-            size in all operands of a call, or ``*`` for any; None for any rank.
-        types: the element types that are taken.
-        optional: whether it may be left out, it and all behind it.
-        positions: whether it says where to look, or which matrix to invert: such
-            numbers stay in float.
+        name: the name in messages.
+        dims: its dimensions, separated by blanks: a number, a letter for a size that is
+            equal in all operands of a call, or ``*`` for any; None for any rank.
+        types: the accepted element types.
+        optional: whether it, and all inputs after it, may be omitted.
+        positions: whether it holds sampling positions or matrices to invert: these stay
+            in float.
         scores: whether it holds weights before their softmax.
     """
 
@@ -53,11 +53,11 @@ class Operand:
 
     @property
     def rank(self) -> int | None:
-        """How many dimensions it has; None where any number is taken."""
+        """The number of dimensions; None where any number is accepted."""
         return None if self.dims is None else len(self.dims.split())
 
     def takes(self, kind: ir.DataType | None) -> bool:
-        """Return whether an element type is taken; float64 is wherever float32 is."""
+        """Return whether an element type is accepted, float64 counting as float32."""
         if kind == ir.DataType.DOUBLE:
             kind = ir.DataType.FLOAT
         return kind is None or kind in self.types
@@ -68,10 +68,10 @@ class Attribute:
     """One attribute of a fused operator.
 
     Attributes:
-        name: as it stands in the file.
-        default: what is written where a conversion knows none; of its type.
+        name: its name in the file.
+        default: the value of its type that a conversion writes if it knows none.
         required: whether the plugin refuses a node without it.
-        choices: the values that are allowed; empty for any.
+        choices: the allowed values; empty for any.
     """
 
     name: str
@@ -82,25 +82,23 @@ class Attribute:
 
 @dataclasses.dataclass(frozen=True)
 class Dialect:
-    """How one library spells an operator; as it stands, it takes the own form's inputs.
+    """How one library spells an operator; this base class has the own form's inputs.
 
-    Derive from it where inputs, attributes or the output are laid out otherwise:
-    ``inputs_*`` and ``result_*`` write the conversions as nodes, ``options_*`` convert
-    attributes, ``shape*`` shapes, and those with ``array`` in their names do it in
-    numpy, for the reference.
+    Subclasses override the conversions where inputs, attributes or output differ:
+    ``inputs_*`` and ``result_*`` write them as nodes, ``options_*`` convert attributes,
+    ``shape*`` shapes, and methods with ``array`` in their names numpy arrays.
 
     Attributes:
-        name: what ``translate-plugins`` and ``--dialect`` call it.
+        name: its name for ``translate-plugins`` and ``--dialect``.
         op_type: the operator's name in a file.
-        domain: where exporters put it.
+        domain: the domain that exporters use.
         operands: its inputs in order.
         source: the library, for messages.
-        attributes: those that it takes besides ``plugin_version`` and
-            ``plugin_namespace``.
-        version: ``plugin_version`` that TensorRT looks for.
-        namespace: ``plugin_namespace`` that TensorRT looks for.
-        int8_scale: which input holds the scales of int8 features, float32, one a
-            channel; None where no input does.
+        attributes: all attributes except ``plugin_version`` and ``plugin_namespace``.
+        version: the ``plugin_version`` that TensorRT looks for.
+        namespace: the ``plugin_namespace`` that TensorRT looks for.
+        int8_scale: index of the input with the scales of int8 features, float32, one
+            per channel; None if there is none.
     """
 
     name: str
@@ -116,54 +114,51 @@ class Dialect:
     def inputs_to_own(
         self, call: FusedCall, inputs: Values, attributes: Attributes
     ) -> Values:
-        """Write what turns this dialect's inputs into the own form's."""
+        """Write the conversion of this dialect's inputs to the own form's."""
         return inputs
 
     def inputs_from_own(
         self, call: FusedCall, inputs: Values, attributes: Attributes
     ) -> Values:
-        """Write what turns the own form's inputs into this dialect's."""
+        """Write the conversion of the own form's inputs to this dialect's."""
         kinds = dict(zip((each.name for each in self.operands), inputs, strict=False))
         return self.in_types(call, kinds)
 
     def options_to_own(self, attributes: Attributes) -> Attributes:
-        """Turn this dialect's attributes into the own form's."""
+        """Convert this dialect's attributes to the own form's."""
         return attributes
 
     def options_from_own(self, attributes: Attributes) -> Attributes:
-        """Turn the own form's attributes into this dialect's."""
+        """Convert the own form's attributes to this dialect's."""
         return attributes
 
     def result_to_own(self, call: FusedCall, result: ir.Value, own: Values) -> ir.Value:
-        """Write what turns this dialect's output into the own form's.
+        """Write the conversion of this dialect's output to the own form's.
 
-        Args:
-            call: where to write.
-            result: the output.
-            own: the inputs in the own form.
+        ``own`` are the inputs in the own form.
         """
         return result
 
     def result_from_own(
         self, call: FusedCall, result: ir.Value, own: Values
     ) -> ir.Value:
-        """Write what turns the own form's output into this dialect's."""
+        """Write the conversion of the own form's output to this dialect's."""
         return result
 
     def arrays_to_own(self, arrays: Arrays, attributes: Attributes) -> Arrays:
-        """Turn this dialect's inputs into the own form's, in numpy."""
+        """Convert this dialect's inputs to the own form's, in numpy."""
         return arrays
 
     def result_from_own_array(self, result: NdArray) -> NdArray:
-        """Turn the own form's output into this dialect's, in numpy."""
+        """Convert the own form's output to this dialect's, in numpy."""
         return result
 
     def shape_from_own(self, shape: Dims) -> Dims:
-        """Turn the shape of the own form's output into that of this dialect's."""
+        """Convert the shape of the own form's output to that of this dialect's."""
         return shape
 
     def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
-        """Turn the shapes of this dialect's inputs into those of the own form's."""
+        """Convert the shapes of this dialect's inputs to those of the own form's."""
         return shapes
 
     def output_type(self, inputs: Values) -> ir.DataType | None:
@@ -173,7 +168,7 @@ class Dialect:
     def in_types(
         self, call: FusedCall, inputs: Mapping[str, ir.Value | None]
     ) -> Values:
-        """Cast integer operands, by name, to a type that this dialect takes."""
+        """Cast integer operands, given by name, to a type that this dialect accepts."""
         cast = []
         for operand in self.operands:
             value = inputs.get(operand.name)
@@ -189,16 +184,16 @@ class Dialect:
         return tuple(cast)
 
     def attributes_of(self, node: ir.Node) -> dict[str, AttributeValue]:
-        """Read a node's attributes, defaults filled in.
+        """Return a node's attributes, with defaults filled in.
 
         Raises:
-            PreconditionError: it has one that this dialect does not know, or a value
-                that it does not take.
+            PreconditionError: an attribute or a value that this dialect does not know.
         """
         known = {each.name: each for each in self.attributes}
         found: dict[str, AttributeValue] = {
             each.name: each.default for each in self.attributes
         }
+        # Names and values must be known
         for name, written in node.attributes.items():
             if name in PLUGIN_ATTRIBUTES:
                 continue
@@ -218,11 +213,12 @@ class Dialect:
         return found
 
     def check(self, node: ir.Node) -> None:
-        """Hold a node's inputs to this dialect, as far as shapes and types are known.
+        """Check a node's inputs as far as shapes and types are known.
 
         Raises:
-            PreconditionError: their number, types or shapes are of no such call.
+            PreconditionError: their number, types or shapes do not fit this dialect.
         """
+        # The number of inputs
         least = sum(not each.optional for each in self.operands)
         count = len(node.inputs)
         if not least <= count <= len(self.operands):
@@ -230,6 +226,7 @@ class Dialect:
             raise PreconditionError(
                 f"{self.call_of(node)} takes {wanted} inputs, found {count}"
             )
+        # Types, then dimensions: a letter has one size in all operands
         sizes: dict[str, int] = {}
         for index, operand in enumerate(self.operands):
             value = input_at(node, index)
@@ -244,7 +241,7 @@ class Dialect:
             self._check_shape(node, operand, open_shape(value), sizes)
 
     def call_of(self, node: ir.Node) -> str:
-        """Name a node and what it calls, for messages."""
+        """Name a node and its operator, for messages."""
         name = node.name or node.outputs[0].name
         return f"node {name}: {self.op_type} of {self.source}"
 
@@ -270,12 +267,12 @@ class Dialect:
 
 
 def present(inputs: Values) -> tuple[ir.Value, ...]:
-    """Return the inputs of a call that are not left out."""
+    """Return the inputs of a call that are not omitted."""
     return tuple(value for value in inputs if value is not None)
 
 
 def number(attributes: Attributes, name: str) -> int:
-    """Return an attribute that is one integer."""
+    """Return an integer attribute."""
     value = attributes[name]
     assert isinstance(value, int)
     return value

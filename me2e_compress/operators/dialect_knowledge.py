@@ -1,4 +1,4 @@
-"""What the graph asks of plugins: shapes and cost, where their dialect is known."""
+"""Tell the graph room the shapes and costs of plugins whose dialect is known."""
 
 import onnx_ir as ir
 
@@ -10,16 +10,15 @@ from me2e_compress.operators.replace import set_output
 class DialectKnowledge:
     """See :class:`me2e_compress.graph.plugins.PluginKnowledge`.
 
-    A node that its dialect refuses is one that nobody knows: whoever rewrites it says
-    what is wrong.
+    A node that its dialect refuses counts as unknown; rewriting it raises the error.
     """
 
     def knows(self, node: ir.Node) -> bool:
-        """Return whether a node's operator is in one of the dialects."""
+        """Return whether a dialect has the node's operator."""
         return find(node) is not None
 
     def infer(self, node: ir.Node) -> bool:
-        """Write type and shape of what a node gives; return whether anything is new."""
+        """Write the type and shape of a node's output; return whether any is new."""
         found = find(node)
         try:
             if found is not None:
@@ -30,7 +29,7 @@ class DialectKnowledge:
         return False
 
     def macs(self, node: ir.Node) -> int | None:
-        """Count a node's multiply-accumulates; None where they are not known."""
+        """Count a node's multiply-accumulates, if known."""
         found = find(node)
         try:
             return None if found is None else found[0].cost(node, found[1]).macs

@@ -1,4 +1,4 @@
-"""``grid_sample`` in any number of dimensions: by Gather, and in numpy."""
+"""``grid_sample`` in any number of dimensions, by Gather and in numpy."""
 
 import itertools
 from collections.abc import Sequence
@@ -13,33 +13,36 @@ from me2e_compress.operators.dialect import Arrays, NdArray, number
 _BILINEAR, _NEAREST, _BICUBIC = range(3)
 _ZEROS, _BORDER, _REFLECTION = range(3)
 _CUBIC = -0.75
-"""Of the cubic convolution that torch and ONNX use (Keys 1981 has -0.5)."""
+"""The parameter of torch's and ONNX's cubic convolution (Keys 1981 has -0.5)."""
 
 
 def grid_by_gather(
     call: FusedCall, image: ir.Value, grid: ir.Value, attributes: Attributes
 ) -> ir.Value:
-    """Write the neighbours of each position, and their weighted sum.
+    """Write the neighbours of each position and their weighted sum.
 
     Raises:
-        PreconditionError: bicubic.
+        PreconditionError: for bicubic sampling.
     """
     mode = number(attributes, "interpolation_mode")
     if mode == _BICUBIC:
         raise PreconditionError(
             f"node {call.node.name}: bicubic sampling needs GridSample, of opset 16"
         )
+    # One row of channels per pixel
     rank = len(image.shape) if image.shape is not None else 4
     sizes = [call.size(image, axis) for axis in range(2, rank)]
     batch, channels = call.size(image, 0), call.size(image, 1)
     rows = call.reshape(image, (batch, channels, -1))
     rows = call.reshape(call.transpose(rows, (0, 2, 1)), (-1, channels))
+    # Neighbours along each axis
     axes = [
         _neighbours(call, at, size, attributes)
         for at, size in zip(
             call.split_last(grid, len(sizes)), reversed(sizes), strict=True
         )
     ]  # x first
+    # Add all combinations of neighbours
     step = call.value_of(call.product(*sizes))
     first = call.add("Mul", [call.counting(batch), step])
     first = call.unsqueeze(first, range(1, rank - 1))
@@ -57,7 +60,7 @@ def grid_by_gather(
 def _one(
     call: FusedCall, near: Sequence[tuple[ir.Value, ir.Value]], sizes: Sequence[Size]
 ) -> tuple[ir.Value, ir.Value]:
-    """Write index and share of one neighbour, from those along x, y, ..."""
+    """Write index and share of one neighbour from those along x, y, ..."""
     (index, share), *others = near
     step = call.value_of(sizes[-1])
     for (along, part), size in zip(others, reversed(sizes[:-1]), strict=True):
@@ -75,12 +78,14 @@ def _size(value: ir.Value) -> Size:
 def _neighbours(
     call: FusedCall, at: ir.Value, size: Size, attributes: Attributes
 ) -> list[tuple[ir.Value, ir.Value]]:
-    """Write the pixels around a position along one axis: index and share."""
+    """Write index and share of the pixels around a position on one axis."""
     kind = at.dtype or ir.DataType.FLOAT
     count = call.cast(call.value_of(size), kind)
     one = call.numbers(1.0, at)
     last = call.add("Sub", [count, one])
+    # The pixel position, after padding
     pixel = _padded(call, _pixel(call, at, count, last, attributes), last, attributes)
+    # The neighbours and their shares
     if attributes["interpolation_mode"] == _NEAREST:
         edges: list[tuple[ir.Value, ir.Value | None]]
         edges = [(call.add("Round", [pixel]), None)]
@@ -89,6 +94,7 @@ def _neighbours(
         part = call.add("Sub", [pixel, low])
         rest = call.add("Sub", [one, part])
         edges = [(low, rest), (call.add("Add", [low, one]), part)]
+    # Neighbours outside of the image have no share
     zero, found = call.numbers(0.0, at), []
     for edge, share in edges:
         kept = call.add("Max", [call.add("Min", [edge, last]), zero])
@@ -117,7 +123,7 @@ def _pixel(
 def _padded(
     call: FusedCall, pixel: ir.Value, last: ir.Value, attributes: Attributes
 ) -> ir.Value:
-    """Write where a pixel outside of the image is looked up."""
+    """Write the position that replaces one outside of the image."""
     padding = number(attributes, "padding_mode")
     if padding == _ZEROS:
         return pixel
@@ -136,20 +142,18 @@ def _padded(
 
 
 def grid_sample_array(inputs: Arrays, attributes: Attributes) -> NdArray:
-    """Compute ``grid_sample`` in numpy.
-
-    Returns:
-        [N, C, ...] float64.
-    """
+    """Compute ``grid_sample`` in numpy, [N, C, ...] float64."""
     image, grid = (np.asarray(each, np.float64) for each in inputs)
     batch, channels, *sizes = image.shape
     rows = image.reshape(batch, channels, -1)
+    # Neighbours along each axis
     axes = [
         _nearby(grid[..., axis], size, attributes)
         for axis, size in enumerate(reversed(sizes))
     ]
     total = np.zeros((batch, channels, *grid.shape[1:-1]))
     first = np.arange(batch).reshape(batch, *(1 for _ in sizes))
+    # Add all combinations of neighbours
     for near in itertools.product(*axes):
         index = np.zeros(grid.shape[:-1], np.int64)
         share, step = np.ones(grid.shape[:-1]), 1

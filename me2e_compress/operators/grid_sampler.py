@@ -1,4 +1,4 @@
-"""Samples of an image or a volume at a grid of positions (torch's ``grid_sample``)."""
+"""Sample an image or a volume at a grid of positions (torch's ``grid_sample``)."""
 
 import dataclasses
 import math
@@ -28,7 +28,7 @@ from me2e_compress.operators.grid_positions import grid_by_gather, grid_sample_a
 from me2e_compress.operators.renamed_attributes import RenamedAttributes
 
 _SCALE = 10.0
-"""By which BEVFormer_tensorrt multiplies a grid, so that int8 holds it better."""
+"""BEVFormer_tensorrt multiplies a grid by this for a better int8 range."""
 
 
 def _options(first: str, *, required: bool = True) -> tuple[Attribute, ...]:
@@ -44,14 +44,14 @@ _OWN = _options("interpolation_mode")
 
 @dataclasses.dataclass(frozen=True)
 class Sampler(RenamedAttributes):
-    """A library that names the three attributes as it likes, in one order."""
+    """A library with its own names for the three attributes, in the same order."""
 
     own_attributes: ClassVar[tuple[Attribute, ...]] = _OWN
 
 
 @dataclasses.dataclass(frozen=True)
 class ScaledGrid(Sampler):
-    """A library whose grid has its components first, [N, 2 or 3, ...], times 10."""
+    """A library whose grid is [N, 2 or 3, ...] and multiplied by 10."""
 
     def inputs_to_own(
         self, call: FusedCall, inputs: Values, attributes: Attributes
@@ -122,9 +122,9 @@ def _scaled(dims: int) -> tuple[Dialect, ...]:
 class GridSampler2D(Operator):
     """Sample an image at a grid of positions.
 
-    Own form ``me2e::GridSampler2D``: input [N, C, H, W]; grid [N, F, G, 2] (x, y), -1
-    and 1 are the edges; ``interpolation_mode`` 0 bilinear, 1 nearest, 2 bicubic;
-    ``padding_mode`` 0 zeros, 1 border, 2 reflection; ``align_corners``. Output
+    Own form ``me2e::GridSampler2D``: input [N, C, H, W]; grid [N, F, G, 2] (x, y),
+    where -1 and 1 are the edges; ``interpolation_mode`` 0 bilinear, 1 nearest, 2
+    bicubic; ``padding_mode`` 0 zeros, 1 border, 2 reflection; ``align_corners``. Output
     [N, C, F, G].
     """
 
@@ -147,7 +147,7 @@ class GridSampler2D(Operator):
         """Write GridSample, or below its opset four or eight neighbours by Gather.
 
         Raises:
-            PreconditionError: bicubic below the opset of GridSample.
+            PreconditionError: bicubic sampling below the opset of GridSample.
         """
         image, grid = present(inputs)
         kind = image.dtype or ir.DataType.FLOAT
@@ -193,7 +193,7 @@ class GridSampler2D(Operator):
 
 _MODES, _NEW_MODES = ("bilinear", "nearest", "bicubic"), ("linear", "nearest", "cubic")
 _RENAMED = 20
-"""The opset from which GridSample's modes have other names, and volumes are taken."""
+"""The opset from which GridSample's modes have other names and volumes are allowed."""
 _PADDING = ("zeros", "border", "reflection")
 
 
@@ -202,7 +202,7 @@ class GridSampler3D(GridSampler2D):
     """Sample a volume at a grid of positions.
 
     Own form ``me2e::GridSampler3D``: input [N, C, D, H, W]; grid [N, E, F, G, 3]
-    (x, y, z); attributes as of :class:`GridSampler2D`, but no bicubic. Output
+    (x, y, z); attributes as in :class:`GridSampler2D`, but no bicubic. Output
     [N, C, E, F, G].
     """
 

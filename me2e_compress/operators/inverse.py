@@ -1,4 +1,4 @@
-"""Inverse of small matrices, of cameras for one."""
+"""The inverse of small matrices, for example of cameras."""
 
 import dataclasses
 import math
@@ -25,7 +25,7 @@ from me2e_compress.operators.dialect import (
 )
 
 _LARGEST = 16
-"""Of n * n minors of (n - 1) x (n - 1) numbers, the work is n to the fifth."""
+"""Largest n: the n * n minors of (n - 1) x (n - 1) numbers take n^5 work."""
 
 _DERRYHUB = "BEVFormer_tensorrt"
 _ANY, _BATCHES = Operand("matrix", None, FLOAT32, positions=True), "B C n n"
@@ -39,8 +39,9 @@ def _plugin(name: str, op_type: str, domain: str, source: str) -> Dialect:
 class Inverse(Operator):
     """The inverse of square matrices.
 
-    Own form ``me2e::Inverse``: matrix [..., n, n], n known and at most 16, to the same.
-    The body divides the cofactors, each a determinant (ONNX's Det), by the determinant.
+    Own form ``me2e::Inverse``: matrix [..., n, n], n known and at most 16; output of
+    the same shape. The body divides the cofactors, each a determinant (ONNX's Det), by
+    the determinant.
     """
 
     name: ClassVar[str] = "inverse"
@@ -64,7 +65,7 @@ class Inverse(Operator):
         """Write the adjugate over the determinant.
 
         Raises:
-            PreconditionError: the size of the matrices is not known, or too large.
+            PreconditionError: the size of the matrices is unknown or too large.
         """
         (matrix,) = present(inputs)
         kind = matrix.dtype or ir.DataType.FLOAT
@@ -78,6 +79,7 @@ class Inverse(Operator):
             )
         if size == 1:
             return call.cast(call.add("Reciprocal", [matrix]), kind)
+        # Determinants of all minors, with alternating signs
         rank = len(matrix.shape) if matrix.shape is not None else 2
         outer = tuple(call.size(matrix, axis) for axis in range(rank - 2))
         flat = call.reshape(matrix, (*outer, size * size))
@@ -99,7 +101,7 @@ class Inverse(Operator):
         return shapes[0]
 
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count n cubed for each matrix, what elimination takes."""
+        """Count n cubed for each matrix, the work of an elimination."""
         shape = shapes[0]
         known = [dim for dim in shape or () if dim is not None]
         if shape is None or len(known) < len(shape):
@@ -108,7 +110,7 @@ class Inverse(Operator):
 
 
 def _minors(size: int) -> NdArray:
-    """Index the minor of each element of the adjugate, [n, n, n - 1, n - 1]."""
+    """Return the indices of each adjugate element's minor, [n, n, n - 1, n - 1]."""
     kept = np.array([[j for j in range(size) if j != i] for i in range(size)])
     # element (i, j) of the adjugate is the minor without row j and column i
     rows, columns = kept[None, :, :, None], kept[:, None, None, :]

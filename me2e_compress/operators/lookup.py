@@ -1,4 +1,4 @@
-"""Which fused operator a node is, and in whose spelling."""
+"""Find the fused operator and the dialect of a node."""
 
 import functools
 from collections.abc import Mapping
@@ -37,19 +37,20 @@ OPERATORS: Registry[Operator] = Registry(
 )
 
 _RESERVED = (OWN_DOMAIN, "com.microsoft")
-"""Domains whose names mean what that domain says, and nothing else."""
+"""Domains that define their operators; names there match no other dialect."""
 
 
 def find(node: ir.Node) -> tuple[Operator, Dialect] | None:
-    """Return the fused operator that a node is, and its dialect; None if it is none.
+    """Return a node's fused operator and dialect; None if it is not one.
 
     TensorRT finds a plugin by the operator's name, and exporters put it in any domain
     or none: so the name decides. Among several dialects of one name, the domain and
-    ``plugin_version`` choose, then the types and shapes that the node's inputs have.
+    ``plugin_version`` decide, then the types and shapes of the node's inputs.
     """
     rows = _rows().get(node.op_type)
     if rows is None or (is_standard(node) and not is_plugin(node)):
         return None
+    # Reserved domains match only their own dialects
     domain = "" if is_standard(node) or node.domain == PLUGIN_DOMAIN else node.domain
     if domain in _RESERVED:
         rows = [row for row in rows if row[1].domain == domain]
@@ -68,12 +69,12 @@ def find(node: ir.Node) -> tuple[Operator, Dialect] | None:
 
 
 def dialect_of(operator: Operator, name: str) -> Dialect | None:
-    """Return an operator's dialect of this name; None if that library has none."""
+    """Return an operator's dialect of this name, if there is one."""
     return next((each for each in operator.all_dialects() if each.name == name), None)
 
 
 def dialect_names() -> tuple[str, ...]:
-    """List the names of all dialects, in the order of the operators."""
+    """Return the names of all dialects, in the order of the operators."""
     return tuple(
         dict.fromkeys(
             dialect.name
@@ -85,13 +86,13 @@ def dialect_names() -> tuple[str, ...]:
 
 @functools.cache
 def operators() -> tuple[Operator, ...]:
-    """Build every operator that can be imported, ours first."""
+    """Build every operator that can be imported, built-in ones first."""
     return tuple(OPERATORS.build(name, {}) for name in OPERATORS.usable())
 
 
 @functools.cache
 def op_types(name: str) -> frozenset[str]:
-    """Return what the nodes of an operator are called, in every dialect."""
+    """Return the node types of an operator in every dialect."""
     return frozenset(
         dialect.op_type
         for operator in operators()
@@ -102,7 +103,7 @@ def op_types(name: str) -> frozenset[str]:
 
 @functools.cache
 def position_inputs() -> Mapping[str, tuple[int, ...]]:
-    """Return which inputs say where to look or which matrix to invert, by op_type."""
+    """Return the indices of inputs with positions or matrices to invert, by op_type."""
     return {
         op_type: tuple(
             index
@@ -115,7 +116,7 @@ def position_inputs() -> Mapping[str, tuple[int, ...]]:
 
 @functools.cache
 def score_inputs() -> Mapping[str, int]:
-    """Return which input holds weights before their softmax, by op_type."""
+    """Return the index of the input with weights before their softmax, by op_type."""
     return {
         op_type: index
         for op_type, rows in _rows().items()
@@ -125,14 +126,14 @@ def score_inputs() -> Mapping[str, int]:
 
 
 def int8_inputs(node: ir.Node) -> tuple[int, ...]:
-    """Return which inputs of a node may be int8, if it is a fused operator."""
+    """Return the inputs of a fused node that may be int8."""
     found = find(node) if node.op_type in int8_op_types() else None
     return () if found is None else found[0].int8_inputs
 
 
 @functools.cache
 def int8_op_types() -> frozenset[str]:
-    """Return what the fused operators are called of which an input may be int8."""
+    """Return the op_types of fused operators that have int8 inputs."""
     return frozenset(
         op_type for op_type, rows in _rows().items() if rows[0][0].int8_inputs
     )

@@ -1,4 +1,4 @@
-"""Attention whose heads lie in the batch (Attention is all you need, equation 1)."""
+"""Attention whose heads are in the batch (Attention is all you need, equation 1)."""
 
 import dataclasses
 import math
@@ -38,8 +38,8 @@ def _dialect(name: str, op_type: str, domain: str, source: str) -> Dialect:
 class FusedMultiHeadAttention(Operator):
     """Softmax(query key^T / sqrt(C)) value, for each head.
 
-    Own form ``me2e::MultiHeadAttention``: query [B, Q, C]; key and value [B, K, C]; the
-    heads lie in B. Output [B, Q, C].
+    Own form ``me2e::MultiHeadAttention``: query [B, Q, C]; key and value [B, K, C];
+    heads are in B. Output [B, Q, C].
     """
 
     name: ClassVar[str] = "multi-head-attention"

@@ -1,4 +1,4 @@
-"""A fused node in other words: its body, or the same call in another dialect."""
+"""Replace a fused node by its body, or by the same call in another dialect."""
 
 import dataclasses
 
@@ -26,13 +26,10 @@ _LEAST_OPSET = 13
 
 @dataclasses.dataclass(frozen=True)
 class FusedNode:
-    """A fused node of a model, and what is needed to rewrite it.
+    """A fused node of a model, with what is needed to rewrite it.
 
     Attributes:
-        node: where it stands.
-        operator: what it is.
-        dialect: how it is spelt.
-        opset: of ONNX's own operators, where it stands.
+        opset: of the standard operators, where the node is.
         names: of all values and nodes there.
     """
 
@@ -44,7 +41,7 @@ class FusedNode:
 
 
 def fused_nodes(model: ir.Model) -> list[FusedNode]:
-    """List the fused nodes of a graph, of its bodies and of its functions."""
+    """Return the fused nodes of a graph, of its bodies and of its functions."""
     names = value_names(model.graph)
     names.update(node.name or "" for node in nodes_in(model.graph))
     found = _found_in(model.graph, opset_of(model), names)
@@ -64,9 +61,9 @@ def _found_in(
 
 
 def import_domains(model: ir.Model) -> None:
-    """Import every domain that is used, and no plugin domain that no longer is.
+    """Import all used domains, and remove imports of unused plugin domains.
 
-    What was written into functions is made such that a file can hold it.
+    Initializers of functions become Constant nodes, which a file can hold.
     """
     bodies: list[ir.Graph | ir.Function] = [model.graph, *model.functions.values()]
     for body in bodies:
@@ -89,23 +86,21 @@ def expand(
     compiled: bool = False,
     known: tuple[Operator, Dialect] | None = None,
 ) -> None:
-    """Put standard operators in the place of a fused node.
+    """Replace a fused node by standard operators; its output keeps its name.
 
     Args:
-        node: recognised by :func:`~me2e_compress.operators.find`; it is removed, and
-            what read its output reads the same name.
-        opset: of ONNX's own operators, 13 or later.
+        node: recognised by :func:`~me2e_compress.operators.find`; it is removed.
+        opset: of the standard operators, 13 or later.
         by: the name of the pass, for the provenance.
         names: of all values of the model, where many nodes are expanded.
         compiled: whether the body may call compiled kernels; a session must then
             register them (:mod:`me2e_compress.operators.kernels`).
-        known: what the node is; None asks :func:`~me2e_compress.operators.find`, which
-            knows registered operators only.
+        known: operator and dialect of the node; None asks
+            :func:`~me2e_compress.operators.find`, which knows registered ones only.
 
     Raises:
-        PreconditionError: the node's attributes, or its inputs' number, types or
-            shapes, are of no such call.
-        GraphError: it is no fused operator.
+        PreconditionError: attributes or inputs that do not fit the dialect.
+        GraphError: the node is not a fused operator.
     """
     operator, dialect = _found(node, known)
     if opset < _LEAST_OPSET:
@@ -127,26 +122,17 @@ def translate(
     names: set[str] | None = None,
     known: tuple[Operator, Dialect] | None = None,
 ) -> None:
-    """Put the same call in another dialect in the place of a fused node.
+    """Replace a fused node by the same call in the dialect ``to`` of its operator.
 
-    A node whose dialect has no domain stands in ``me2e.plugin`` afterwards, and says in
-    its metadata that it had none, as import-normalize does it.
-
-    Args:
-        node: see :func:`expand`.
-        to: a dialect of the same operator.
-        opset: of ONNX's own operators.
-        by: the name of the pass, for the provenance.
-        names: of all values of the model, where many nodes are translated.
-        known: see :func:`expand`.
-
-    Raises:
-        PreconditionError: see :func:`expand`; or the dialect cannot say it.
-        GraphError: it is no fused operator.
+    If that has no domain, the node moves to ``me2e.plugin`` and its metadata record it,
+    as with import-normalize. For arguments and errors see :func:`expand`; a dialect
+    that cannot express the call is a PreconditionError.
     """
+    # Bring the call into the own form
     operator, dialect = _found(node, known)
     call = FusedCall(node, opset=opset, by=by, names=names)
     own, attributes = _own_call(call, dialect)
+    # Write it in the new dialect
     inputs = to.inputs_from_own(call, own, attributes)
     options = {**to.options_from_own(attributes), **_plugin_attributes(to)}
     result = call.add(to.op_type, inputs, options, domain=to.domain)
@@ -156,18 +142,16 @@ def translate(
         made.domain = PLUGIN_DOMAIN
         made.metadata_props[ORIGINAL_DOMAIN] = ""
     set_output(made, operator, to)
+    # Convert the output back to the old layout
     result = to.result_to_own(call, result, own)
     _take_place(call, dialect.result_from_own(call, result, own))
 
 
 def set_output(node: ir.Node, operator: Operator, dialect: Dialect) -> bool:
-    """Write the type and shape of what a fused node gives, as far as inputs tell.
-
-    Returns:
-        Whether anything that was not known is known now.
-    """
+    """Write the type and shape of a fused node's output; return whether any is new."""
     shapes = dialect.shapes_to_own([open_shape(value) for value in node.inputs])
     attributes = dialect.options_to_own(dialect.attributes_of(node))
+    # Merge the inferred dimensions into the known ones
     shape = operator.output_shape(shapes, attributes)
     result, known = node.outputs[0], False
     if shape is not None and None in (found := open_shape(result) or (None,)):
@@ -183,7 +167,7 @@ def set_output(node: ir.Node, operator: Operator, dialect: Dialect) -> bool:
 
 
 def hold_constants(function: ir.Function) -> None:
-    """Make Constant nodes of a function's initializers, which no file can hold."""
+    """Replace a function's initializers, which no file can hold, by Constant nodes."""
     graph = function.graph
     for name, value in list(graph.initializers.items()):
         tensor = value.const_value
@@ -222,12 +206,14 @@ def _plugin_attributes(dialect: Dialect) -> dict[str, str]:
 
 
 def _take_place(call: FusedCall, result: ir.Value) -> None:
-    """Let what was written stand for the node's output, under its name."""
+    """Replace the node's output by a result, which takes its name."""
     node, old = call.node, call.node.outputs[0]
     made, body = result.producer(), node.graph
     assert body is not None
+    # Each output needs a node of its own
     if made is None or result in node.inputs:  # an output needs a node that makes it
         result = call.add("Identity", [result])
+    # Keep the better type and shape, and the name
     if result.shape is None or not result.shape.is_static():
         result.shape = old.shape if old.shape is not None else result.shape
     result.type = result.type if result.type is not None else old.type

@@ -1,4 +1,4 @@
-"""Rotation of a feature map about a point, as BEVFormer turns its last BEV."""
+"""Rotation of a feature map about a point, as BEVFormer rotates its last BEV."""
 
 import dataclasses
 import math
@@ -46,7 +46,7 @@ _DERRYHUB = "BEVFormer_tensorrt"
 
 @dataclasses.dataclass(frozen=True)
 class Rotate(Operator):
-    """Rotate a feature map by an angle about a point; zeros come in from outside.
+    """Rotate a feature map by an angle about a point, with zeros from outside.
 
     Own form ``me2e::Rotate``: img [C, H, W]; angle [1] in degrees; center [2] (x, y) in
     pixels; ``interpolation`` 0 bilinear, 1 nearest (halves to the even pixel). Output
@@ -64,11 +64,12 @@ class Rotate(Operator):
     )
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
-        """Sample the map at the turned positions of its pixels."""
+        """Sample the map at the rotated positions of its pixels."""
         image, angle, center = present(inputs)
         channels, height, width = (call.size(image, axis) for axis in range(3))
         rows = call.transpose(call.reshape(image, (channels, -1)), (1, 0))
         value = call.unsqueeze(rows, (0, 2))  # [1, H*W, 1, C]
+        # Positions as 0..1 of the map
         x, y = self._positions(call, image, angle, center)
         places = []
         for at, size in ((x, width), (y, height)):
@@ -79,6 +80,7 @@ class Rotate(Operator):
             scaled = call.add("Div", [middle, count])
             places.append(call.reshape(scaled, (1, -1, 1, 1, 1, 1)))
         at = call.concat(places, 5)
+        # Sample as one level with one head
         pixels = call.product(height, width)
         weights = call.full((1, pixels, 1, 1, 1), 1.0, at)
         sizes = call.sizes((height, width), (1, 2))
@@ -89,10 +91,11 @@ class Rotate(Operator):
     def _positions(
         self, call: FusedCall, image: ir.Value, angle: ir.Value, center: ir.Value
     ) -> tuple[ir.Value, ir.Value]:
-        """Write where each pixel comes from, x and y [H, W] in pixels."""
+        """Write where each pixel comes from: x and y, [H, W], in pixels."""
         turn = call.add("Mul", [angle, call.numbers(math.pi / 180, angle)])
         cosine, sine = call.add("Cos", [turn]), call.add("Sin", [turn])
         kind = angle.dtype or ir.DataType.FLOAT
+        # Pixel centres relative to the centre of rotation
         middles = []  # of a pixel, from the center of rotation
         for axis, at in zip((2, 1), call.split_last(center, 2), strict=True):
             counted = call.cast(call.counting(call.size(image, axis)), kind)
@@ -100,6 +103,7 @@ class Rotate(Operator):
             middles.append((call.add("Sub", [half, at]), at))
         (across, x), (down, y) = middles
         down = call.unsqueeze(down, (1,))
+        # Rotate, and move back
         turned = (
             call.add("Sub", self._products(call, (cosine, across), (sine, down))),
             call.add("Add", self._products(call, (sine, across), (cosine, down))),

@@ -45,7 +45,7 @@ def _dialect(
 
 @dataclasses.dataclass(frozen=True)
 class SelectAndPad(Operator):
-    """The first rows that are flagged, in order; a row of its own where they run out.
+    """The first flagged rows, in order, padded with a given row.
 
     Own form ``me2e::SelectAndPad``: feat [B, Q, C]; flag int32 or int64 [B, Q], above 0
     where a row is taken; invalid [C]; ``P`` rows. Output [B, P, C].
@@ -61,7 +61,7 @@ class SelectAndPad(Operator):
     )
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
-        """Take the P flagged rows of the lowest number (TopK), then choose."""
+        """Take the first P flagged rows (TopK of negative indices), then pad."""
         feature, flag, invalid = present(inputs)
         count, rows = number(attributes, "P"), call.size(feature, 1)
         if not isinstance(rows, int) or rows < count:  # there must be P rows to take
@@ -70,6 +70,7 @@ class SelectAndPad(Operator):
             flag = call.cast(flag, ir.DataType.INT32)
             flag = call.add("Pad", [flag, call.integers([0, 0, 0, count])])
             rows = call.size(feature, 1)
+        # Rank flagged rows by index, all others last
         numbers = call.cast(call.counting(rows), ir.DataType.FLOAT)
         first = call.add("Sub", [call.numbers(0.0, numbers), numbers])
         last = call.numbers(float("-inf"), numbers)
@@ -79,6 +80,7 @@ class SelectAndPad(Operator):
         best = call.add("TopK", [order, call.integers([count])], outputs=2)
         index = best.producer().outputs[1]  # type: ignore[union-attr]
         index = call.unsqueeze(index, (2,))
+        # Replace unflagged rows by the padding
         found = call.add("GatherND", [feature, index], {"batch_dims": 1})
         none = call.add("Equal", [best, last])
         return call.add("Where", [call.unsqueeze(none, (2,)), invalid, found])

@@ -1,4 +1,4 @@
-"""The passes. To add one: write its file, then add its class to this table."""
+"""The compression passes; a new pass is a file here and a row in ``PASSES``."""
 
 from me2e_compress.errors import RecipeError
 from me2e_compress.passes.base import Context, Pass, PassResult

@@ -30,31 +30,31 @@ from me2e_compress.passes.substitutes import (
 _LAYOUT = frozenset(
     {"Cast", "Flatten", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze"}
 )
-"""Operators that only lay out anew what another node made."""
+"""Operators that only change the layout or type of another node's result."""
 
 
 @dataclasses.dataclass(frozen=True)
 class AblateModules(Pass):
-    """Remove modules; what read them reads a substitute, a mean, or zeros.
+    """Remove modules and give their readers a substitute, a mean, or zeros.
 
     Given:   features -> occupancy -> plan
+
     Result:  features,   zeros     -> plan
 
-    With ``fill="substitute"`` the substitutes of the module map go first: the result of
-    one scope takes the place of another's (without the map, the ego query keeps what it
-    knew of the agents), repeated where there are more to read it (without motion, one
-    track query for each of six modes). Whatever else leaves a dropped module is then
-    zeros of its shape; with ``fill="means"``, what it is on average over the context's
-    frames, so that the others read nothing that they never saw. What only lays out anew
-    a value of a module that stays (a cast that two modules share) is handed to its
-    readers. Everything that became dead is swept, in other modules too.
+    With ``fill="substitute"`` the substitutes of the module map are applied first: the
+    result of one scope replaces that of another, repeated where the readers expect more
+    queries (without motion, one track query for each of six modes). Every other value
+    that leaves a dropped module becomes zeros of its shape or, with ``fill="means"``,
+    its mean over the context's frames. A node that only changes the layout of a value
+    of a module that stays (a cast that two modules share) moves to its reader. Dead
+    nodes are removed, in other modules too.
 
-    With ``edges`` parts of the graph read others directly::
+    With ``edges`` a part of the graph also reads another one directly::
 
         Given:   map -> motion -> planner
         Result:  map -> motion -> planner, map -> planner
 
-    They need no weights, and no training made them: the plan is another one.
+    Edges have no weights and were never trained: they change the plan.
 
     Attributes:
         drop: the modules to remove.
@@ -79,31 +79,33 @@ class AblateModules(Pass):
 
     @property
     def needs_frames(self) -> bool:
-        """Whether means are to be measured."""
+        """Whether means must be measured."""
         return self.fill == "means" and self.means is None
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Re-wire, cut, sweep.
+        """Substitute, add edges, fill the rest, and remove dead nodes.
 
         Raises:
             ModuleMapError: the map has no such module.
-            PreconditionError: no node belongs to it, it makes a graph output (and
-                ``drop_outputs`` is False), it makes all of them, the plan would go or
-                no longer depend on what the cameras see, a value that leaves it has no
-                static shape, or a substitute, a mean or an edge does not fit.
+            PreconditionError: a module has no nodes or makes an output that must stay,
+                the plan would be lost or no longer depend on the cameras, a shape is
+                not static, or a substitute, mean or edge does not fit.
             RecipeError: ``means`` without ``fill="means"``, or nothing to do.
-            FramesError: means are asked for, and there are neither frames nor a file;
-                or they are of another graph.
+            FramesError: means are needed but neither frames nor a file are given, or
+                they belong to another graph.
         """
+        # Check the options against the graph and the module map
         self._check_options()
         known = [context.modules.module(name) for name in self.drop]
         _require_nodes(model, self.drop)
         for pattern in self.keep:
             result_of(model, Part(pattern))
         before, sighted = graph.node_count(model), seeing(model, context.modules)
+        # Separate the dropped modules from everything that stays
         _hand_over(model, self._goes)
         gone = self._cut_outputs(model)
         notes = [f"output removed: {name}" for name in gone]
+        # Rewire readers to substitutes and along new edges
         if self.fill == "substitute":
             for module in known:
                 notes += [
@@ -114,10 +116,12 @@ class AblateModules(Pass):
             add_edge(model, edge, context.modules, self._goes, self.name)
             for edge in self.edges
         ]
+        # Fill what is left after the first sweep, then sweep again
         rewrite.sweep(model)
         notes += self._fill(model, context)
         rewrite.sweep(model)
         model.graph.sort()
+        # The planner must still depend on the cameras
         check_sight(model, context.modules, sighted, self.drop)
         removed = before - graph.node_count(model)
         said = counted(abs(removed), "node")
@@ -139,11 +143,9 @@ class AblateModules(Pass):
         return self._goes(value.producer())
 
     def _readers(self, value: ir.Value) -> list[ir.Node]:
-        """List who reads a value, those that stay first: new nodes are theirs."""
         return sorted(value.consumers(), key=self._goes)
 
     def _fill(self, model: ir.Model, context: Context) -> list[str]:
-        """Put constants in the place of all that leaves the dropped modules."""
         where, exits = model.graph, self._exits(model)
         if self.fill == "means":
             means, how = means_of(model, exits, context, self.means)
@@ -191,12 +193,14 @@ class AblateModules(Pass):
     ) -> str:
         if wanted.reader is not None and wanted.by is not None:
             return self._read_instead(model, wanted, modules)
+        # Zeros take the place where the map names no substitute
         old = result_of(model, Part.of(wanted.scope, modules))
         if self._dropped(old):
             return f"{wanted.scope} is dropped itself: nothing is substituted"
         if wanted.by is None:
             replace_readers(old, self._zeros(model.graph, old))
             return f"{wanted.scope} reads as zeros"
+        # A substitute must stay in the graph and not read the old result
         new = result_of(model, Part.of(wanted.by, modules), like=old)
         if self._dropped(new):
             raise PreconditionError(
@@ -214,7 +218,6 @@ class AblateModules(Pass):
     def _read_instead(
         self, model: ir.Model, wanted: Substitute, modules: ModuleMap
     ) -> str:
-        """Let one part of the graph read a substitute; others read what they did."""
         reader = Part.of(str(wanted.reader), modules)
         if not any(reader.holds(node) and not self._goes(node) for node in model.graph):
             return f"{wanted.reader} is not there: nothing is substituted for it"
@@ -232,19 +235,12 @@ def _require_nodes(model: ir.Model, drop: tuple[str, ...]) -> None:
 
 
 def _hand_over(model: ir.Model, goes: Callable[[ir.Node], bool]) -> int:
-    """Move layout nodes of modules that go into the modules that read them.
+    """Move layout nodes of dropped modules into the modules that read them.
 
-    An exporter that finds the same cast of the same value in two modules writes it
-    once, with the scope of the first. It computes nothing of that module's own: if the
-    first goes, the second must not lose its input.
-
-    Args:
-        model: the graph, sorted; modules of nodes change in place.
-        goes: whether a node belongs to a module that goes.
-
-    Returns:
-        How many nodes changed their module.
+    Exporters write an equal cast of two modules once, with the scope of the first; the
+    second must not lose its input with that module. Returns the number of moved nodes.
     """
+    # Find layout nodes whose inputs all come from modules that stay
     carriers = dict[ir.Node, None]()
     for node in model.graph:
         makers = [value.producer() for value in node.inputs if value is not None]
@@ -253,6 +249,7 @@ def _hand_over(model: ir.Model, goes: Callable[[ir.Node], bool]) -> int:
         )
         if node.op_type in _LAYOUT and goes(node) and outside:
             carriers[node] = None
+    # Stamp them with the module of their first remaining reader
     count = 0
     for node in reversed(carriers):
         readers = [reader for reader in node.outputs[0].consumers() if not goes(reader)]

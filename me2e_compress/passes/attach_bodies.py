@@ -1,4 +1,4 @@
-"""Bodies of fused operators, as functions in the file."""
+"""Attach bodies of standard operators to fused operators."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,23 +15,23 @@ from me2e_compress.operators.replace import FusedNode, hold_constants
 from me2e_compress.passes.base import Context, Pass, PassResult
 
 LARGEST_TABLE = 256
-"""Numbers of a constant operand that a body may hold itself: sizes of feature maps."""
+"""Largest constant operand, in elements, that a body may hold (feature-map sizes)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class AttachBodies(Pass):
-    """Give every fused operator a body of standard operators, so that any runtime runs.
+    """Give every fused operator a body of standard operators that any runtime can run.
 
     Given:   y = me2e.MultiScaleDeformableAttention(value, sizes, starts, at, weights)
+
     Result:  the same node, and a function me2e.MultiScaleDeformableAttention in the
              file: { ... GridSample ... Mul ... ReduceSum ... }
 
-    A runtime that has no such operator inlines the function; one that has it, this
-    toolkit's sessions or TensorRT with its plugin, takes its own. All nodes of a name
-    share one function: what they agree on, the sizes of feature maps above all, stands
-    in it as constants, the rest is computed. Nodes that differ in attributes, and
-    plugins without a domain, which functions cannot have, stay without a body; the
-    notes name them.
+    A runtime without the operator inlines the function; one that has it (this toolkit's
+    sessions, or TensorRT with its plugin) uses its own. All nodes of a name share one
+    function. Constants that they agree on, above all the sizes of feature maps, are
+    stored in it. Nodes that differ in attributes, and plugins without a domain (which
+    functions cannot have), get no body; the notes name them.
     """
 
     name: ClassVar[str] = "attach-bodies"
@@ -41,8 +41,8 @@ class AttachBodies(Pass):
         """Add a function for each kind of fused node that has none.
 
         Raises:
-            PreconditionError: an opset below 13; or a plugin has an attribute, or
-                inputs, that its dialect does not know.
+            PreconditionError: an opset below 13, or a plugin with attributes or inputs
+                that its dialect does not know.
         """
         kinds: dict[ir.OperatorIdentifier, list[FusedNode]] = {}
         for fused in operators.fused_nodes(model):
@@ -62,12 +62,12 @@ class AttachBodies(Pass):
         return PassResult(model, made, tuple(notes))
 
     def _body(self, calls: Sequence[FusedNode]) -> ir.Function:
-        """Write the function that all these nodes can call."""
         first = calls[0]
         inputs = [
             _parameter(index, [each.node.inputs[index] for each in calls])
             for index in range(len(first.node.inputs))
         ]
+        # One call of the operator inside a function of the same signature
         result = ir.Value(name="y")
         node = ir.Node(
             first.node.domain,
@@ -90,6 +90,7 @@ class AttachBodies(Pass):
                 for name, each in node.attributes.items()
             ],
         )
+        # Store shared constants, then expand the operator
         for value, known in inputs:
             if known is not None:
                 _hold(function, node, value, known)
@@ -117,12 +118,13 @@ def _why_not(calls: Sequence[FusedNode]) -> str:
 def _parameter(
     index: int, given: Sequence[ir.Value | None]
 ) -> tuple[ir.Value, Array | None]:
-    """Make a function's input of what its callers give: what they all agree on."""
+    """Make a function input with the type, shape and constant common to all calls."""
     shapes = [open_shape(value) for value in given if value is not None]
     types = {value.dtype for value in given if value is not None}
     value = ir.Value(name=f"x{index}", shape=_agreed(shapes))
     if len(types) == 1 and (kind := next(iter(types))) is not None:
         value.type = ir.TensorType(kind)
+    # Only a small constant that is equal in every call is stored
     arrays = [None if each is None else graph.array_of(each) for each in given]
     first = arrays[0]
     if first is None or first.size > LARGEST_TABLE:
@@ -150,7 +152,6 @@ def _agreed(shapes: Sequence[Dims | None]) -> ir.Shape | None:
 
 
 def _hold(function: ir.Function, node: ir.Node, value: ir.Value, known: Array) -> None:
-    """Let a node read a constant in the place of a function's input."""
     constant = ir.node("Constant", [], {"value": ir.tensor(known)}, num_outputs=1)
     constant.name = constant.outputs[0].name = f"{value.name}_known"
     constant.outputs[0].type, constant.outputs[0].shape = value.type, value.shape

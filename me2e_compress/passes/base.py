@@ -1,4 +1,4 @@
-"""What every pass is."""
+"""The base class of passes, their context and their result."""
 
 import abc
 import dataclasses
@@ -19,15 +19,14 @@ from me2e_compress.runtime.providers import CPU, Provider
 
 @dataclasses.dataclass(frozen=True)
 class Context:
-    """What a pass may ask for besides the graph.
+    """What a pass may use besides the graph.
 
     Attributes:
-        modules: which part of the graph is which.
         frames: recorded inputs, in scenes; None where the user gave none.
-        seed: for everything random.
-        provider: what runs graphs.
-        measured: the ranges that passes measured on the frames, by the pass's name: a
-            pass that runs again on the same graph need not measure again.
+        seed: for every random choice.
+        provider: runs graphs.
+        measured: ranges measured on the frames, by pass name, so that a pass that runs
+            again on the same graph need not measure again.
     """
 
     modules: ModuleMap
@@ -47,19 +46,13 @@ class Context:
         method: str,
         saved: Path | None,
     ) -> Ranges:
-        """Read the ranges of some tensors from a file, or measure them on the frames.
-
-        Args:
-            name: of the pass that asks.
-            model: the graph that is quantized.
-            tensors: what it needs a range of.
-            method: how ranges are read from the frames.
-            saved: file of saved ranges; None to measure.
+        """Load the ranges of tensors from ``saved``, or measure them on the frames.
 
         Raises:
             FramesError: neither frames nor a file, or they are of another graph.
             RecipeError: no such method.
         """
+        # Saved ranges must belong to this graph and these frames
         if saved is not None:
             found = Ranges.load(saved)
             found.check(
@@ -74,6 +67,7 @@ class Context:
                 f"{name} needs recorded frames (--frames) or saved ranges (--ranges):"
                 " int8 ranges are never made up"
             )
+        # Measure only what an earlier run has not measured
         known = self.measured.get(name)
         if known is None or not known.hold_for(graph.digest(model), tensors, method):
             known = Calibrator(method, provider=self.provider).run(
@@ -85,13 +79,13 @@ class Context:
 
 @dataclasses.dataclass(frozen=True)
 class PassResult:
-    """The graph after a pass, and what to say about it.
+    """The graph after a pass, and what to report about it.
 
     Attributes:
-        model: the graph, the same object where the pass works in place.
-        changes: how many places changed; 0 exactly if the graph is as it was.
-        removed_outputs: names of the graph outputs that went, where the options asked
-            for that; every other output and every input must be as it was.
+        model: the same object where the pass works in place.
+        changes: number of changes; 0 exactly if the graph is unchanged.
+        removed_outputs: graph outputs removed at the user's request; every other output
+            and every input must be unchanged.
         notes: sentences for the report: what was left alone and why.
     """
 
@@ -103,16 +97,16 @@ class PassResult:
 
 @dataclasses.dataclass(frozen=True)
 class Pass(abc.ABC):
-    """A named rewrite of a graph: derive a frozen dataclass, its fields are options.
+    """A named rewrite of a graph; subclasses are frozen dataclasses of options.
 
     Class attributes:
-        name: what recipes and the command line call it.
-        exact: True promises the same outputs, and the manager checks it by running
-            the graph before and after; False is judged by fidelity and on the road.
-        changes_interface: True if the pass may change inputs and outputs at will.
-        quantizes: True if it puts int8 on a float graph.
+        name: its name in recipes and on the command line.
+        exact: True promises equal outputs, and the manager checks it by running the
+            graph before and after; False is judged by fidelity and driving scores.
+        changes_interface: True if the pass may change inputs and outputs.
+        quantizes: True if it quantizes a float graph to int8.
         reads_ranges: True if it calibrates tensors; it then has the options ``ranges``
-            (a file that takes the place of frames) and ``method``.
+            (a file that replaces frames) and ``method``.
     """
 
     name: ClassVar[str]
@@ -127,20 +121,20 @@ class Pass(abc.ABC):
 
     @property
     def needs_frames(self) -> bool:
-        """Whether it measures on recorded frames, with these options, on any graph."""
+        """Whether the pass, with these options, measures on recorded frames."""
         return False
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
-        """Return the names of the tensors whose range it reads, shapes inferred."""
+        """Return the names of the tensors it calibrates; shapes must be inferred."""
         return ()
 
     def files(self) -> tuple[Path, ...]:
-        """List the files that its options name."""
+        """Return the files that its options name."""
         values = [getattr(self, name) for name in self.option_names()]
         return tuple(value for value in values if isinstance(value, Path))
 
     def options(self) -> dict[str, object]:
-        """Return the options that differ from their defaults; functions left out."""
+        """Return the options that differ from their defaults, without functions."""
         found: dict[str, object] = {}
         for field in dataclasses.fields(self):
             value, default = getattr(self, field.name), field.default
@@ -156,11 +150,7 @@ class Pass(abc.ABC):
         return tuple(field.name for field in dataclasses.fields(cls))
 
     def with_options(self, options: Mapping[str, object]) -> Self:
-        """Return this pass with other options.
-
-        Raises:
-            RecipeError: it has no such option.
-        """
+        """Return this pass with other options; an unknown one is a RecipeError."""
         known = self.option_names()
         if unknown := [name for name in options if name not in known]:
             raise RecipeError(

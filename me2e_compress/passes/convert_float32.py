@@ -1,4 +1,4 @@
-"""Float32 instead of float16."""
+"""Convert a float16 graph to float32."""
 
 import dataclasses
 from typing import ClassVar
@@ -21,18 +21,19 @@ class ConvertFloat32(Pass):
     """Compute in float32 what a graph computes in float16.
 
     Given:   y = Conv(x, w_half, b_half)                       x, y float16
+
     Result:  y = Cast<float16>(Conv(Cast<float>(x), w, b))
 
-    A CPU has next to no kernels for float16: onnxruntime casts every operand to and
-    fro. Inputs and outputs keep their types. What rounds in float16 on purpose, plugins
-    and bodies of If, Loop and Scan, stays.
+    A CPU has almost no float16 kernels: onnxruntime casts every operand back and forth.
+    Inputs and outputs keep their types. Nodes that round to float16 on purpose, plugins
+    and bodies of If, Loop and Scan are left alone.
     """
 
     name: ClassVar[str] = "convert-float32"
     exact: ClassVar[bool] = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Retype every node that can be, and drop the Casts that become idle."""
+        """Retype every node that can be retyped and drop the Casts that become idle."""
         types = ElementTypes(model, HALF, FLOAT)
         nodes = [n for n in model.graph if types.inputs(n) or types.outputs(n)]
         retyping = Retyping(model, types, self.name)
@@ -45,7 +46,6 @@ class ConvertFloat32(Pass):
 
 
 def _bypass_idle_casts(model: ir.Model) -> int:
-    """Let the readers of idle Casts read what these do; count the Casts."""
     idle = [
         node
         for node in model.graph

@@ -1,4 +1,4 @@
-"""New edges of a graph: a part reads another's result, at no weight of its own."""
+"""Add edges to a graph: a part reads another's result, without weights."""
 
 import dataclasses
 import itertools
@@ -24,28 +24,28 @@ from me2e_compress.passes.substitutes import (
 
 @dataclasses.dataclass(frozen=True)
 class Edge:
-    """A part of a graph reads another's result, directly.
+    """An edge through which one part of a graph reads another's result directly.
 
     Given:   map -> motion -> planner
+
     Result:  map -> motion -> planner, map -> planner
 
-    A part is a module of the map by its name (``track``), or a pattern of scopes
+    A part is a module of the map (``track``) or a pattern of scopes
     (``*.ego_map_decoder``).
 
     Attributes:
-        source: the part whose result is to be read: of what leaves it and fits, what
-            the reader reads already, or else what leaves last.
-        reader: the part that is to read it, in one of the values that enter it: the
-            largest that it fits, of several the one that is first read last.
-        how: ``append`` gives the reader more queries, those of the source behind its
-            own; ``add`` gives it the sum; ``replace`` gives it the source's in the
-            place of its own. A result of fewer queries is repeated for the last two:
+        source: the part whose result is read: among the fitting values that leave it,
+            one that the reader reads already, or else the last.
+        reader: the part that reads it, joined to one of the values that enter it: the
+            largest that fits; on a tie, the one that is first read last.
+        how: ``append`` appends the source's queries to the reader's; ``add`` adds them;
+            ``replace`` replaces them. The last two repeat a result of fewer queries:
             one agent's for its six modes.
-        of: the part that makes what the reader reads so far; None: any.
-        axis: of the queries, for ``append``.
+        of: the part that makes the value that the reader reads so far; None: any.
+        axis: the axis of the queries, for ``append``.
 
     Raises:
-        RecipeError: an edge that replaces does not say what.
+        RecipeError: ``how="replace"`` without ``of``.
     """
 
     source: str
@@ -55,7 +55,7 @@ class Edge:
     axis: int = 1
 
     def __post_init__(self) -> None:
-        """Check that it says what it replaces."""
+        """Check that ``replace`` names what it replaces."""
         if self.how == "replace" and self.of is None:
             raise RecipeError(f"edge {self.label}: how=replace needs of=PART too")
 
@@ -72,22 +72,16 @@ def add_edge(
     goes: Callable[[ir.Node | None], bool],
     by: str,
 ) -> str:
-    """Add an edge to a graph; what does not depend on its reader stays as it is.
+    """Add an edge to a graph and return a sentence that describes it.
 
-    Args:
-        model: the graph, in order, its nodes still scoped, shapes known; changes.
-        edge: what reads what.
-        modules: the map of the graph.
-        goes: whether a node is of a module that is to be removed.
-        by: name of the pass.
-
-    Returns:
-        What is read now, in words.
+    The graph must be sorted, with scopes and known shapes; it changes in place, but
+    only downstream of the reader. ``goes`` tells the nodes that are to be removed.
 
     Raises:
-        PreconditionError: there is no such part, the source is removed or depends on
+        PreconditionError: a part does not exist or is removed, the source depends on
             the reader, or nothing fits.
     """
+    # Find both ends; a cycle is refused
     source, reader = Part.of(edge.source, modules), Part.of(edge.reader, modules)
     new, old = _ends(model, edge, source, reader, modules, goes)
     heirs = [node for node in old.consumers() if reader.holds(node)]
@@ -96,6 +90,7 @@ def add_edge(
             f"edge {edge.label}: {new.name} depends on what {edge.reader} makes of"
             f" {old.name}"
         )
+    # Redirect only the readers inside the reading part
     uses = [(node, index) for node, index in old.uses() if node in heirs]
     joined = _join(model.graph, edge, new, old, heirs, by)
     for node, index in uses:
@@ -114,7 +109,8 @@ def _ends(
     modules: ModuleMap,
     goes: Callable[[ir.Node | None], bool],
 ) -> tuple[ir.Value, ir.Value]:
-    """Find the value that is to be read, and the one it joins or replaces."""
+    """Find the value to read, and the one that it joins or replaces."""
+    # Both parts must exist and exchange values
     if all(goes(node) for node in model.graph if source.holds(node)):
         raise PreconditionError(f"edge {edge.label}: {_lacks(model, source)}")
     read = reader.entries(model)
@@ -124,6 +120,7 @@ def _ends(
             f"{edge.reader} reads nothing" if left else f"{edge.source} gives nothing"
         )
         raise PreconditionError(f"edge {edge.label}: {what} nothing")
+    # Restrict the reader's inputs to those that ``of`` makes
     made = [value for value in read if not source.holds(value.producer())]
     if edge.of is not None:
         of = Part.of(edge.of, modules)
@@ -133,6 +130,7 @@ def _ends(
             f"edge {edge.label}: {edge.reader} reads nothing of {edge.of or 'others'},"
             f" only {listed(read)}"
         )
+    # Rank all fitting pairs; the largest input wins
     ranked = [
         (math.prod(graph.static_shape(old) or ()), old_at, best, new in read, new_at)
         for (old_at, old), (new_at, new) in itertools.product(
@@ -156,7 +154,7 @@ def _lacks(model: ir.Model, source: Part) -> str:
 
 
 def _fit(edge: Edge, new: ir.Value, old: ir.Value) -> int:
-    """Return how well two values can be joined; 0 not at all."""
+    """Return how well two values can be joined; 0 means not at all."""
     if edge.how != "append":
         return fit(new, old)
     have, want = _as_queries(new, old), graph.static_shape(old)
@@ -170,7 +168,7 @@ def _fit(edge: Edge, new: ir.Value, old: ir.Value) -> int:
 
 
 def _as_queries(new: ir.Value, old: ir.Value) -> tuple[int, ...] | None:
-    """Return a shape with ones in front, as many dimensions as another's."""
+    """Return a shape padded in front with ones to the rank of another."""
     have, want = graph.static_shape(new), graph.static_shape(old)
     if have is None or want is None or len(have) > len(want):
         return None
@@ -185,7 +183,6 @@ def _join(
     heirs: Sequence[ir.Node],
     by: str,
 ) -> ir.Value:
-    """Make what is read from now on; the heirs give the new nodes their module."""
     want = graph.static_shape(old) or ()
     if edge.how == "replace":
         return shaped_like(where, new, old, heirs, by)

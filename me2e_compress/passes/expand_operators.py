@@ -1,4 +1,4 @@
-"""Standard operators instead of fused ones."""
+"""Replace fused operators by standard ones."""
 
 import dataclasses
 from collections import Counter
@@ -12,14 +12,14 @@ from me2e_compress.passes.base import Context, Pass, PassResult
 
 @dataclasses.dataclass(frozen=True)
 class ExpandOperators(Pass):
-    """Write every fused operator, in whatever dialect, in standard operators.
+    """Write every fused operator, of any dialect, in standard operators.
 
     Given:   y = me2e.MultiScaleDeformableAttention(value, sizes, starts, at, weights)
     Result:  y = Transpose(... ReduceSum(Mul(GridSample(value, 2 * at - 1), weights)))
 
-    Of the operators that the graph's opset has: GridSample from opset 16 on where the
-    sizes of the maps are constants, else Gather. A plugin that no dialect names stays
-    as it is.
+    The graph's opset decides which operators are used: GridSample from opset 16 on
+    where the sizes of the maps are constants, else Gather. A plugin that no dialect
+    names is left alone.
     """
 
     name: ClassVar[str] = "expand-operators"
@@ -29,8 +29,8 @@ class ExpandOperators(Pass):
         """Expand the nodes of the graph, of its bodies and of its functions.
 
         Raises:
-            PreconditionError: an opset below 13; or a plugin has an attribute, or
-                inputs, that its dialect does not know.
+            PreconditionError: an opset below 13, or a plugin with attributes or inputs
+                that its dialect does not know.
         """
         counts: Counter[str] = Counter()
         for fused in operators.fused_nodes(model):

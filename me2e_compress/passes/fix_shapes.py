@@ -1,4 +1,4 @@
-"""Give open dimensions a size: a graph of one batch has shapes that can be folded."""
+"""Give open dimensions a size, so that shapes can be folded."""
 
 import dataclasses
 import json
@@ -13,12 +13,12 @@ from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.passes.base import Context, Pass, PassResult
 
 FIXED = "me2e.fixed"
-"""Metadata with the sizes that were given to open dimensions, as JSON."""
+"""Metadata key of the sizes given to open dimensions, as JSON."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FixShapes(Pass):
-    """Give open dimensions of the inputs a size, and infer what follows from it.
+    """Give open dimensions of the inputs a size, and infer shapes from them.
 
     Given:   image float[batch,3,224,224]  ->  Shape, Gather, ... -> y float[batch,10]
     Result:  image float[1,3,224,224]  ->  Shape, Gather, ... -> y float[1,10]
@@ -29,7 +29,7 @@ class FixShapes(Pass):
             name: ``{batch=1, "image:2"=224}``.
 
     Raises:
-        RecipeError: a size below 1, or none at all.
+        RecipeError: a size is below 1, or none is given.
     """
 
     name: ClassVar[str] = "fix-shapes"
@@ -46,12 +46,13 @@ class FixShapes(Pass):
                 raise RecipeError(f"{self.name}: {name}={size} must be 1 or more")
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Write the sizes wherever the dimensions stand, then infer shapes.
+        """Write the sizes wherever the dimensions occur, then infer shapes.
 
         Raises:
-            PreconditionError: no input has such a dimension, or the graph does not
-                work with that size.
+            PreconditionError: no input has such a dimension, or shape inference fails
+                with that size.
         """
+        # Sizes that an earlier run wrote need no change
         known = _fixed(model)
         wanted = {k: size for k, size in self.dims.items() if known.get(k) != size}
         if not wanted:
@@ -62,6 +63,7 @@ class FixShapes(Pass):
                 f"{self.name}: no open dimension is called {unknown[0]!r}; there is"
                 f" {', '.join(there) or 'none'}"
             )
+        # Blame the sizes only if the graph was sound before
         sound = _refusal(model) is None
         count = _write(model, wanted)
         if sound and (reason := _refusal(model)) is not None:
@@ -73,10 +75,9 @@ class FixShapes(Pass):
 
 
 def open_dimensions(model: ir.Model) -> dict[str, int]:
-    """Name the open dimensions of the inputs: their symbols, else ``input:axis``.
+    """Map the open dimensions of inputs, by symbol or ``input:axis``, to their axis.
 
-    Returns:
-        Name -> the axis that it stands at, where at several the first of them.
+    A symbol that occurs at several axes maps to the first of them.
     """
     names: dict[str, int] = {}
     for value in model.graph.inputs:
@@ -88,7 +89,7 @@ def open_dimensions(model: ir.Model) -> dict[str, int]:
 
 
 def sized_inputs(model: ir.Model, sizes: Mapping[str, int]) -> ir.Model:
-    """Return a graph of nothing but the inputs of another, open dimensions sized."""
+    """Return a graph of only the inputs of another, with open dimensions sized."""
     inputs = [
         ir.Value(
             name=each.name,
@@ -101,7 +102,6 @@ def sized_inputs(model: ir.Model, sizes: Mapping[str, int]) -> ir.Model:
 
 
 def _fixed(model: ir.Model) -> dict[str, object]:
-    """Read the sizes that open dimensions of a graph were given before."""
     try:
         found = json.loads(model.metadata_props.get(FIXED, "{}"))
     except json.JSONDecodeError:
@@ -110,7 +110,7 @@ def _fixed(model: ir.Model) -> dict[str, object]:
 
 
 def with_sizes(passes: Sequence[Pass], dims: Mapping[str, int]) -> tuple[Pass, ...]:
-    """Put sizes of open dimensions before the passes, behind an import alone."""
+    """Put FixShapes before the passes, but after a leading import-normalize."""
     if not dims:
         return tuple(passes)
     at = int(bool(passes) and passes[0].name == "import-normalize")
@@ -118,7 +118,7 @@ def with_sizes(passes: Sequence[Pass], dims: Mapping[str, int]) -> tuple[Pass, .
 
 
 def _symbols(dim: ir.SymbolicDim) -> tuple[str, ...]:
-    """Name the symbols of a dimension: of ``2*s0 + 1`` that is ``s0``."""
+    """Return the symbols of a dimension: ``s0`` for ``2*s0 + 1``."""
     if dim.value is None:
         return ()
     try:
@@ -128,7 +128,6 @@ def _symbols(dim: ir.SymbolicDim) -> tuple[str, ...]:
 
 
 def _write(model: ir.Model, sizes: Mapping[str, int]) -> int:
-    """Write sizes into every shape that names them; count the inputs that changed."""
     for node in model.graph.all_nodes():
         for value in node.outputs:
             value.shape = _sized(value.shape, sizes, "")
@@ -145,7 +144,7 @@ def _write(model: ir.Model, sizes: Mapping[str, int]) -> int:
 def _sized(
     shape: ir.Shape | None, sizes: Mapping[str, int], owner: str
 ) -> ir.Shape | None:
-    """Return a shape with sizes in the place of their names; itself if it has none."""
+    """Return a shape with symbols replaced by sizes; the same object if unchanged."""
     if shape is None:
         return None
     dims = [

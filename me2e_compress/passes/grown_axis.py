@@ -1,4 +1,4 @@
-"""A value of a graph got longer: what is computed of it has to know."""
+"""Propagate the size of an axis that grew through the rest of a graph."""
 
 import math
 
@@ -11,24 +11,20 @@ from me2e_compress.errors import PreconditionError
 from me2e_compress.passes.parts import listed
 
 _SHOWN_BYTES = 1024
-"""Constants up to this size are shown to the inference: shapes and axes are."""
+"""Constants up to this size (shapes, axes) are shown to the shape inference."""
 
 
 def carry(model: ir.Model, grown: ir.Value, old: ir.Value, what: str) -> None:
-    """Infer the shapes behind a value that got longer along one axis, in place.
+    """Infer the shapes behind a value that grew along one axis, in place.
 
-    A Reshape to a constant shape gets a new constant.
-
-    Args:
-        model: the graph, in order.
-        grown: the value; its shape is known.
-        old: what its readers read before.
-        what: the change and the tensor that made it, for messages.
+    A Reshape to a constant shape gets a new constant. ``old`` is the value that the
+    readers of ``grown`` read before; ``what`` describes the change in messages.
 
     Raises:
-        PreconditionError: an operator does not work with the new size, an output of the
-            graph would change its shape, or nobody knows what a plugin would make.
+        PreconditionError: an operator does not work with the new size, a graph output
+            would change its shape, or the result of a plugin is unknown.
     """
+    # Visit, in order, only nodes that read a grown value
     was = {grown: graph.static_shape(old) or ()}
     for node in model.graph:
         if not any(value in was for value in node.inputs if value is not None):
@@ -37,6 +33,7 @@ def carry(model: ir.Model, grown: ir.Value, old: ir.Value, what: str) -> None:
             _reshape(model.graph, node, was, what)
         shapes = _inferred(model, node, what)
         for value in node.outputs:
+            # A shape may change only where it stays known and internal
             before, after = graph.static_shape(value), shapes.get(str(value.name))
             if before == after or not value.name:
                 continue
@@ -51,10 +48,11 @@ def _reshape(
     was: dict[ir.Value, tuple[int, ...]],
     what: str,
 ) -> None:
-    """Give a Reshape the new size where the old one stands in its shape.
+    """Update the constant shape of a Reshape to the new size.
 
     The axis that grew must be an axis of the result too, neither split nor merged.
     """
+    # The shapes before and after must be known
     source, size = node.inputs[0], node.inputs[1]
     made = graph.static_shape(node.outputs[0])
     target = None if size is None else graph.array_of(size)
@@ -64,6 +62,7 @@ def _reshape(
             f"{what}: the shape that {node.name} makes is not known"
         )
     before = was[source]
+    # Find the same axis in the target shape
     axis = next(at for at, size in enumerate(before) if size != after[at])
     places = [
         at
@@ -82,7 +81,6 @@ def _reshape(
 
 
 def _inferred(model: ir.Model, node: ir.Node, what: str) -> dict[str, tuple[int, ...]]:
-    """Return the shapes that a node gives by ONNX's inference."""
     opset = model.opset_imports.get(node.domain, 0)
     read = [value for value in node.inputs if value is not None]
     try:

@@ -1,4 +1,4 @@
-"""Rewrite int8 that was placed for TensorRT so that onnxruntime is fast with it."""
+"""Rewrite int8 that was placed for TensorRT so that onnxruntime runs it fast."""
 
 import dataclasses
 from pathlib import Path
@@ -15,17 +15,18 @@ from me2e_compress.targets import onnxruntime
 
 @dataclasses.dataclass(frozen=True)
 class LowerInt8(Pass):
-    """Rewrite a graph that was quantized for TensorRT so that a CPU is fast with it.
+    """Rewrite a graph quantized for TensorRT so that a CPU runs it fast.
 
     Given:   y = Conv(DequantizeLinear(QuantizeLinear(x)), DequantizeLinear(w_int8), b)
+
     Result:  y = DequantizeLinear(QuantizeLinear(Conv(DequantizeLinear(
              QuantizeLinear(x)), DequantizeLinear(w_int8), DequantizeLinear(b_int32))))
 
-    The graph may be ModelOpt's, or what ``quantize-int8`` wrote for TensorRT. Layers,
-    weights and ranges stay the same, on uint8 instead of int8; what convolutions answer
-    is quantized too, and the ranges of that are measured on the context's frames, or
-    read from a file. Activations that TensorRT reads in int8 and onnxruntime has no
-    fast kernel for (the products of attention) become float again.
+    The graph may come from ModelOpt or from ``quantize-int8``. Layers, weights and
+    ranges stay, on uint8 instead of int8. Outputs of convolutions are quantized too;
+    their ranges are measured on the context's frames or read from a file. Activations
+    that TensorRT reads in int8 but onnxruntime has no fast kernel for (the products of
+    attention) become float again.
 
     Attributes:
         method: how ranges are read from the frames: ``max-min``.
@@ -39,12 +40,13 @@ class LowerInt8(Pass):
     ranges: Path | None = None
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Read the pairs, calibrate what they do not tell, write them anew.
+        """Read the quantizers, calibrate the missing ranges, and write the new graph.
 
         Raises:
             PreconditionError: the graph is not quantized, or not in symmetric int8.
             FramesError: neither frames nor ranges, or they are of another graph.
         """
+        # Ranges of tensors that TensorRT leaves in float
         missing = self.ranged_tensors(model, context)
         ranges = None
         if missing:

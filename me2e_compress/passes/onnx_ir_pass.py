@@ -1,4 +1,4 @@
-"""Run any pass written for onnx-ir as a pass of ours."""
+"""Run any pass written for onnx-ir as a pass of this toolkit."""
 
 import dataclasses
 from typing import ClassVar
@@ -13,12 +13,13 @@ __all__ = ["OnnxIrPass"]
 
 @dataclasses.dataclass(frozen=True)
 class OnnxIrPass(Pass):
-    """Run an onnx-ir pass and count its changes by the graph itself.
+    """Run an onnx-ir pass; its changes are counted by comparing the graphs.
 
-    Nodes that it changes name this pass. It gives new nodes no past: the manager
+    Nodes that it changes name this pass. New nodes get no provenance: the manager
     refuses onnx-ir passes that make nodes without copying metadata.
 
     Given:   OnnxIrPass(onnx_ir.passes.common.IdentityEliminationPass())
+
     Result:  a pass that removes Identity nodes
 
     Attributes:
@@ -31,7 +32,7 @@ class OnnxIrPass(Pass):
     inner: ir.passes.PassBase
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Run the inner pass, in place if it works so."""
+        """Run the inner pass, in place if it works in place."""
         before = model.clone()
         after = self.inner(model).model
         provenance.sign(before, after, self.name)

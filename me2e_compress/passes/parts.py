@@ -1,4 +1,4 @@
-"""Parts of a graph that a re-wiring names: a module, or the scopes of a pattern."""
+"""Parts of a graph: a module, or the scopes that a pattern matches."""
 
 import dataclasses
 import math
@@ -12,28 +12,23 @@ from me2e_compress.modules import ModuleMap, PathGlob, scope_of
 from me2e_compress.modules.paths import entering, leaving
 
 _NAMED = 4
-"""Values that a message lists."""
+"""Number of values that a message lists."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """A module of the map, by its name, or the scopes that a pattern matches.
-
-    Attributes:
-        name: of the module (``track``), or the pattern (``*.ego_map_decoder``).
-        is_module: which of the two it is.
-    """
+    """A module of the map by its name, or the scopes that a pattern matches."""
 
     name: str
     is_module: bool = False
 
     @classmethod
     def of(cls, name: str, modules: ModuleMap) -> Self:
-        """Read a name: that of a module goes before a pattern."""
+        """Read a name; that of a module takes precedence over a pattern."""
         return cls(name, name in modules.names())
 
     def holds(self, node: ir.Node | None) -> bool:
-        """Return whether a node is of this part."""
+        """Return whether a node belongs to this part."""
         if node is None:
             return False
         if self.is_module:
@@ -41,16 +36,16 @@ class Part:
         return within(node, self.name)
 
     def exits(self, model: ir.Model) -> tuple[ir.Value, ...]:
-        """List what it gives to the rest of the graph, in graph order."""
+        """Return the values that leave it, in graph order."""
         return leaving(model, self.holds)
 
     def entries(self, model: ir.Model) -> tuple[ir.Value, ...]:
-        """List what it reads of the rest of the graph, as it is first read."""
+        """Return the values that enter it, in the order they are first read."""
         return entering(model, self.holds)
 
 
 def within(node: ir.Node, scope: str) -> bool:
-    """Return whether a node was made in a scope, e.g. ``*.lane_encoder``."""
+    """Return whether a node was made in a scope such as ``*.lane_encoder``."""
     path = tuple(part for part in scope_of(node).split(".") if part)
     return PathGlob(scope).reach(path) is not None
 
@@ -63,15 +58,11 @@ def listed(values: tuple[ir.Value, ...] | list[ir.Value]) -> str:
 
 
 def stretched(have: tuple[int, ...], want: tuple[int, ...]) -> tuple[int, ...] | None:
-    """Return the shape from which a broadcast makes another one; None if none does.
+    """Return the shape from which ``have`` broadcasts to ``want``; None if none does.
 
-    The last axis, the channels, is as long in both: whole queries are repeated. One
-    agent's [1, 256] is [1, 1, 256] for the six modes of [1, 6, 256], and [1, A, 256] of
-    all agents is [1, A, 1, 256] for [1, A, 6, 256].
-
-    Args:
-        have: the shape of what is to be read.
-        want: the shape of what is read so far.
+    The last axis, the channels, must be equal: whole queries are repeated. [1, 256] of
+    one agent becomes [1, 1, 256] for the six modes of [1, 6, 256], and [1, A, 256] of
+    all agents becomes [1, A, 1, 256] for [1, A, 6, 256].
     """
     if have == want or bare(have) == bare(want):
         return want
@@ -87,17 +78,16 @@ def stretched(have: tuple[int, ...], want: tuple[int, ...]) -> tuple[int, ...] |
 
 
 def bare(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Drop the ones: a reorder that moves only those moves no element."""
+    """Drop dimensions of size 1: moving only these moves no element."""
     if math.prod(shape) == 0:
         return shape
     return tuple(size for size in shape if size != 1)
 
 
 def fit(value: ir.Value, like: ir.Value) -> int:
-    """Return how well a value can be read in another's place.
+    """Return how well a value can be read in place of another.
 
-    Returns:
-        2 as it is, up to dimensions of size 1; 1 after a broadcast; 0 not at all.
+    2: as it is, up to dimensions of size 1; 1: after a broadcast; 0: not at all.
     """
     have, want = graph.static_shape(value), graph.static_shape(like)
     if have is None or want is None or value.dtype != like.dtype:
@@ -109,7 +99,6 @@ def fit(value: ir.Value, like: ir.Value) -> int:
 def _places(
     sizes: tuple[int, ...], want: tuple[int, ...], start: int = 0
 ) -> list[tuple[int, ...]]:
-    """List the ways in which sizes stand, in their order, among those of a shape."""
     if not sizes:
         return [()]
     return [

@@ -1,4 +1,4 @@
-"""Whether what drives still sees: what an ablation must not cut."""
+"""Check that the planner still depends on the cameras after an ablation."""
 
 import onnx_ir as ir
 
@@ -11,12 +11,7 @@ PLANNER = "planner"
 
 
 def seeing(model: ir.Model, modules: ModuleMap) -> tuple[str, ...]:
-    """Name the planner's outputs that depend on the modules of feature extraction.
-
-    Args:
-        model: the graph.
-        modules: its map; one without a planner has no such outputs.
-    """
+    """Return the planner's outputs that depend on the feature extraction."""
     features = set(modules.names("feature"))
     return tuple(
         str(value.name)
@@ -28,16 +23,9 @@ def seeing(model: ir.Model, modules: ModuleMap) -> tuple[str, ...]:
 def check_sight(
     model: ir.Model, modules: ModuleMap, before: tuple[str, ...], drop: tuple[str, ...]
 ) -> None:
-    """Check that the plan still depends on what the cameras see.
+    """Check that the plan still depends on the cameras, else raise a PreconditionError.
 
-    Args:
-        model: the graph without what was dropped.
-        modules: its map.
-        before: what :func:`seeing` said of the whole graph.
-        drop: the modules that went.
-
-    Raises:
-        PreconditionError: it does not.
+    ``before`` is the result of :func:`seeing` for the whole graph.
     """
     blind = [name for name in before if name not in seeing(model, modules)]
     if blind:

@@ -1,4 +1,4 @@
-"""Int8 where a plan says so."""
+"""Quantize to int8 where a plan says so."""
 
 import dataclasses
 from pathlib import Path
@@ -27,7 +27,7 @@ from me2e_compress.targets.quantized import describe_quantized
 from me2e_compress.targets.weight_only import store_weights
 
 _SHOWN = 5
-"""How many of a kind a note lists."""
+"""Number of items of a kind that a note lists."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,20 +37,19 @@ class QuantizeInt8(Pass):
     Given:   y = Conv(x, w, b)
     Result:  y = Conv(DequantizeLinear(QuantizeLinear(x)), DequantizeLinear(w_int8), b)
 
-    The plan (:mod:`me2e_compress.quantization.plan`) decides which nodes, and says why
-    not the others; the graph carries it in its metadata:
-    geometry, positions, attention weights and matrix-vector products stay float. Ranges
-    are measured on the context's frames, or read from a file; there is no calibration
-    on made-up data.
+    The plan (:mod:`me2e_compress.quantization.plan`) decides which nodes, gives the
+    reason for the others, and is stored in the graph's metadata: geometry, positions,
+    attention weights and matrix-vector products stay float. Ranges are measured on the
+    context's frames, or read from a file; there is no calibration on made-up data.
 
     Attributes:
         scheme: ``feature-ext``, ``prediction`` or ``full``.
         modules: module names instead of a scheme.
         rules: ``safe`` (also called ``tensorrt``), which keeps geometry, positions,
-            attention weights, ego status and what kernels are too coarse for in float
-            besides; ``paper``, its two stages alone; a rule set of your own, by its
-            name or, in Python, itself; each with options, ``paper{extra=[my-rule]}``.
-        without: names of rules that are switched off, e.g. ``gemv``.
+            attention weights, ego status and operators whose kernels are too coarse in
+            float; ``paper``, its two stages alone; a rule set of your own, by name or,
+            in Python, as an object; each with options, ``paper{extra=[my-rule]}``.
+        without: names of rules to switch off, e.g. ``gemv``.
         target: who will run the graph.
         attention_limit: longest attention that becomes int8, in tokens; None leaves it
             to the rules (512).
@@ -79,17 +78,17 @@ class QuantizeInt8(Pass):
 
     @property
     def needs_frames(self) -> bool:
-        """Whether no saved ranges take the place of frames."""
+        """Whether frames are needed because no saved ranges are given."""
         return self.ranges is None
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Plan, calibrate, place.
+        """Plan, calibrate, and place quantizers.
 
         Raises:
             PreconditionError: the graph is quantized already, of opset below 13, or in
                 float16 that its target or opset has no int8 for.
             FramesError: neither frames nor ranges, or they are of another graph.
-            ModuleMapError: no such module.
+            ModuleMapError: the map has no such module.
             RecipeError: no such scheme, rules, target or method, or bad overrides.
         """
         if found := describe_quantized(model):
@@ -98,6 +97,7 @@ class QuantizeInt8(Pass):
                 " give the float graph that it was made of, or let lower-int8 rewrite"
                 " this one for onnxruntime"
             )
+        # Plan, and stop if there is nothing to do
         target = TARGETS.parse(self.target)
         plan = self._placeable(model, context)
         target.check_types(plan, model)
@@ -106,6 +106,7 @@ class QuantizeInt8(Pass):
         if not tensors and not plan.weight_only:
             notes = ("nothing to quantize", *_notes(plan, self.target), *advice)
             return PassResult(model, 0, notes)
+        # Calibrate
         ranges = Ranges({}, self.method, 0, "", "")
         if tensors:
             ranges = context.ranges(
@@ -115,6 +116,7 @@ class QuantizeInt8(Pass):
                 method=self.method,
                 saved=self.ranges,
             )
+        # Place the quantizers and record the plan
         placed = target.place(model, plan, ranges)
         store_weights(placed, plan)
         stamp_plan(placed, plan)
@@ -127,7 +129,6 @@ class QuantizeInt8(Pass):
         return PassResult(placed, len(plan.placed) + len(plan.weight_only), notes)
 
     def _advice(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
-        """Say what weights of matrix-vector products would save as int8, if much."""
         if self.weight_only_gemv:
             return ()
         count, saved = savable_bytes(plan, model)
@@ -139,7 +140,7 @@ class QuantizeInt8(Pass):
         )
 
     def plan(self, model: ir.Model, context: Context) -> QuantPlan:
-        """Decide for every node of a graph whose shapes are inferred."""
+        """Choose for every node; shapes must be inferred."""
         overrides = Overrides()
         if self.overrides is not None:
             overrides = Overrides.load(self.overrides)
@@ -151,18 +152,17 @@ class QuantizeInt8(Pass):
         return with_weight_only(plan, model) if self.weight_only_gemv else plan
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
-        """Return the names of what its target reads in int8."""
+        """Return the names of the tensors that its target reads in int8."""
         plan = self._placeable(model, context)
         return TARGETS.parse(self.target).tensors(plan, model)
 
     def _placeable(self, model: ir.Model, context: Context) -> QuantPlan:
-        """Plan, and note what the target leaves in float nevertheless."""
         plan = self.plan(model, context)
         kept_float = TARGETS.parse(self.target).kept_float(plan, model)
         return dataclasses.replace(plan, kept_float=kept_float)
 
     def _rules(self) -> RuleSet:
-        """Build the rule set; what this pass says of it counts."""
+        """Build the rule set; options of this pass take precedence."""
         rules = self.rules
         if isinstance(rules, str):
             rules = RULE_SETS.parse(rules)
@@ -195,7 +195,6 @@ def _notes(plan: QuantPlan, target: str) -> tuple[str, ...]:
 
 
 def _kept_float(plan: QuantPlan, target: str) -> tuple[str, ...]:
-    """List the plan's nodes that the target leaves in float, a line a reason."""
     reasons = dict.fromkeys(each.reason for each in plan.kept_float)
     nodes = {
         reason: [
@@ -246,7 +245,6 @@ def _outliers(ranges: Ranges) -> list[str]:
 
 
 def _first(found: list[str], what: str) -> tuple[str, ...]:
-    """List the first few of many on one line, or nothing."""
     if not found:
         return ()
     more = len(found) - _SHOWN

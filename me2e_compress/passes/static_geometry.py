@@ -1,4 +1,4 @@
-"""Make inputs that never change on one vehicle constants: the camera matrices."""
+"""Turn inputs that never change on one vehicle (camera matrices) into constants."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -22,19 +22,20 @@ class StaticGeometry(Pass):
     """Make inputs constant that are the same in every frame of one vehicle.
 
     Given:   lidar2img float[1,6,4,4] -> at = MatMul(pillars, lidar2img) -> ...
-    Result:  at = MatMul(pillars, lidar2img), lidar2img a weight; ``fold-constants``
-             behind it computes at, and all else that depends on weights alone
 
-    Where every pillar of the grid falls in which camera, which queries a camera sees,
-    and lists of those are computed in every frame by an exported graph, although they
-    change only when a camera is moved. The graph is that of one vehicle from then on:
-    the input is gone, frames may hold it still, and if they hold another one they are
-    refused. Lossy by that alone; for the vehicle itself outputs are equal to rounding.
+    Result:  at = MatMul(pillars, lidar2img), lidar2img a weight; a following
+             ``fold-constants`` computes at, and all else that depends only on weights
+
+    An exported graph computes in every frame where each pillar of the grid falls in
+    each camera, and which queries a camera sees, although this changes only when a
+    camera is moved. The graph then fits one vehicle: the input is gone, and frames that
+    hold another value are refused. It is lossy only in this sense; for the vehicle
+    itself outputs are equal up to rounding.
 
     Attributes:
-        inputs: which become constant.
+        inputs: the inputs that become constant.
         calibration: an ``.npz`` that holds them by name, such as one frame; None takes
-            them from the frames, which must all hold the same.
+            them from the frames, which must all agree.
     """
 
     name: ClassVar[str] = "static-geometry"
@@ -44,23 +45,24 @@ class StaticGeometry(Pass):
     calibration: Path | None = None
 
     def __post_init__(self) -> None:
-        """Check that there is something to do."""
+        """Check that inputs are given."""
         if not self.inputs:
             raise RecipeError(f"{self.name} needs inputs: inputs=[lidar2img]")
 
     @property
     def needs_frames(self) -> bool:
-        """Whether the values are to be read off the frames."""
+        """Whether the values are read from the frames."""
         return self.calibration is None
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Register the values as weights under the names of the inputs.
 
         Raises:
-            PreconditionError: the graph has no such input, or answers with it.
-            FramesError: there are neither frames nor a file; a value is missing, has
-                another type or shape, is not finite, or is not the same in all frames.
+            PreconditionError: the graph has no such input, or it is an output too.
+            FramesError: neither frames nor a file; or a value is missing, of another
+                type or shape, not finite, or not the same in all frames.
         """
+        # Inputs that are constant already need no change
         known = static_inputs(model)
         ports = {str(value.name): value for value in model.graph.inputs}
         wanted = [name for name in self.inputs if name not in known]
@@ -74,6 +76,7 @@ class StaticGeometry(Pass):
                 raise PreconditionError(f"{self.name}: {name} is an output too")
         if not wanted:
             return PassResult(model, 0)
+        # Check every value against its input, then replace it
         arrays = self._read(wanted, context)
         for name in wanted:
             _check(ports[name], arrays[name], f"{self.name}: {name}")
@@ -84,7 +87,6 @@ class StaticGeometry(Pass):
         return PassResult(model, len(wanted), (f"constant from now on: {said}",))
 
     def _read(self, names: list[str], context: Context) -> dict[str, Array]:
-        """Read the values from the file, or from the frames, which must agree."""
         if self.calibration is not None:
             arrays = load_arrays(self.calibration)
             return {name: _held(arrays, name, str(self.calibration)) for name in names}
@@ -115,7 +117,6 @@ def _held(arrays: Mapping[str, Array], name: str, where: str) -> Array:
 
 
 def _check(value: ir.Value, array: Array, where: str) -> None:
-    """Hold a value to the input that it takes the place of."""
     kind = None if value.dtype is None else value.dtype.numpy()
     if kind is not None and array.dtype != kind:
         raise FramesError(f"{where} is {array.dtype}, expected {kind}")
@@ -132,7 +133,6 @@ def _check(value: ir.Value, array: Array, where: str) -> None:
 
 
 def _fix(model: ir.Model, value: ir.Value, array: Array) -> None:
-    """Make an input an initializer of the same name."""
     model.graph.inputs.remove(value)
     value.const_value = ir.tensor(np.ascontiguousarray(array), name=value.name)
     value.shape = ir.Shape(array.shape)

@@ -1,4 +1,4 @@
-"""What can be read in the place of a value whose makers are removed."""
+"""Values that replace those whose nodes are removed."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -25,19 +25,13 @@ def module_of(value: ir.Value) -> str:
 
 
 def result_of(model: ir.Model, part: Part, like: ir.Value | None = None) -> ir.Value:
-    """Return what a part of a graph returns: the last value that leaves it.
+    """Return the result of a part of a graph: the last value that leaves it.
 
-    A decoder returns its queries and, last, the reference points it refined; so the
-    last value *that fits* is taken where it is known what it must fit.
-
-    Args:
-        model: the graph, its nodes still scoped.
-        part: a module, or scopes, e.g. those of ``*.motion_decoder``.
-        like: what it is to substitute for: same type, same shape up to dimensions of
-            size 1, or else one that a broadcast makes the same.
+    A decoder returns its queries and, last, the reference points it refined; so with
+    ``like`` the last value of fitting type and shape (up to a broadcast) is taken.
 
     Raises:
-        PreconditionError: nothing leaves such a part, or nothing that fits.
+        PreconditionError: nothing leaves the part, or nothing that fits.
     """
     found = part.exits(model)
     if like is None and found:
@@ -55,7 +49,7 @@ def result_of(model: ir.Model, part: Part, like: ir.Value | None = None) -> ir.V
 
 
 def depends(value: ir.Value, on: Collection[ir.Value]) -> bool:
-    """Return whether a value is computed from one of others (or is it)."""
+    """Return whether a value is one of others or computed from them."""
     queue, seen = [value], {value}
     while queue:
         current = queue.pop()
@@ -70,7 +64,7 @@ def depends(value: ir.Value, on: Collection[ir.Value]) -> bool:
 
 
 def is_shape_arithmetic(value: ir.Value) -> bool:
-    """Return whether integers come from shapes and constants alone, not from data."""
+    """Return whether integers come only from shapes and constants, not from data."""
     queue, seen = [value], {value}
     while queue:
         current = queue.pop()
@@ -87,7 +81,7 @@ def is_shape_arithmetic(value: ir.Value) -> bool:
 
 
 def replace_readers(old: ir.Value, new: ir.Value) -> None:
-    """Replace a value in the nodes that read it; graph outputs keep theirs."""
+    """Replace a value in the nodes that read it, but not as a graph output."""
     maker = new.producer()
     for node, index in tuple(old.uses()):
         if node is not maker:
@@ -95,16 +89,10 @@ def replace_readers(old: ir.Value, new: ir.Value) -> None:
 
 
 def constant_like(where: ir.Graph, value: ir.Value, array: Array) -> ir.Value:
-    """Make a constant that stands for a value.
-
-    Args:
-        where: the graph that gets it.
-        value: what it stands for.
-        array: what it is.
+    """Add a constant in place of a value.
 
     Raises:
-        PreconditionError: the array has another type or shape than the value, or the
-            value is itself a shape.
+        PreconditionError: type or shape differ, or the value is itself a shape.
     """
     shape, dtype = layout_of(value)
     if array.dtype != dtype or array.shape != shape:
@@ -116,7 +104,7 @@ def constant_like(where: ir.Graph, value: ir.Value, array: Array) -> ir.Value:
 
 
 def layout_of(value: ir.Value) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
-    """Return the shape and the type that a substitute must have.
+    """Return the shape and type that a substitute must have.
 
     Raises:
         PreconditionError: the shape is not static, or the value is itself a shape.
@@ -138,16 +126,9 @@ def layout_of(value: ir.Value) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
 def zeros_like(
     where: ir.Graph, value: ir.Value, readers: Sequence[ir.Node], by: str
 ) -> ir.Value:
-    """Make zeros of a value's shape and type: a few bytes, whatever the size.
+    """Add zeros of a value's shape and type, in a few bytes of any size.
 
-    Args:
-        where: the graph that gets the node.
-        value: what the zeros stand for.
-        readers: the nodes that will read them, whose heir the new node is.
-        by: name of the pass.
-
-    Raises:
-        PreconditionError: the shape is not static, or the value is itself a shape.
+    New nodes inherit from the ``readers``. Raises as :func:`layout_of`.
     """
     shape, dtype = layout_of(value)
     zero = ir.tensor(np.zeros(1, dtype), name="zero")
@@ -163,14 +144,9 @@ def shaped_like(
     readers: Sequence[ir.Node],
     by: str,
 ) -> ir.Value:
-    """Give a value another's shape: add ones, then repeat along axes of size 1.
+    """Give ``new`` the shape of ``old``: add ones, then repeat along axes of size 1.
 
-    Args:
-        where: the graph that gets the nodes.
-        new: what is to be read; it fits, see :func:`~me2e_compress.passes.parts.fit`.
-        old: what is read so far.
-        readers: whose heirs the new nodes are.
-        by: name of the pass.
+    It must fit, see :func:`~me2e_compress.passes.parts.fit`.
     """
     have, want = graph.static_shape(new), graph.static_shape(old)
     padded = have and want and stretched(have, want)
@@ -200,7 +176,6 @@ def reshaped(
 
 
 def _size(where: ir.Graph, shape: tuple[int, ...], of: ir.Value) -> ir.Value:
-    """Add a shape as a constant, named after a value."""
     return rewrite.add_constant(where, np.array(shape, np.int64), f"{of.name}_shape")
 
 
@@ -211,15 +186,7 @@ def finished(
     like: ir.Value,
     name: str,
 ) -> ir.Value:
-    """Name a new node and what it gives, append it, and return what it gives.
-
-    Args:
-        where: the graph that gets it.
-        node: it has one output.
-        shape: of this.
-        like: a value of the same type.
-        name: if that is free.
-    """
+    """Name a new node and its only output, append it, and return the output."""
     unique = rewrite.fresh_name(name, rewrite.value_names(where))
     node.name = unique
     output = node.outputs[0]
@@ -234,16 +201,9 @@ def means_of(
     context: Context,
     file: Path | None,
 ) -> tuple[dict[str, Array], str]:
-    """Read means from a file, or measure them on frames.
+    """Read means by value name from a file, or measure them on the context's frames.
 
-    Args:
-        model: the graph that makes the values.
-        values: of its main graph.
-        context: has the recording, or none.
-        file: an ``.npz`` by value name, which goes before frames; None for frames.
-
-    Returns:
-        The means by value name, and where they are from in words.
+    Returns the means, and a phrase that tells their source.
 
     Raises:
         FramesError: neither frames nor a file, or they are of another graph.

@@ -19,19 +19,18 @@ NodeKey = tuple[str, str, tuple[str | None, ...], tuple[str | None, ...]]
 class SurgeonFunction(Pass):
     """Run a function over the graph as onnx-graphsurgeon sees it.
 
-    Modules, origins and other metadata, which graphsurgeon does not hold, come back
-    afterwards; new nodes belong to the module of their neighbours. In the function,
+    Modules, origins and other metadata, which graphsurgeon drops, are restored;
+    new nodes belong to the module of their neighbours. In the function,
     call ``fold_constants`` and ``cleanup`` with ``recurse_functions=False``.
 
     Given:
         a = Relu(x)  ;  y = Relu(a)     and a function that drops the second Relu
     Result:
-        y = Relu(x)                     with the past of the first
+        y = Relu(x)                     with the provenance of the first
 
     Attributes:
-        function: takes the graph, changes it or returns another; None means the one
-            that it was given.
-        name: what reports call the pass.
+        function: takes the graph, and changes it (returning None) or returns another.
+        name: the name in reports.
         exact: whether it promises the same outputs.
         changes_interface: whether it may change inputs and outputs.
     """
@@ -48,8 +47,9 @@ class SurgeonFunction(Pass):
 
         Raises:
             PassError: the function returned something that is not a graph.
-            GraphError: what it made of the graph is not a model.
+            GraphError: the result is not a valid model.
         """
+        # Run the function on graphsurgeon's form of the graph
         handed = to_graphsurgeon(model)
         given = self.function(handed)
         if given is not None and not isinstance(given, gs.Graph):
@@ -61,6 +61,7 @@ class SurgeonFunction(Pass):
         )
         if digest(result) == digest(model):
             return PassResult(model, 0)
+        # Count changes by the nodes that differ
         provenance.sign(model, result, self.name)
         before, after = _nodes(model), _nodes(result)
         edited = (before - after).total() + (after - before).total()

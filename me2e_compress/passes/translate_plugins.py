@@ -1,4 +1,4 @@
-"""Plugins of one library in the words of another."""
+"""Translate plugins of one library into those of another."""
 
 import dataclasses
 from collections import Counter
@@ -16,12 +16,13 @@ class TranslatePlugins(Pass):
     """Write every fused operator in one dialect: the plugin library of a target.
 
     Given:   y = MultiScaleDeformableAttnTRT(value, sizes, points, offsets, raw)
+
     Result:  y = trt.plugins.MultiscaleDeformableAttnPlugin_TRT(value, sizes, starts,
              points + offsets / sizes, Softmax(raw))       with dialect=tensorrt
 
-    Operator, domain, ``plugin_version``, ``plugin_namespace``, the order and the types
-    of the inputs and the layout of the output become those of the library. What has no
-    domain there has none in the file that is written.
+    Operator, domain, ``plugin_version``, ``plugin_namespace``, the order and types of
+    the inputs and the layout of the output become those of the library. A plugin that
+    has no domain there has none in the written file.
 
     Attributes:
         dialect: the library; ``me2e`` is the toolkit's own form.
@@ -36,7 +37,7 @@ class TranslatePlugins(Pass):
     dialect: str
 
     def __post_init__(self) -> None:
-        """Check the name."""
+        """Check the dialect."""
         known = operators.dialect_names()
         if self.dialect not in known:
             there = ", ".join(known)
@@ -48,8 +49,8 @@ class TranslatePlugins(Pass):
         """Translate the nodes of the graph, of its bodies and of its functions.
 
         Raises:
-            PreconditionError: the library has no such operator, or cannot say it; or a
-                plugin has an attribute, or inputs, that its dialect does not know.
+            PreconditionError: the library has no such operator or cannot express it, or
+                a plugin has attributes or inputs that its dialect does not know.
         """
         counts: Counter[str] = Counter()
         for fused in operators.fused_nodes(model):

@@ -1,4 +1,4 @@
-"""What a node costs in every frame, and what that is worth in bytes of the file."""
+"""The cost of a node per frame, and its equivalent in bytes of the file."""
 
 import math
 
@@ -7,7 +7,7 @@ import onnx_ir as ir
 from me2e_compress.graph import macs, static_shape
 
 BYTES_PER_NODE = 2048
-"""What a node that is gone may cost in the file: at 2 us a node, 1 MB for 1 ms."""
+"""File bytes that a removed node may cost: at 2 us a node, 1 MB for 1 ms."""
 MACS_PER_NODE = 200_000
 """Multiply-accumulates that take as long as starting a node does."""
 MOVED_BYTES_PER_NODE = 40_000
@@ -23,13 +23,13 @@ is folded on VAD-tiny is the same from 1 to 4 KB a node.
 VIEWS = frozenset(
     {"Flatten", "Identity", "Reshape", "Shape", "Size", "Squeeze", "Unsqueeze"}
 )
-"""Operators that move nothing."""
+"""Operators that move no data."""
 
 
 def work(node: ir.Node) -> float:
-    """Return what a node costs a frame, in starts of a node: 1 and its work.
+    """Return the cost of a node per frame in node starts: 1 plus its work.
 
-    Sizes that are not known count as nothing.
+    Unknown sizes count as 0.
     """
     if node.op_type in VIEWS:
         return 1.0

@@ -1,4 +1,4 @@
-"""Find the layers that positions come from."""
+"""Find the layers that produce positions."""
 
 from collections import deque
 from collections.abc import Collection, Iterator
@@ -48,20 +48,17 @@ _DATA_ONLY = {"Gather": 1, "GatherElements": 1, "GatherND": 1, "Pad": 1, "Slice"
 def find_coordinates(
     model: ir.Model, constants: Collection[ir.Value]
 ) -> dict[ir.Node, str]:
-    """Map every layer that positions come from to why it is one.
+    """Map every layer that produces positions to the reason.
 
     From whatever takes positions (samplers, gathers, rotations) one walk goes back
     through arithmetic and changes of layout to the layers that they come from: sampling
     offsets, reference points, refinements of boxes; and on through products that sum
     over 4 numbers at most, which turn and shift points. It enters no node twice, so it
     is linear in the graph. Sampling weights whose layer reads the same tensor as such a
-    layer are mapped too.
-
-    Args:
-        model: the graph, in topological order.
-        constants: values that no input changes.
+    layer are mapped too. ``constants`` are values that no input changes.
     """
     found: dict[ir.Node, str] = {}
+    # back from the readers of positions, each node once
     queue = deque(_positions(model.graph))
     seen: set[ir.Node] = set()
     while queue:
@@ -83,11 +80,11 @@ def find_coordinates(
 def position_arithmetic(
     model: ir.Model, constants: Collection[ir.Value]
 ) -> frozenset[ir.Node]:
-    """Find the nodes that positions are computed with, and the layers they come from.
+    """Find the nodes that compute positions, and the layers they come from.
 
     The same walk as :func:`find_coordinates`; it ends at layers with a weight, and goes
-    on through other products, which are projections: of two computed operands, or of
-    a camera's matrix and a table of points.
+    on through other products, which are projections: of two computed operands, or of a
+    camera's matrix and a table of points.
     """
     found: set[ir.Node] = set()
     queue = deque(value for value, _ in _positions(model.graph))

@@ -1,4 +1,4 @@
-"""What int8 saves in arithmetic and pays at its borders, and where that is a loss."""
+"""Estimate where int8 costs more at its borders than it saves in arithmetic."""
 
 import dataclasses
 import itertools
@@ -15,9 +15,8 @@ Layers = frozenset[ir.Node]
 class Join:
     """An Add or Concat: it is in int8 if a layer before it and one behind it are.
 
-    Attributes:
-        makers: the layers that its inputs come from.
-        readers: the layers that read its result.
+    ``makers`` are the layers that its inputs come from, ``readers`` those that read its
+    result.
     """
 
     makers: Layers
@@ -28,13 +27,9 @@ class Join:
 class Border:
     """A tensor where int8 may begin or end.
 
-    Attributes:
-        quantize_s: seconds to quantize it where no int8 layer makes it.
-        dequantize_s: seconds to give it in float where an int8 layer makes it.
-        makers: layers; if any of them is int8, the tensor is.
-        readers: layers that read it.
-        joins: Adds and Concats that read it.
-        read_as_float: whether anything else reads it, or it leaves the graph.
+    It is int8 if any of ``makers`` is. ``quantize_s`` is paid if no int8 layer makes
+    it, ``dequantize_s`` to convert it to float if one does; ``read_as_float`` tells
+    whether anything but layers and joins reads it, or it leaves the graph.
     """
 
     quantize_s: float
@@ -45,7 +40,7 @@ class Border:
     read_as_float: bool = False
 
     def layers(self) -> Iterator[ir.Node]:
-        """Walk all layers whose int8 decides what it costs."""
+        """Iterate over all layers whose int8 decides what it costs."""
         yield from self.makers
         yield from self.readers
         for join in self.joins:
@@ -53,7 +48,7 @@ class Border:
             yield from join.readers
 
     def paid_s(self, int8: Collection[ir.Node]) -> float:
-        """Return the seconds that go into it if exactly these layers are int8."""
+        """Return its conversion seconds if exactly these layers are int8."""
         if _some(self.makers, int8):
             stays = (
                 not self.read_as_float
@@ -70,13 +65,10 @@ class Border:
 
 @dataclasses.dataclass(frozen=True)
 class Loss:
-    """Int8 that does not pay.
+    """Int8 that does not pay, for one layer or several together.
 
-    Attributes:
-        saved_s: seconds that the layers themselves save in int8, mostly less than 0 or
-            little.
-        paid_s: seconds that quantizing and dequantizing take for their sake.
-        layers: how many layers these figures are of, together.
+    ``saved_s`` are the seconds that the layers save in int8, usually negative or small;
+    ``paid_s`` those that quantizing and dequantizing for them take.
     """
 
     saved_s: float
@@ -84,7 +76,6 @@ class Loss:
     layers: int = 1
 
     def __str__(self) -> str:
-        """Return the comparison in words."""
         whose = "" if self.layers == 1 else f" ({self.layers} layers together)"
         return (
             f"int8 would save {self.saved_s * 1e6:.1f} µs of arithmetic and take"
@@ -96,12 +87,8 @@ class Loss:
 class Costs:
     """What int8 would save and cost in one graph on one machine.
 
-    Attributes:
-        machine: whose seconds these are.
-        saved_s: seconds that each layer saves in int8, its borders apart; layers whose
-            shapes are open are not in it, and are not judged.
-        borders: the tensors where int8 may begin or end.
-        margin_s: a loss below that is not told from none: the smaller file wins.
+    Layers with open shapes are not in ``saved_s`` (seconds, without borders), and are
+    not judged. A loss below ``margin_s`` counts as none: the smaller file wins.
     """
 
     machine: str
@@ -115,17 +102,11 @@ class Costs:
         return sum(self.saved_s.get(each, 0.0) for each in int8) - paid
 
     def losses(self, int8: Iterable[ir.Node]) -> dict[ir.Node, Loss]:
-        """Find the layers that are faster in float.
+        """Find the layers that are faster in float, among those that could be int8.
 
         First one by one: a layer goes if that saves time while all others stay; its
-        neighbours are then looked at again. Then what hangs together in int8 goes if it
+        neighbours are then looked at again. Then each connected int8 region goes if it
         does not pay as a whole. Not always the best choice, but near it, and linear.
-
-        Args:
-            int8: the layers that could be int8.
-
-        Returns:
-            The layers that had better stay float.
         """
         kept = dict.fromkeys(int8)
         touching: dict[ir.Node, list[Border]] = {each: [] for each in kept}
@@ -138,6 +119,7 @@ class Costs:
     def _alone(
         self, kept: dict[ir.Node, None], touching: Mapping[ir.Node, list[Border]]
     ) -> dict[ir.Node, Loss]:
+        # a layer that goes changes the costs of its neighbours, which queue again
         found: dict[ir.Node, Loss] = {}
         waiting = deque(each for each in kept if each in self.saved_s)
         while waiting:

@@ -26,14 +26,11 @@ def find_ego_layers(
 
     A status is an input of at most 64 numbers beside a sensor's, neither recurrent nor
     made of matrices: ``can_bus`` [18], a speed, a command. Its encoder are the layers
-    that depend on statuses alone, until they meet what else the graph reads or grow to
-    more than 4,096 elements.
+    that depend on statuses alone, until they meet other data or grow to more than 4,096
+    elements.
 
-    One sweep, linear in the graph.
-
-    Args:
-        model: the graph, in topological order.
-        constants: values that no input changes.
+    One sweep over the graph, which is in topological order. ``constants`` are values
+    that no input changes.
     """
     sources = dict(_statuses(model))
     found: dict[ir.Node, str] = {}

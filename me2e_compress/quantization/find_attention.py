@@ -29,12 +29,9 @@ Test: TypeAlias = Callable[[ir.Node], bool]
 
 
 def behind(graph: ir.Graph, through: Collection[str], is_product: Test) -> Nearest:
-    """List the products that every value comes from, through some operators only.
+    """List, for every value, the products it comes from through some operators only.
 
-    Args:
-        graph: in topological order.
-        through: operators that are looked through.
-        is_product: what the search stops at.
+    The graph is in topological order.
     """
     found: dict[ir.Value, Hits] = {}
     for node in graph:
@@ -50,7 +47,7 @@ def behind(graph: ir.Graph, through: Collection[str], is_product: Test) -> Neare
 
 
 def ahead(graph: ir.Graph, through: Collection[str], is_product: Test) -> Nearest:
-    """List the products that read every value, through some operators only."""
+    """List, for every value, the products that read it through some operators only."""
     found: dict[ir.Value, Hits] = {}
     beyond: dict[ir.Node, Hits] = {}
     for node in reversed(graph):
@@ -102,12 +99,7 @@ layout."""
 
 @dataclasses.dataclass(frozen=True)
 class Attention:
-    """One attention.
-
-    Attributes:
-        queries: number of query tokens; None if that is open.
-        keys: number of key tokens; None if that is open.
-    """
+    """The numbers of query and key tokens of an attention; None if open."""
 
     queries: int | None
     keys: int | None
@@ -129,28 +121,27 @@ def find_attention(
     another which lie ahead; scaling, masks, casts and changes of layout are looked
     through. A softmax with a product behind it is an attention: that product is queries
     by keys, the one ahead weights by values. Products may be MatMul, Gemm or Einsum,
-    the softmax may be decomposed into ``Div(Exp(x), ReduceSum(Exp(x)))``. What a mask
-    is made of is told from the scores by its size. The search is linear in the graph.
+    the softmax may be decomposed into ``Div(Exp(x), ReduceSum(Exp(x)))``. A mask's own
+    products are told from the scores by their size. The search is linear in the graph.
 
-    Operators that are attention as a whole (:func:`is_fused`) are mapped too.
+    Operators that are attention as a whole (:func:`is_fused`) are mapped too. Sampling
+    weights of deformable attention come from a linear layer, not from such a product,
+    and are not attention here.
 
-    Sampling weights of deformable attention come from a linear layer, not from such a
-    product, and are not attention here.
-
-    Args:
-        model: the graph, shapes inferred, in topological order.
-        constants: values that no input changes: what multiplies one of them from the
-            left is a layer, not an attention, unless it is a batch of matrices (keys
-            that are learned or known beforehand).
+    Shapes must be inferred, and nodes in topological order. What multiplies one of
+    ``constants`` from the left is a layer, not an attention, unless it is a batch of
+    matrices (keys that are learned or known beforehand).
     """
 
     def is_product(node: ir.Node) -> bool:
         return _is_product(node, constants)
 
+    # products behind the scores, and ahead of the weights, of every softmax
     scored = behind(model.graph, _SCORES, is_product)
     weighed = ahead(model.graph, _WEIGHTS, is_product)
     found = _fused(model.graph)
     for weights, scores in _softmaxes(model.graph):
+        # a mask may have products of its own, of another size
         queries_by_keys = [
             node for node in _products(scored, scores) if _fits(node.outputs[0], scores)
         ]
@@ -167,8 +158,8 @@ def find_attention_weights(
 ) -> dict[ir.Node, str]:
     """Map every product that gives attention weights, or reads them, to the reason.
 
-    Besides both products of an attention: layers that read a softmax, as a mean
-    position over bins does.
+    Besides both products of an attention these are layers that read a softmax, as a
+    mean position over bins does.
     """
     found = dict.fromkeys(attention, "gives or reads attention weights")
     softmaxes = behind(model.graph, _WEIGHTS, lambda node: node.op_type == "Softmax")
@@ -184,7 +175,7 @@ def _products(nearest: Nearest, value: ir.Value) -> list[ir.Node]:
 
 
 def _is_product(node: ir.Node, constants: Collection[ir.Value]) -> bool:
-    """Return whether a node multiplies two things, neither of them a layer's weight.
+    """Return whether a node multiplies two values, neither of them a layer's weight.
 
     The left one may be constant: learned queries that have not met the scene yet.
     """
@@ -198,7 +189,7 @@ def _is_product(node: ir.Node, constants: Collection[ir.Value]) -> bool:
 
 
 def _fits(product: ir.Value, scores: ir.Value) -> bool:
-    """Return whether scores may be this product: as many, or as many a row."""
+    """Return whether scores may be this product's: as many, or as many per row."""
     left, right = static_shape(product), static_shape(scores)
     if not left or not right:
         widths = [(open_shape(value) or (None,))[-1] for value in (product, scores)]
@@ -208,7 +199,7 @@ def _fits(product: ir.Value, scores: ir.Value) -> bool:
 
 
 def is_fused(node: ir.Node) -> bool:
-    """Return whether a node is attention as a whole, a plugin of a library or not."""
+    """Return whether a node is attention as a whole, a library's plugin or not."""
     return node.op_type in _FUSED or node.op_type in op_types("multi-head-attention")
 
 

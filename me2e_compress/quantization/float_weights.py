@@ -1,4 +1,4 @@
-"""Weights that stay float although a graph is quantized: the largest, and why."""
+"""List weights that stay float although a graph is quantized, and why."""
 
 import dataclasses
 
@@ -14,16 +14,10 @@ _FLOATS = (ir.DataType.FLOAT, ir.DataType.FLOAT16, ir.DataType.DOUBLE)
 
 @dataclasses.dataclass(frozen=True)
 class FloatWeight:
-    """A weight that stays float.
+    """A weight that stays float, with the first node that reads it.
 
-    Attributes:
-        name: of the weight.
-        bytes: that it takes.
-        node: the first node that reads it.
-        op: the operator of that node.
-        module: its module; empty if unknown.
-        rule: that keeps it float, e.g. ``gemv``; ``target`` where the runtime does.
-        reason: the same in words.
+    ``rule`` keeps it float, e.g. ``gemv``; ``target`` if the runtime does. ``module``
+    is empty if unknown.
     """
 
     name: str
@@ -39,15 +33,14 @@ def float_weights(model: ir.Model, plan: QuantPlan) -> tuple[FloatWeight, ...]:
     """List the weights that a plan leaves in float, the largest first.
 
     A weight that any node stores as int8 is not among them, nor are biases of int8
-    layers and constants below a kilobyte.
-
-    Args:
-        model: the float graph that the plan is of.
-        plan: with what the target leaves in float.
+    layers and constants below a kilobyte. The plan must include what the target leaves
+    in float.
     """
+    # decisions by node, and those that the target does not follow
     decided = {each.output: each for each in plan.decisions}
     kept = {each.output: each.reason for each in plan.kept_float}
     found, stored = dict[str, FloatWeight](), set[str]()
+    # float weights, and those that some other node stores as int8
     for node in model.graph:
         decision = decided.get(str(node.outputs[0].name)) if node.outputs else None
         if decision is None:

@@ -1,4 +1,4 @@
-"""Find the products that geometry goes through: camera matrices, points, pixels."""
+"""Find the products that carry geometry: camera matrices, points, pixels."""
 
 import dataclasses
 import math
@@ -69,23 +69,20 @@ class _Source:
 def find_geometry(
     model: ir.Model, constants: Collection[ir.Value]
 ) -> dict[ir.Node, str]:
-    """Map every product that geometry goes through to the input that it comes from.
+    """Map every product that carries geometry to the input that it comes from.
 
     Geometry begins at inputs that are matrices (``lidar2img`` [1, 6, 4, 4], poses,
-    intrinsics), or are named like matrices and reference points. It goes through
-    arithmetic and changes of layout, however the product is batched: what multiplies a
-    matrix by points gives points, be they constant or computed, columns or rows.
+    intrinsics), or are named like matrices and reference points. It continues through
+    arithmetic and changes of layout, however the product is batched: a matrix times
+    points gives points, be they constant or computed, columns or rows.
 
     Geometry ends at the first product with a learned weight (more than 4 numbers in or
     out), which reads coordinates and is the last to be mapped; at sines and cosines,
     comparisons and samplers; and where it is added to, or multiplied by, features of
     more than 4 numbers. Layers behind these are layers like any other.
 
-    One sweep, linear in the graph.
-
-    Args:
-        model: the graph, in topological order.
-        constants: values that no input changes.
+    One sweep over the graph, which is in topological order. ``constants`` are values
+    that no input changes.
     """
     flow = _Flow(constants)
     for value in model.graph.inputs:
@@ -100,9 +97,8 @@ def find_geometry(
 class _Flow:
     """Geometry on its way through a graph.
 
-    Attributes:
-        sources: of the values that are geometry.
-        found: the products that it went through.
+    ``sources`` are those of the values that are geometry, ``found`` the products that
+    it went through.
     """
 
     def __init__(self, constants: Collection[ir.Value]) -> None:
@@ -113,7 +109,8 @@ class _Flow:
         self._inverses = op_types("inverse")
 
     def enter(self, node: ir.Node) -> None:
-        """Follow geometry, and what is learned, through one node."""
+        """Follow geometry, and learned values, through one node."""
+        # does the node read geometry, and is its result still geometry
         product = node.op_type in _PRODUCTS and is_standard(node)
         reads = node.inputs if product else _data(node)
         met = [self.sources[each] for each in reads if each in self.sources]
@@ -123,6 +120,7 @@ class _Flow:
             goes_on = self._passes(node)
         elif met and (node.op_type in _ARITHMETIC or node.op_type in self._inverses):
             goes_on = self._remains(node, reads)
+        # mark the results as geometry, or else as learned
         if goes_on:
             matrix = all(each.is_matrix for each in met) and self._alone(reads)
             if product:
@@ -162,9 +160,7 @@ class _Flow:
 def _width(product: ir.Node, *, flipped: bool) -> int | None:
     """Return how many numbers a product gives for each point.
 
-    Args:
-        product: a convolution, or a product of matrices.
-        flipped: whether points are its right operand, one a column.
+    ``flipped`` if points are its right operand, one per column.
     """
     shape = open_shape(product.outputs[0])
     if shape is None or len(shape) < 2:
@@ -220,7 +216,7 @@ def _is_stacked(value: ir.Value) -> bool:
 
 
 def depth(product: ir.Node) -> int | None:
-    """Return how many numbers a product sums over for each that it gives."""
+    """Return how many numbers a product sums over for each of its results."""
     if product.op_type in ("Gemm", "MatMul"):
         return extent(product, weight=False).depth
     if product.op_type == "Einsum":

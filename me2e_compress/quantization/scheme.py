@@ -1,4 +1,4 @@
-"""Schemes: which modules become int8."""
+"""Quantization schemes: which modules become int8."""
 
 import dataclasses
 from typing import Self
@@ -19,9 +19,7 @@ and BEV encoder, the prediction every other functional module, full their union.
 class QuantScheme:
     """A named choice of modules.
 
-    Attributes:
-        name: of the scheme; ``modules`` where the modules were listed one by one.
-        modules: which are int8, in the order of the module map.
+    ``name`` is ``modules`` if the modules were listed one by one.
     """
 
     name: str
@@ -31,12 +29,11 @@ class QuantScheme:
     def named(cls, name: str, modules: ModuleMap) -> Self:
         """Return the modules of a map whose roles a scheme names.
 
-        A scheme of one role is of a part of the graph: a map whose modules are all of
-        one role knows no part.
+        A scheme of one role needs a map that has modules of both.
 
         Raises:
-            RecipeError: no such scheme, int4 and fp8 among them.
-            ModuleMapError: the map does not tell that part from the rest.
+            RecipeError: no such scheme; int4 and fp8 are none.
+            ModuleMapError: the map has modules of one role only.
         """
         if name not in SCHEMES:
             raise RecipeError(
@@ -55,11 +52,7 @@ class QuantScheme:
 
     @classmethod
     def of(cls, chosen: tuple[str, ...], modules: ModuleMap) -> Self:
-        """Return the scheme of modules chosen by name.
-
-        Raises:
-            ModuleMapError: the map has no such module.
-        """
+        """Return the scheme of modules chosen by name."""
         for name in chosen:
             modules.module(name)
         return cls("modules", tuple(n for n in modules.names() if n in chosen))

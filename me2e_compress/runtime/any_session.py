@@ -1,4 +1,4 @@
-"""What can be run over frames: a graph, or a stack of several files."""
+"""The interface of a runnable model: a graph, or a stack of several files."""
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol
@@ -9,21 +9,21 @@ from me2e_compress.runtime.recurrence import SessionPort
 
 
 class AnySession(Protocol):
-    """A model that is ready to run, in however many files it comes."""
+    """A model that is ready to run, stored in one file or several."""
 
     @property
     def provider(self) -> Provider:
-        """What runs it."""
+        """The execution provider that runs the model."""
         ...
 
     @property
     def inputs(self) -> Mapping[str, SessionPort]:
-        """By name, what must be fed, in order."""
+        """The inputs by name, in order."""
         ...
 
     @property
     def outputs(self) -> Mapping[str, SessionPort]:
-        """By name, what comes out, in order."""
+        """The outputs by name, in order."""
         ...
 
     @property
@@ -37,10 +37,9 @@ class AnySession(Protocol):
         ...
 
     def first_state(self, held: Mapping[str, Array]) -> dict[str, Array]:
-        """Return what the recurrent inputs hold where a scene begins.
+        """Return the recurrent inputs for the start of a scene.
 
-        Args:
-            held: what a frame says of them; it wins.
+        Arrays in ``held``, which come from the frame, take precedence.
 
         Raises:
             GraphError: an input of unknown shape has no first value.
@@ -54,15 +53,15 @@ class AnySession(Protocol):
         *,
         first: bool = False,
     ) -> dict[str, Array]:
-        """Run once.
+        """Run one inference.
 
         Args:
             feeds: one array for every input; other names are ignored.
-            outputs: which to return; None for all.
+            outputs: the outputs to return; None returns all.
             first: whether a scene begins here; it decides which files of a stack run.
 
         Raises:
-            FramesError: an input is missing, or has not the type or shape it must.
+            FramesError: an input is missing or has the wrong type or shape.
             GraphError: a node failed on these inputs.
         """
         ...

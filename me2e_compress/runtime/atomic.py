@@ -1,4 +1,4 @@
-"""Files that are either whole or not there."""
+"""Write files atomically."""
 
 import json
 import os
@@ -10,10 +10,9 @@ from me2e_compress import drafts
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file all or nothing: a draft in the same folder takes its place.
+    """Write a file atomically: a draft in the same folder is renamed to it.
 
-    Raises:
-        OSError: The folder is missing, not writable or full; nothing is left behind.
+    An OSError (folder missing, not writable, or full) leaves nothing behind.
     """
     with drafts.naming(path):
         handle, draft = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -30,6 +29,6 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_json(path: Path, record: dict[str, Any], indent: int | None = None) -> None:
-    """Write a JSON file all or nothing; the same record gives the same bytes."""
+    """Write a JSON file atomically; the same record gives the same bytes."""
     text = json.dumps(record, indent=indent, allow_nan=False, ensure_ascii=False)
     write_bytes(path, f"{text}\n".encode())

@@ -1,4 +1,4 @@
-"""Where the time of an inference goes: by module and by operator."""
+"""Divide the time of an inference by module and by operator."""
 
 import dataclasses
 import json
@@ -20,21 +20,21 @@ from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay
 
 MOST_EVENTS = 200_000
-"""Nodes times inferences that are recorded: onnxruntime holds half a kilobyte of each
+"""Most nodes times inferences to record: onnxruntime holds half a kilobyte for each
 until the end, and drops those beyond a million."""
 BETWEEN = "(between nodes)"
-"""What an inference takes beside its nodes; the profiler's own work is in it."""
+"""Time of an inference outside of its nodes, including the profiler's own work."""
 NOWHERE = "(no module)"
 _KERNEL = "_kernel_time"
 
 
 @dataclasses.dataclass(frozen=True)
 class Breakdown:
-    """The time of every inference, divided in two ways; each way adds up to all of it.
+    """The time of every inference, divided in two ways that each add up to the total.
 
     Attributes:
-        modules_us: by module, most first; nodes of none are under :data:`NOWHERE`,
-            what is outside of nodes under :data:`BETWEEN`.
+        modules_us: by module, largest first; nodes without a module are under
+            :data:`NOWHERE`, time outside of nodes is under :data:`BETWEEN`.
         operators_us: by operator as it runs: ``FusedConv``, ``QGemm``.
     """
 
@@ -46,11 +46,7 @@ class Breakdown:
 class NodeRun:
     """One node in one inference.
 
-    Attributes:
-        name: of the node that runs.
-        operator: of it.
-        begin_us: when it began, on the profiler's clock.
-        taken_us: how long it took, nodes of its bodies included.
+    ``begin_us`` is on the profiler's clock; ``taken_us`` includes nodes of its bodies.
     """
 
     name: str
@@ -72,22 +68,12 @@ def break_down(
 ) -> Breakdown:
     """Run a model under onnxruntime's profiler, its recurrent state fed forward.
 
-    A node that onnxruntime's optimizer made counts where the node counts that it
-    stands for.
-
-    Args:
-        model: the graph; it stays as it is.
-        module_of: the module of a node of it.
-        frames: what it sees, repeated as often as it takes.
-        runs: inferences that count; fewer where that is more than
-            :data:`MOST_EVENTS`.
-        warm_up: inferences before.
-        threads: of onnxruntime.
-        provider: what runs it; its nodes must run on the CPU.
-        on_run: called with inferences done and to do.
+    Time of a node that onnxruntime's optimizer made goes to the node that it replaces.
+    ``frames`` repeat as often as needed; ``runs`` inferences count after ``warm_up``
+    ones, fewer where that exceeds :data:`MOST_EVENTS`.
 
     Raises:
-        ProviderError: the provider runs nodes elsewhere.
+        ProviderError: the provider runs nodes elsewhere than on the CPU.
         GraphError: the model cannot be run.
         FramesError: a frame does not fit.
     """
@@ -95,6 +81,7 @@ def break_down(
         raise ProviderError(
             f"provider {provider.name}: times of nodes are measured on the CPU alone"
         )
+    # Map the optimized nodes back to the modules of the nodes that they replace.
     source = with_unique_names(model)
     modules = {
         str(copy.name): module_of(node)
@@ -103,6 +90,7 @@ def break_down(
     found = optimized(source, provider)
     made_of = origins(source, found)
     places = {name: modules[str(node.name)] for name, node in made_of.items()}
+    # Record no more events than the profiler can hold.
     wanted = max(1, min(runs, MOST_EVENTS // max(1, len(found.graph))))
     with tempfile.TemporaryDirectory(prefix="me2e-profile-") as folder:
         session = Session(
@@ -119,7 +107,7 @@ def _profiled(
     warm_up: int,
     on_run: Callable[[int, int], None],
 ) -> list[tuple[int, list[NodeRun]]]:
-    """Run a session that records its nodes; read what the wanted inferences took."""
+    """Run a profiled session; return the times of the wanted inferences."""
     endless = chain.from_iterable(repeat(frames))
     replayed = islice(replay(session, endless), warm_up + wanted)
     for done, _ in enumerate(replayed, 1):
@@ -129,13 +117,10 @@ def _profiled(
 
 
 def node_runs(lines: Iterable[str]) -> Iterator[tuple[int, list[NodeRun]]]:
-    """Read what onnxruntime's profiler wrote, an event a line.
+    """Yield the microseconds and the nodes, in order, of each profiled inference.
 
-    Nodes in the body of an If, Loop or Scan are left out: the node that has the body
-    includes them.
-
-    Yields:
-        Of every inference its time in microseconds, and its nodes in their order.
+    ``lines`` is what onnxruntime's profiler wrote, one event a line. Nodes in the body
+    of an If, Loop or Scan are left out: the node that has the body includes their time.
     """
     nodes: list[NodeRun] = []
     for line in lines:
@@ -163,7 +148,7 @@ def _event(line: str) -> dict[str, Any]:
 def _divided(
     runs: Sequence[tuple[int, Sequence[NodeRun]]], places: Mapping[str, str]
 ) -> Breakdown:
-    """Add up the nodes of every inference by module, and by operator."""
+    """Add up the node times of every inference by module and by operator."""
     modules, operators = _Sums(len(runs)), _Sums(len(runs))
     for index, (taken_us, nodes) in enumerate(runs):
         for node in nodes:
@@ -176,7 +161,7 @@ def _divided(
 
 
 class _Sums:
-    """Sums by name and inference."""
+    """Sums of time by name, one for each inference."""
 
     def __init__(self, runs: int) -> None:
         self._sums = defaultdict[str, Any](lambda: np.zeros(runs, np.int64))
@@ -185,7 +170,7 @@ class _Sums:
         self._sums[name][run] += taken_us
 
     def found(self) -> Microseconds:
-        """Return the sums, the largest share first, what is between nodes last."""
+        """Return the sums, the largest first and :data:`BETWEEN` last."""
         order = sorted(
             self._sums.items(), key=lambda item: (item[0] == BETWEEN, -item[1].sum())
         )

@@ -1,6 +1,6 @@
-"""Run a script and end with the parent: ``python -P child_main.py SCRIPT WORDS``.
+"""Run a script and exit with the parent: ``python -P child_main.py SCRIPT WORDS``.
 
-It imports nothing of the package: the script shall start at once.
+It imports nothing of the package, so that the script starts at once.
 """
 
 import os
@@ -9,12 +9,12 @@ import sys
 import threading
 
 PR_SET_PDEATHSIG = 1
-"""Of prctl(2): a signal of one's own for the end of the parent."""
+"""Option of prctl(2): the signal to receive when the parent dies."""
 SIGKILL = 9
 
 
 def main() -> None:
-    """Watch the parent, run the script."""
+    """Watch the parent and run the script."""
     if sys.platform == "linux":  # native code that holds Python's lock ends, too
         import ctypes
 
@@ -25,7 +25,7 @@ def main() -> None:
 
 
 def _wait_for_parent() -> None:
-    """End this process when its input does, which the parent holds open."""
+    """Exit when standard input closes; the parent holds it open."""
     while os.read(0, 1):
         pass
     os._exit(1)

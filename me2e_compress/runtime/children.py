@@ -1,4 +1,4 @@
-"""Child processes: none runs code of the current folder, none outlives its parent.
+"""Child processes that run no code of the current folder and never outlive the parent.
 
 Every process of this package is started here, or within :func:`sheltered`.
 """
@@ -18,17 +18,17 @@ from pathlib import Path
 from me2e_compress.runtime import child_main
 
 _TRACKER_IS_SILENT = "ignore::UserWarning:multiprocessing.resource_tracker"
-"""It clears locks away where this process was killed, and need not say so."""
+"""Silences the warning about locks that the tracker cleans up after a kill."""
 _STARTING = threading.RLock()
 
 
 @contextlib.contextmanager
 def sheltered() -> Iterator[None]:
-    """Start processes in this block so that they hear no Ctrl-C and look around less.
+    """Start processes in this block without Ctrl-C and without the current folder.
 
-    Python looks for the modules of a new process in the current folder first, be it
-    ``pickle`` or ``numpy``. And a terminal sends Ctrl-C to all processes at once: only
-    the parent shall hear it, and ends the others.
+    Python looks for the modules of a new process in the current folder first, even for
+    ``pickle`` or ``numpy``. A terminal sends Ctrl-C to all processes at once: only the
+    parent should receive it, and it ends the others.
     """
     with _STARTING, _told("PYTHONSAFEPATH", "1"):
         if os.name == "posix":
@@ -40,7 +40,7 @@ def sheltered() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _told(name: str, value: str) -> Iterator[None]:
-    """Set a variable of the environment, for the processes that start meanwhile."""
+    """Set an environment variable for processes that start in this block."""
     before = os.environ.get(name)
     os.environ[name] = value
     try:
@@ -54,7 +54,7 @@ def _told(name: str, value: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _deaf_to_interrupts() -> Iterator[None]:
-    """Block Ctrl-C in this thread: processes that it starts inherit that."""
+    """Block Ctrl-C in this thread; processes that it starts inherit the mask."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -69,25 +69,25 @@ class ShelteredProcess(SpawnProcess):
     """A spawned process that starts within :func:`sheltered`."""
 
     def start(self) -> None:
-        """Start it."""
+        """Start the process within :func:`sheltered`."""
         with sheltered():
             super().start()
 
 
 class ShelteredContext(SpawnContext):
-    """The context ``spawn``, its processes sheltered."""
+    """The context ``spawn`` with sheltered processes."""
 
     Process = ShelteredProcess
 
 
 def spawn_context() -> ShelteredContext:
-    """Return the context that every process is started from."""
+    """Return the context from which every process is started."""
     with sheltered():  # starts what watches over the context's locks
         return ShelteredContext()
 
 
 def end_with_parent() -> None:
-    """End this spawned process when its parent does; leave Ctrl-C to the parent."""
+    """Exit this spawned process when its parent exits; leave Ctrl-C to the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     if parent is None:
@@ -102,7 +102,7 @@ def end_with_parent() -> None:
 
 @contextlib.contextmanager
 def killed_on_error() -> Iterator[None]:
-    """Kill the processes that were started in this block if an error leaves it."""
+    """Kill the processes started in this block if an error leaves it."""
     others = set(active_children())
     try:
         yield
@@ -114,7 +114,7 @@ def killed_on_error() -> Iterator[None]:
 
 @contextlib.contextmanager
 def pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Open a pool of processes, which ends with this block, however it is left."""
+    """Open a pool of processes that ends with this block in every case."""
     made = ProcessPoolExecutor(workers, spawn_context(), end_with_parent)
     try:
         with killed_on_error():
@@ -128,16 +128,8 @@ def run_script(
 ) -> "subprocess.CompletedProcess[str]":
     """Run a Python file, which imports nothing of this package, to its end.
 
-    Args:
-        script: the file.
-        words: its arguments.
-        timeout_s: seconds that it may take; None for any.
-
-    Returns:
-        Its exit code, and what it wrote.
-
     Raises:
-        subprocess.TimeoutExpired: it took longer, and was killed.
+        subprocess.TimeoutExpired: it took longer than ``timeout_s`` and was killed.
     """
     command = [sys.executable, "-P", child_main.__file__, str(script), *words]
     ear, mouth = os.pipe()  # nothing is ever said: it ends when this process does

@@ -1,4 +1,4 @@
-"""The values of a graph that no input reaches, computed by onnxruntime."""
+"""Compute the constant values of a graph with onnxruntime."""
 
 from collections.abc import Sequence
 
@@ -10,11 +10,7 @@ from me2e_compress.runtime.session import run_once
 
 
 def evaluate_constants(model: ir.Model, names: Sequence[str]) -> dict[str, Array]:
-    """Compute constant values of a graph.
-
-    Args:
-        model: the graph; it stays as it is.
-        names: values that :func:`~me2e_compress.graph.nodes.constant_values` lists.
+    """Compute values that :func:`~me2e_compress.graph.nodes.constant_values` lists.
 
     Raises:
         GraphError: onnxruntime cannot compute them.
@@ -22,6 +18,7 @@ def evaluate_constants(model: ir.Model, names: Sequence[str]) -> dict[str, Array
     """
     if not names:
         return {}
+    # Cut a copy of the graph down to the wanted values and run it.
     part = model.clone()
     part.metadata_props.clear()  # it speaks of inputs and outputs that go
     made = {str(each.name): each for node in part.graph for each in node.outputs}

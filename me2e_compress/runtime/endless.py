@@ -1,4 +1,4 @@
-"""Loops that constants alone keep going: native code runs them, and hears no signal."""
+"""Detect Loop nodes that never end: native code runs them and ignores signals."""
 
 import math
 from collections.abc import Iterable
@@ -8,13 +8,13 @@ import onnx_ir as ir
 from me2e_compress.graph.nodes import array_of, bodies_of, input_at, is_standard, maker
 
 MOST_ROUNDS = 1 << 24
-"""Of a loop and those around it: a round takes 5 us at least."""
+"""Most iterations of a loop times those around it: one takes at least 5 us."""
 
 
 def endless(model: ir.Model) -> str | None:
-    """Say which loop of a graph would not end, or after minutes; None if none is known.
+    """Describe a loop that would run for minutes or forever; None if none is known.
 
-    A loop that may end by what it computes is none of them.
+    Loops whose condition is computed at run time are not reported.
     """
     for nodes in (model.graph, *model.functions.values()):
         if (node := _endless(nodes, 1)) is not None:
@@ -37,12 +37,13 @@ def _endless(nodes: Iterable[ir.Node], rounds: float) -> ir.Node | None:
 
 
 def _rounds(node: ir.Node) -> float:
-    """Return how often the body of a loop runs, if constants alone say so; else 1."""
+    """Return the iterations of a loop if constants alone decide them; else 1."""
     if node.op_type != "Loop" or not is_standard(node):
         return 1
     (body,) = bodies_of(node)
     if len(body.inputs) < 2 or not body.outputs:
         return 1
+    # Both conditions must be constantly true, or passed through unchanged.
     goes_on = _origin(body.outputs[0])
     first = input_at(node, 1)
     if first is not None and not _is_true(first):
@@ -62,7 +63,7 @@ def _is_true(value: ir.Value) -> bool:
 
 
 def _origin(value: ir.Value) -> ir.Value:
-    """Look through Identity nodes."""
+    """Follow a value back through Identity nodes."""
     while (node := maker(value, "Identity")) is not None and node.inputs[0]:
         value = node.inputs[0]
     return value

@@ -1,8 +1,8 @@
-"""A graph is opened in a process of its own first: onnxruntime may die of it.
+"""Open a graph in a separate process first, because onnxruntime may crash on it.
 
-Native code that divides the least integer by -1, or runs out of stack, takes its
-process down without a word. What a graph did is remembered by its digest: the same one
-is not tried again on this machine.
+Native code that divides the least integer by -1, or overflows the stack, kills its
+process without a message. The verdict on a graph is stored by its digest: the same
+graph is not tried again on this machine.
 """
 
 import contextlib
@@ -44,24 +44,24 @@ def try_apart(
     memory: Path | None = None,
     on_begin: Callable[[], None] = lambda: None,
 ) -> float:
-    """Open a graph, and run it once, in a process of its own, if it is a new one.
+    """Open a graph, and run it once, in a separate process, unless it is known.
 
-    Opening takes 0.3 s and what a session takes; running one inference more. A graph
-    that onnxruntime refuses passes here: whoever opens it then says why.
+    Opening takes 0.3 s more than a session takes; running adds one inference. A graph
+    that onnxruntime refuses passes here: whoever opens it next reports why.
 
     Args:
-        model: the graph; it stays as it is.
-        name: what messages call it.
-        file: that holds this very graph; None writes it to a temporary one.
-        feeds: inputs to run it once on; recurrent ones may be missing. None only opens.
+        model: the graph; it is not changed.
+        name: name of the graph in messages.
+        file: a file that holds this very graph; None writes it to a temporary one.
+        feeds: inputs for one run; recurrent ones may be missing. None only opens.
         memory: folder of verdicts; None takes the user's cache folder.
-        on_begin: called if the graph is a new one.
+        on_begin: called if the graph is new.
 
     Returns:
-        Seconds that it took; 0 where the graph is known.
+        The seconds taken; 0 where the graph is known.
 
     Raises:
-        GraphError: the process died; the message names the graph, the step and the
+        GraphError: the process died; the message has the graph, the step and the
             signal.
     """
     begun = perf_counter()
@@ -71,6 +71,7 @@ def try_apart(
         ready, needed = compiled_or_expanded(model, compiled=why_not() is None)
     except GraphError:
         return 0.0
+    # A verdict holds for this graph, onnxruntime and these kernels.
     kernels = [each.op_type for each in needed]
     folder = memory or platformdirs.user_cache_path("me2e-compress") / "opened"
     opened, ran = (folder / f"{each}.json" for each in _fingerprints(model, kernels))
@@ -78,6 +79,7 @@ def try_apart(
     if _is_known(verdict) or _is_known(ran):
         return 0.0
     on_begin()
+    # Run the script on a file of the graph and of its inputs.
     with tempfile.TemporaryDirectory(prefix="me2e-opening-") as scratch:
         inputs = Path(scratch) / "inputs.npz"
         _save(feeds or {}, inputs)
@@ -87,6 +89,7 @@ def try_apart(
         steps = "open" if feeds is None else "run"
         words = [str(file), str(inputs), steps, ",".join(kernels), *CPU.left_out]
         done = run_script(_SCRIPT, words)
+    # A script that died of a signal is a crash; store the rest.
     if done.returncode not in _REFUSED:
         step = (done.stdout.split() or ["start"])[-1]
         raise GraphError(f"{name}: onnxruntime {_end(done.returncode)} at step {step}")
@@ -98,7 +101,7 @@ def try_apart(
 
 
 def _fingerprints(model: ir.Model, kernels: Sequence[str]) -> Iterator[str]:
-    """Name a graph that was opened, and one that was run, by this onnxruntime."""
+    """Yield the digests of an opened and of a run graph, for this onnxruntime."""
     how = (CPU.native, *CPU.left_out, *kernels)
     known = (graph.digest(model), ort.__version__, *how)
     for step in ("opened", "ran"):
@@ -106,12 +109,12 @@ def _fingerprints(model: ir.Model, kernels: Sequence[str]) -> Iterator[str]:
 
 
 def _save(feeds: Mapping[str, Array], path: Path) -> None:
-    """Write arrays by number, their names before them: any name is allowed."""
+    """Write arrays by number, and their names first, so that any name is allowed."""
     np.savez(path, np.array(list(feeds), np.str_), *feeds.values(), allow_pickle=False)
 
 
 def _is_known(verdict: Path) -> bool:
-    """Return whether a graph survived before; a verdict that is no JSON is none."""
+    """Return whether the graph survived before; unreadable verdicts do not count."""
     try:
         found: object = json.loads(verdict.read_bytes())
     except (OSError, ValueError, RecursionError):
@@ -120,7 +123,7 @@ def _is_known(verdict: Path) -> bool:
 
 
 def _end(code: int) -> str:
-    """Say how a process died."""
+    """Describe how a process died."""
     if code == -signal.SIGKILL:
         return "was killed (out of memory?)"
     if code < 0:

@@ -1,4 +1,4 @@
-"""Frames: what a model sees at one moment."""
+"""Frames: the inputs of a model at one moment."""
 
 import dataclasses
 import zipfile
@@ -25,7 +25,7 @@ UNREADABLE = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""What numpy and zipfile raise of a file of arrays that is none."""
+"""What numpy and zipfile raise on a file that holds no valid arrays."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -36,8 +36,9 @@ class Frame:
         index: position in the recording, from 0.
         starts_scene: True where a new scene begins: recurrent state is reset here.
         arrays: one array for every input, by input name; recurrent ones may be missing.
-        place: of its scene among those that its source tried; some give no frame.
-        future: what really happened next; None where nobody recorded it.
+        place: number of its scene among those that its source tried; some give no
+            frame.
+        future: what really happened next; None where it was not recorded.
     """
 
     index: int
@@ -47,7 +48,7 @@ class Frame:
     future: RecordedFuture | None = None
 
     def __repr__(self) -> str:
-        """Show index and shapes, not the pictures."""
+        """Show the index and the shapes, not the arrays."""
         shapes = (f"{name} {list(each.shape)}" for name, each in self.arrays.items())
         starts = ", starts a scene" if self.starts_scene else ""
         return f"<Frame: {self.index}{starts}; {', '.join(shapes)}>"

@@ -1,10 +1,9 @@
-"""Fused nodes of a graph that is to be opened: their bodies, with compiled kernels.
+"""Replace the fused nodes of a graph by compiled kernels or by their bodies.
 
-A node is replaced by its body, in which compiled kernels are called, where there are
-any, in a domain that belongs to them. So nothing depends on whether onnxruntime prefers
-a function of the file or a registered operator of the same name, and no library of
-anybody else can claim a kernel's name or domain (which onnxruntime refuses as set
-twice).
+A node is replaced by its body, which calls compiled kernels where there are any, in a
+domain of their own. So nothing depends on whether onnxruntime prefers a function of
+the file or a registered operator of the same name, and no other library can register
+the same name and domain twice, which onnxruntime refuses.
 """
 
 import functools
@@ -31,7 +30,7 @@ _COMPILED = {each.op_type: each for each in kernels.KERNELS}
 
 @functools.cache
 def known_operators() -> frozenset[tuple[str, str]]:
-    """List the (domain, operator) pairs that are known; ai.onnx is written ``""``."""
+    """List the known (domain, operator) pairs; ai.onnx is written ``""``."""
     return frozenset(
         ("" if schema.domain == "ai.onnx" else schema.domain, schema.name)
         for schema in _native.get_all_operator_schema()
@@ -39,9 +38,9 @@ def known_operators() -> frozenset[tuple[str, str]]:
 
 
 def unknown_nodes(model: ir.Model) -> Iterator[ir.Node]:
-    """Walk the nodes that onnxruntime does not know and that have no body in the file.
+    """Yield the nodes that onnxruntime does not know and that have no body in the file.
 
-    Those of the toolkit's own form have a compiled kernel though they may have a body.
+    Nodes in the toolkit's own domain are included although they may have a body.
     """
     known = known_operators()
     for where in (*model.graphs(), *model.functions.values()):
@@ -58,17 +57,14 @@ def runnable(
 ) -> ir.Model:
     """Return a graph whose fused nodes onnxruntime can run with these options.
 
-    Args:
-        model: the graph; it stays as it is.
-        options: are told of the kernels that the graph needs.
-        provider: what runs the session. Kernels are for the CPU; what a library of
-            the user names is left to that library.
+    The kernels that it needs are registered in ``options``. Kernels are for the CPU;
+    operators that a library of the user implements are left to that library.
 
     Returns:
         The graph itself, where it has no fused nodes, or a copy.
 
     Raises:
-        GraphError: a fused node is not used as its operator must be.
+        GraphError: a fused node is not used as its operator requires.
     """
     compiled = provider.native == CPU.native and kernels.why_not() is None
     theirs = provider.claims
@@ -90,18 +86,18 @@ def compiled_or_expanded(
     compiled: bool,
     theirs: Callable[[str], bool] = lambda op_type: False,
 ) -> tuple[ir.Model, tuple[kernels.CompiledKernel, ...]]:
-    """Put kernels, or bodies, in the place of the fused nodes.
+    """Replace the fused nodes by kernels or by bodies.
 
     Args:
-        model: the graph; it stays as it is.
+        model: the graph; it is not changed.
         compiled: whether kernels may be used.
-        theirs: whether an operator is to be left as it is.
+        theirs: returns whether an operator is to be left as it is.
 
     Returns:
         A copy, or the graph itself if it has no fused nodes; and the kernels in it.
 
     Raises:
-        GraphError: a fused node is not used as its operator must be.
+        GraphError: a fused node is not used as its operator requires.
     """
     names = {node.op_type for node in unknown_nodes(model) if is_fused(node)}
     ours = {name for name in sorted(names) if not theirs(name)}
@@ -110,6 +106,7 @@ def compiled_or_expanded(
     copy = model.clone()
     if any(_is_bare(node) for node in unknown_nodes(copy) if node.op_type in ours):
         graph.infer_shapes(copy)  # the file does not say what bodies have to know
+    # Expand the fused nodes; bodies may call kernels.
     taken = value_names(copy.graph)
     try:
         for node in list(unknown_nodes(copy)):
@@ -135,7 +132,7 @@ def is_fused(node: ir.Node) -> bool:
 
 
 def _is_bare(node: ir.Node) -> bool:
-    """Return whether the type or the rank of an input is not known."""
+    """Return whether the type or the rank of an input is unknown."""
     return any(
         value is not None and (value.type is None or value.shape is None)
         for value in node.inputs
@@ -143,7 +140,7 @@ def _is_bare(node: ir.Node) -> bool:
 
 
 def _expand(node: ir.Node, model: ir.Model, names: set[str], compiled: bool) -> None:
-    """Write a node as its body, unless it has one in the file that may run."""
+    """Replace a node by its body, unless the file has one that may run."""
     if node.op_identifier() in model.functions and not compiled:
         return
     opset, taken = _opset(node, model), _names(node, names)

@@ -1,11 +1,11 @@
-"""Latencies and power that other tools wrote, found by what a file holds.
+"""Read latencies and power that other tools wrote; the content tells the format.
 
 * ``trtexec --exportTimes``: a list of inferences with ``latencyMs`` (copying in,
   computing, copying out; TensorRT's ``samples/common/sampleReporting.cpp``);
-* ``trtexec --exportProfile``: ``count``, then layers with ``averageMs``: no inference
-  by itself, so the average of them all is one sample;
+* ``trtexec --exportProfile``: ``count``, then layers with ``averageMs``: there are no
+  single inferences, so the sum of the averages is one sample;
 * a latency trace of our own, made elsewhere;
-* the log of ``tegrastats``: milliwatts of the rails of a Jetson; it has no latencies.
+* the log of ``tegrastats``: milliwatts of the rails of a Jetson, without latencies.
 """
 
 import re
@@ -26,20 +26,20 @@ FORMATS = (
     " expected"
 )
 _RAIL = re.compile(r"\b([A-Z][A-Z0-9_]*) (\d+)mW/\d+mW")
-"""Now and on average; newer releases leave the unit out of neither."""
+"""Present and average milliwatts; newer releases also print both units."""
 _LONGEST_MS = 1e9
 
 
 @dataclass(frozen=True)
 class Imported:
-    """What files of other tools say.
+    """What was read from files of other tools.
 
     Attributes:
-        samples_us: One an inference; empty where none are told.
-        layers_us: What each layer takes on average.
-        rails_w: Watts of each rail, one a line of the log.
-        machine: That is named; empty if none is.
-        sources: What each file is, in words.
+        samples_us: one latency for each inference; empty if unknown.
+        layers_us: average time of each layer.
+        rails_w: watts of each rail, one for each line of the log.
+        machine: the machine, if a file names it.
+        sources: description of each file.
     """
 
     samples_us: tuple[int, ...] = ()
@@ -50,7 +50,7 @@ class Imported:
 
     @property
     def power(self) -> tuple[str, ...]:
-        """Each rail's mean and peak, in words; the input rail holds the others."""
+        """The mean and peak of each rail; the input rail includes all others."""
         return tuple(
             f"{name}: {fmean(watts):.2f} W on average, {max(watts):.2f} W at most, over"
             f" {len(watts)} samples (tegrastats)"
@@ -59,11 +59,10 @@ class Imported:
 
 
 def read_imports(paths: Sequence[Path]) -> Imported:
-    """Read files of other tools, at most one that tells latencies of inferences.
+    """Read files of other tools, at most one of each kind.
 
     Raises:
-        EvaluationError: A file is missing, broken or of another kind, two tell the
-            same, or none tells a latency.
+        EvaluationError: a file is not valid, two hold the same, or none has a latency.
     """
     found = Imported()
     for path in paths:
@@ -81,7 +80,7 @@ def read_import(path: Path) -> Imported:
     """Read one file.
 
     Raises:
-        EvaluationError: It is missing, broken or of another kind.
+        EvaluationError: the file is missing, malformed or of another kind.
     """
     try:
         content = documents.content(path)
@@ -96,6 +95,7 @@ def read_import(path: Path) -> Imported:
     if isinstance(found, dict):
         trace = LatencyTrace.load(path)
         return Imported(trace.samples_us, machine=trace.machine, sources=("a trace",))
+    # A list is trtexec's; a profile begins with a count.
     first = next((each for each in found if isinstance(each, dict)), {})
     try:
         return _profile(found) if "count" in first else _times(found)
@@ -128,7 +128,7 @@ def _times(found: list[object]) -> Imported:
 
 
 def _profile(found: list[object]) -> Imported:
-    """Sum layers of one name: trtexec repeats names of loops."""
+    """Sum layers of the same name: trtexec repeats the names in loops."""
     layers = dict[str, int]()
     for each in _LAYERS.validate_python(found[1:]):
         layers[each.name] = layers.get(each.name, 0) + round(1e3 * each.averageMs)

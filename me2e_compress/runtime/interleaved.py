@@ -1,4 +1,4 @@
-"""Interleaved timing: models measured in turn, so that noise falls on all of them."""
+"""Interleaved timing: models measured in turn, so that noise affects all of them."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,32 +22,28 @@ from me2e_compress.runtime.session import replay
 from me2e_compress.runtime.stack.split_stack import digest_of_files
 
 BLOCK = 10
-"""Inferences of one model in a row: as warm as alone, and a noise that lasts a second
-falls on all models."""
+"""Inferences of one model in a row: caches stay warm, and noise that lasts a second
+affects all models."""
 RE_WARM = 2
-"""Inferences at the start of a block that do not count: the caches are another's."""
+"""Uncounted inferences at the start of a block: the caches hold another model's
+data."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RunTimes:
-    """Times of one model, round by round.
-
-    Attributes:
-        wall_s: seconds on the clock.
-        cpu_s: seconds of CPU, all threads together.
-    """
+    """Times of one model, one for each round; CPU time adds up all threads."""
 
     wall_s: tuple[float, ...]
     cpu_s: tuple[float, ...]
 
     @property
     def median_wall_s(self) -> float:
-        """Median wall time, seconds."""
+        """The median wall time in seconds."""
         return median(self.wall_s)
 
     @property
     def best_wall_s(self) -> float:
-        """Least wall time, seconds: that of an idle machine."""
+        """The least wall time in seconds: that of an idle machine."""
         return min(self.wall_s)
 
 
@@ -57,13 +53,11 @@ def time_interleaved(
     rounds: int,
     on_run: Callable[[int, int, str], None] | None = None,
 ) -> dict[str, RunTimes]:
-    """Time one frame of every model in turn, A B C A B C, after a round unmeasured.
+    """Time one frame of every model in turn, A B C A B C, after one uncounted round.
 
-    Args:
-        sessions: the models by name, all with the same number of threads.
-        frames: the first one is run, with recurrent state at zeros.
-        rounds: how often each is measured.
-        on_run: called with runs done, runs in all and the model's name.
+    All models should have the same number of threads. Only the first frame is run, with
+    recurrent state at zeros; ``on_run`` is called with runs done, all runs, and the
+    name.
     """
     wall: dict[str, list[float]] = {name: [] for name in sessions}
     cpu: dict[str, list[float]] = {name: [] for name in sessions}
@@ -91,24 +85,17 @@ def record_traces(
     provider: Provider = CPU,
     on_sample: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> dict[str, LatencyTrace]:
-    """Record the latency of models, each warm and alone, block by block in turn.
+    """Record the latency of models, each warm, in alternating blocks.
 
     Recurrent state is fed forward and reset where scenes begin; the recording is
-    repeated as often as it takes.
-
-    Args:
-        models: ONNX files, or TOMLs of stacks, by name.
-        frames: the recording.
-        samples: latencies of each model.
-        warm_up: inferences of each before the first block.
-        threads: of onnxruntime.
-        provider: what runs them.
-        on_sample: called with samples done, samples in all and the model's name.
+    repeated as often as needed. ``models`` holds ONNX files or TOML files of stacks;
+    ``samples`` and ``warm_up`` count for each model; ``on_sample`` is called with
+    samples done, all samples and the model's name.
 
     Raises:
         EvaluationError: there is nothing to measure.
         GraphError: a model cannot be run.
-        ProviderError: the provider is not there.
+        ProviderError: the provider is not available.
         FramesError: a frame does not fit.
     """
     check_work(samples, warm_up, frames)
@@ -116,6 +103,7 @@ def record_traces(
         name: TimedSession(path, threads=threads, provider=provider)
         for name, path in models.items()
     }
+    # Every model replays the recording endlessly, and warms up.
     runs = {
         name: replay(session, chain.from_iterable(repeat(frames)))
         for name, session in sessions.items()
@@ -123,6 +111,7 @@ def record_traces(
     kept = {name: list[int]() for name in models}
     for run in runs.values():
         _advance(run, warm_up)
+    # Measure block by block, and discard the start of each.
     total = samples * len(models)
     with OthersLoad() as others:
         for done in range(0, samples, BLOCK):
@@ -141,7 +130,7 @@ def record_traces(
 
 
 def describe_machine(threads: int, provider: Provider = CPU) -> str:
-    """Return the machine of `record_traces`, in words: processor, threads, provider."""
+    """Describe the machine of `record_traces`: processor, threads, provider."""
     return f"{machine_words(threads, provider)}, in turn"
 
 

@@ -1,4 +1,4 @@
-"""Latencies of a model as they were measured on one machine."""
+"""Latencies of a model measured on one machine."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,21 +17,20 @@ from me2e_compress.runtime.others_load import Load
 PERCENTILES = (50, 90, 99)
 
 Microseconds: TypeAlias = Mapping[str, tuple[int, ...]]
-"""By name, one number an inference."""
+"""Microseconds by name, one for each inference."""
 
 
 @dataclass(frozen=True)
 class TimeShare:
-    """What one part of a model takes of its time.
+    """The share of one part in a model's time.
 
     Attributes:
-        name: of a module or an operator.
-        share: of the whole, 0 to 1.
-        p50_us: microseconds; None where there are too few for one beyond it; so with
-            the others.
-        p90_us: see there.
-        p99_us: see there.
-        max_us: of the slowest inference.
+        name: name of a module or an operator.
+        share: share of the whole, 0 to 1.
+        p50_us: microseconds; None where there are too few samples, as for the others.
+        p90_us: 90th percentile.
+        p99_us: 99th percentile.
+        max_us: time in the slowest inference.
     """
 
     name: str
@@ -43,7 +42,7 @@ class TimeShare:
 
 
 def shares(parts: Microseconds) -> tuple[TimeShare, ...]:
-    """Return what each part takes, over all inferences."""
+    """Return the share of each part over all inferences."""
     whole = max(1, sum(map(sum, parts.values())))
     return tuple(
         TimeShare(
@@ -59,7 +58,7 @@ def shares(parts: Microseconds) -> tuple[TimeShare, ...]:
 
 
 def shares_table(title: str, what: str, parts: Microseconds) -> Table:
-    """Show what each part takes: share, then milliseconds."""
+    """Return a table of the parts: share, then percentiles in milliseconds."""
     rows = [
         (
             each.name,
@@ -79,7 +78,7 @@ def _told(samples: Sequence[int], percent: float) -> int | None:
 
 
 def _untold(count: int) -> str:
-    """Say which percentiles so many samples do not tell."""
+    """Say which percentiles need more samples."""
     why = {f"p{percent}": too_few(percent, count) for percent in PERCENTILES}
     return not_measured({name: each for name, each in why.items() if each})
 
@@ -93,13 +92,13 @@ class LatencyTrace(Displayed):
     """Latencies in the order in which they were measured.
 
     Attributes:
-        model_sha256: Of the model that ran.
-        machine: Processor and number of threads, in words.
-        samples_us: Microseconds, one an inference, without the warm-up.
-        frames: Fingerprint of the recording that the model saw; None: not known.
-        modules_us: What each module took in as many inferences of their own, under a
-            profiler; empty: not measured.
-        others: What other processes took meanwhile; None: not measured.
+        model_sha256: digest of the model that ran.
+        machine: description of the processor and the number of threads.
+        samples_us: microseconds of each inference, without the warm-up.
+        frames: fingerprint of the recording; None if unknown.
+        modules_us: time of each module in as many separate inferences under a profiler;
+            empty if not measured.
+        others: load by other processes meanwhile; None if not measured.
     """
 
     model_sha256: str
@@ -111,11 +110,11 @@ class LatencyTrace(Displayed):
 
     @property
     def headline(self) -> str:
-        """Number of inferences, machine."""
+        """The number of inferences and the machine."""
         return f"{counted(len(self.samples_us), 'inference')} on {self.machine}"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return the percentiles in milliseconds, and what modules took."""
+        """Return the percentiles in milliseconds, and the times of modules."""
         rows = [
             *((f"p{p}", _told(self.samples_us, p)) for p in PERCENTILES),
             ("max", self.max_us),
@@ -130,7 +129,7 @@ class LatencyTrace(Displayed):
         return whole, shares_table(title, "module", self.modules_us)
 
     def percentile_us(self, percent: float) -> int:
-        """Return the smallest sample that so many percent do not exceed."""
+        """Return the smallest sample that ``percent`` of the samples do not exceed."""
         return percentile(self.samples_us, percent)
 
     @property
@@ -139,7 +138,7 @@ class LatencyTrace(Displayed):
         return max(self.samples_us)
 
     def to_json(self) -> dict[str, Any]:
-        """Return p50, p90, p99 and max beside the samples; None of too few."""
+        """Return p50, p90, p99 and max with the samples; None with too few samples."""
         frames = {} if self.frames is None else {"frames": self.frames}
         taken = {name: list(each) for name, each in self.modules_us.items()}
         modules = {"modules_us": taken} if taken else {}
@@ -160,7 +159,7 @@ class LatencyTrace(Displayed):
         """Write the trace atomically.
 
         Raises:
-            EvaluationError: The file cannot be written.
+            EvaluationError: the file cannot be written.
         """
         try:
             write_json(path, self.to_json())
@@ -171,10 +170,10 @@ class LatencyTrace(Displayed):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a trace; its percentiles are not trusted but computed again.
+        """Read a trace; its percentiles are recomputed from the samples.
 
         Raises:
-            EvaluationError: No such file, or not a trace with at least one sample.
+            EvaluationError: no such file, or not a trace with at least one sample.
         """
         with documents.reading(path, EvaluationError, "not a latency trace"):
             record = _Record.model_validate_json(documents.content(path))

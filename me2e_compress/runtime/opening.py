@@ -1,8 +1,8 @@
-"""Open a graph in onnxruntime, if it can run it, its weights lent, not written out.
+"""Open a graph in onnxruntime, lending its weights instead of serializing them.
 
-What onnxruntime is given is the graph without its large weights, as if they lay in a
-file, and the arrays themselves in the place of that file. So no weight is serialized,
-however large they are together (a protobuf message ends at 2 GiB).
+onnxruntime gets the graph without its large weights, as if they were in an external
+file, and the arrays in place of that file. So their total size does not matter,
+although a protobuf message ends at 2 GiB.
 """
 
 import mmap
@@ -52,11 +52,11 @@ REFUSALS: tuple[type[Exception], ...] = (
 def unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:
     """Return why a graph cannot be run; None if every operator is known.
 
-    A loop that constants keep going cannot: nobody can end it, and no signal.
-    Fused operators can: a kernel or a body runs them. What the libraries of a provider
-    bring is not known before a session is built. A known operator may still lack a
-    kernel for its element type; only building a
-    :class:`~me2e_compress.runtime.session.Session` finds that.
+    Endless loops are refused, because no signal can stop them. Fused operators are
+    supported: a kernel or a body runs them. The operators of a provider's libraries are
+    unknown before a session is built. A known operator may still lack a kernel for its
+    element type; only building a :class:`~me2e_compress.runtime.session.Session` shows
+    it.
     """
     if reason := endless(model):
         return reason
@@ -74,7 +74,7 @@ def unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:
 
 _INT8_STAYS = "session.qdqisint8allowed"
 LENT_BYTES = 1024
-"""Smaller tensors are left in the graph: shape inference reads those."""
+"""Smaller tensors stay in the graph: shape inference reads them."""
 
 Weights: TypeAlias = Mapping[str, ort.OrtValue]
 """Lent weights by name; they must live as long as the session."""
@@ -93,14 +93,14 @@ def open_file(
     provider: Provider = CPU,
     without: Sequence[str] | None = None,
 ) -> tuple[ort.InferenceSession, Weights]:
-    """Open an ONNX file: as it stands or, where onnxruntime refuses that, as read here.
+    """Open an ONNX file directly or, if onnxruntime refuses it, after loading it here.
 
-    So a graph opens that is newer than onnxruntime, whose shapes lie in a file of
-    weights, or that holds fused operators. The arguments are those of
+    This opens graphs that are newer than onnxruntime, that store shapes in a file of
+    weights, or that hold fused operators. The arguments are those of
     :func:`open_graph`.
 
     Returns:
-        The session, and what must live as long.
+        The session, and the weights that must live as long.
 
     Raises:
         GraphError: no such file, or onnxruntime cannot run it.
@@ -116,16 +116,15 @@ def open_file(
 
 
 _OWN_NODE = b":\x04me2e"
-"""A node in the toolkit's own domain, as it stands in a file; onnxruntime would run
-its body."""
+"""Bytes of a node in the toolkit's own domain; onnxruntime would run its body."""
 _LOOP = b'"\x04Loop'
-"""A node that may have no end."""
+"""Bytes of a node that may never end."""
 
 
 def _holds_any(path: Path, nodes: Sequence[bytes]) -> bool:
-    """Return whether a file may hold nodes that are to be looked at before they run.
+    """Return whether a file may hold one of these nodes.
 
-    Reading the graph takes ten times as long as looking through the bytes.
+    Reading the graph takes ten times as long as searching its bytes.
     """
     with path.open("rb") as file:
         if not path.stat().st_size:
@@ -143,15 +142,14 @@ def open_graph(
     """Open a graph in memory.
 
     Args:
-        model: the graph; it stays as it is, and its weights are not to be changed
-            while the session lives.
-        options: of the session, to which the provider is attached.
-        provider: what runs it.
-        without: optimizations that onnxruntime is not to make; None takes those that
-            the provider leaves out.
+        model: the graph; it is not changed, and its weights must not change while the
+            session lives.
+        options: session options, to which the provider is attached.
+        provider: the execution provider.
+        without: optimizations to disable; None takes those of the provider.
 
     Returns:
-        The session, and what must live as long.
+        The session, and the weights that must live as long.
 
     Raises:
         GraphError: onnxruntime cannot run this graph; the message names the operator.
@@ -159,6 +157,7 @@ def open_graph(
     if reason := unsupported(model, provider):
         raise GraphError(reason)
     model = runnable(model, options, provider)
+    # Lend the large weights that are read.
     lent = {
         name: tensor
         for name, value in model.graph.initializers.items()
@@ -168,6 +167,7 @@ def open_graph(
         and tensor.nbytes
         and is_read(value)  # onnxruntime drops the others, and then misses them
     }
+    # What remains may still be too large for one message.
     if _needs_file(model, lent):
         with tempfile.TemporaryDirectory(prefix="me2e-session-") as folder:
             path = Path(folder) / "model.onnx"
@@ -183,7 +183,7 @@ def open_graph(
 
 
 def _without(model: ir.Model, lent: Mapping[str, ir.TensorProtocol]) -> onnx.ModelProto:
-    """Write a graph, of its lent weights only names, types and shapes."""
+    """Return a graph with only names, types and shapes of its lent weights."""
     bare = model.clone()
     for name, tensor in lent.items():
         bare.graph.initializers[name].const_value = ir.ExternalTensor(
@@ -198,7 +198,7 @@ def _without(model: ir.Model, lent: Mapping[str, ir.TensorProtocol]) -> onnx.Mod
 
 
 def _needs_file(model: ir.Model, lent: Mapping[str, ir.TensorProtocol]) -> bool:
-    """Return whether what is not lent lies in files, or fits no single message."""
+    """Return whether the remaining weights are external or exceed one message."""
     kept = [
         tensor
         for each in model.graphs()
@@ -218,7 +218,7 @@ def _build(
     provider: Provider,
     without: Sequence[str] | None,
 ) -> ort.InferenceSession:
-    """Open a graph; where that fails, again without the step that makes int8 uint8.
+    """Open a graph; on failure, retry without converting int8 to uint8.
 
     From opset 21 on, that step of onnxruntime (1.31) leaves QuantizeLinear nodes whose
     ``output_dtype`` is not that of their zero point, and then refuses them.
@@ -237,7 +237,7 @@ def _build(
 
 
 def _keep_int8(options: ort.SessionOptions) -> None:
-    """Leave that step out; to say so twice would make onnxruntime warn."""
+    """Disable that step; setting the option twice would make onnxruntime warn."""
     try:
         options.get_session_config_entry(_INT8_STAYS)
     except RuntimeError:  # nobody said so yet

@@ -1,7 +1,7 @@
-"""Opens and runs a graph: ``opening_main.py MODEL INPUTS.npz STEPS KERNELS FUSION...``.
+"""Open and run a graph: ``opening_main.py MODEL INPUTS.npz STEPS KERNELS FUSION...``.
 
-KERNELS are parted by commas; only for them does it import something of this package. It
-says each step before it takes it, so that the last one is known if it dies.
+KERNELS are separated by commas; only for them does it import something of this package.
+It prints each step before taking it, so that the last one is known if it dies.
 """
 
 import sys
@@ -13,7 +13,7 @@ _NUMPY = {"float": "float32", "double": "float64"}
 
 
 def main(model: str, inputs: str, steps: str, kernels: str, *disabled: str) -> None:
-    """Open a file as a session does; run it once where the steps say so."""
+    """Open a file as a session does; run it once if the steps say so."""
     options = ort.SessionOptions()
     options.log_severity_level = 4
     options.enable_mem_pattern = False
@@ -22,6 +22,7 @@ def main(model: str, inputs: str, steps: str, kernels: str, *disabled: str) -> N
         from me2e_compress.operators.kernels import custom_ops
 
         custom_ops.register_named(options, kernels.split(","))
+    # Announce each step, so that a crash can be located.
     sys.stdout.write("open\n")
     sys.stdout.flush()
     session = ort.InferenceSession(
@@ -32,6 +33,7 @@ def main(model: str, inputs: str, steps: str, kernels: str, *disabled: str) -> N
     )
     if steps != "run":
         return
+    # Inputs that are not given are zeros.
     names, *arrays = np.load(inputs, allow_pickle=False).values()
     feeds = dict(zip(map(str, names), arrays, strict=True))
     for port in session.get_inputs():

@@ -1,4 +1,4 @@
-"""What onnxruntime's optimizer makes of a graph, and which node became which."""
+"""Read back the graph that onnxruntime's optimizer makes, and map its nodes."""
 
 import tempfile
 from collections import Counter
@@ -12,18 +12,14 @@ from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 
 _JOINTS = "/_"
-"""What stands between the name of a node and what onnxruntime adds to it:
+"""Separators between a node's name and the suffix that onnxruntime adds:
 ``/MatMulAddFusion``, ``_nchwc``, ``_token_1``."""
 
 
 def optimized(model: ir.Model, provider: Provider = CPU) -> ir.Model:
-    """Return a graph as onnxruntime's optimizations leave it, on this machine.
+    """Return a graph as onnxruntime's optimizations leave it on this machine.
 
     Its operators are those that run: ``QLinearConv``, ``FusedConv``, ``ReorderInput``.
-
-    Args:
-        model: the graph; it stays as it is.
-        provider: what runs it.
 
     Raises:
         GraphError: onnxruntime cannot run this graph.
@@ -37,10 +33,9 @@ def optimized(model: ir.Model, provider: Provider = CPU) -> ir.Model:
 
 
 def with_unique_names(model: ir.Model) -> ir.Model:
-    """Return a graph whose nodes can be told apart by name: itself, or a copy.
+    """Return a graph whose nodes have unique names: the graph itself, or a copy.
 
-    Nodes without a name, or with one that others have, are called after what they
-    answer.
+    Nodes without a name, or with a shared one, are named after their first output.
     """
     counts = Counter(node.name for node in model.graph)
     if all(name and count == 1 for name, count in counts.items()):
@@ -53,22 +48,18 @@ def with_unique_names(model: ir.Model) -> ir.Model:
 
 
 def origins(source: ir.Model, found: ir.Model) -> dict[str, ir.Node]:
-    """Return for the nodes that run the node of the graph that each stands for.
+    """Return the source node for each node that runs, by the running node's name.
 
-    A fused node stands for the node whose name it carries on, or else for the last one
-    that it took in. A node that only changes a layout belongs to its reader, else to
-    whom it reads.
-
-    Args:
-        source: a graph whose nodes have names of their own.
-        found: what :func:`optimized` made of it.
-
-    Returns:
-        By name of the node that runs; without those of which nothing is known.
+    A fused node maps to the node whose name it keeps, or else to the last one that it
+    absorbed. A node that only changes a layout maps to its reader's node, else to its
+    input's. Nodes without a known origin are missing. ``found`` is what
+    :func:`optimized` made of ``source``, whose nodes have unique names.
     """
     names = {str(node.name): node for node in source.graph}
     makers = {str(value.name): node for node in source.graph for value in node.outputs}
+    # Match by name or output first.
     known = {node: _told(node, names, makers) for node in found.graph}
+    # Take the origin of readers, then of inputs, for the rest.
     for node in reversed(found.graph):
         known[node] = known[node] or _first(
             known.get(reader) for value in node.outputs for reader in value.consumers()
@@ -85,7 +76,7 @@ def origins(source: ir.Model, found: ir.Model) -> dict[str, ir.Node]:
 def _told(
     node: ir.Node, names: Mapping[str, ir.Node], makers: Mapping[str, ir.Node]
 ) -> ir.Node | None:
-    """Return the node that a name or an output speaks of."""
+    """Return the source node that the node's name or an output refers to."""
     name = str(node.name)
     for stem in _stems(name):
         if stem in names:
@@ -94,7 +85,7 @@ def _told(
 
 
 def _stems(name: str) -> Iterator[str]:
-    """Walk a name and what is left of it without its last parts, longest first."""
+    """Yield a name and its prefixes at separators, longest first."""
     yield name
     for end in range(len(name) - 1, 0, -1):
         if name[end] in _JOINTS:

@@ -1,4 +1,4 @@
-"""How busy other processes keep the machine while something is measured."""
+"""Measure how busy other processes keep the machine during a measurement."""
 
 import os
 import time
@@ -9,20 +9,20 @@ from typing import Self
 import psutil
 
 BUSY = 0.1
-"""Share of the cores that other processes may take before a latency is in doubt: their
-work moves ours between cores and out of the caches, long before all cores are taken."""
+"""Share of the cores that other processes may take before a latency is in doubt: they
+move our threads between cores and evict caches long before all cores are taken."""
 
 SHORTEST_S = 0.5
-"""What a block must take to be judged: systems count CPU time in ticks of 10 ms."""
+"""Shortest block to be judged, seconds: systems count CPU time in ticks of 10 ms."""
 
 
 @dataclass(frozen=True)
 class Load:
-    """What other processes took of a machine while something was measured.
+    """Load by other processes during a measurement.
 
     Attributes:
-        others: Cores, mean over that time.
-        cores: Of the machine.
+        others: mean number of cores that they took.
+        cores: cores of the machine.
     """
 
     others: float
@@ -38,7 +38,6 @@ class Load:
         return {"others_cores": self.others, "cores": self.cores}
 
     def __str__(self) -> str:
-        """Say it, and what follows where the machine was busy."""
         said = f"other processes took {self.others:.1f} of {self.cores} cores"
         if not self.busy:
             return said
@@ -49,15 +48,15 @@ class Load:
 
 
 class OthersLoad:
-    """Counts the cores that other processes keep busy while a block runs.
+    """Measure the cores that other processes keep busy while a block runs.
 
     Args:
-        machine: CPU seconds of all processes since the machine started.
-        ours: CPU seconds of this process and the children that ended.
-        clock: seconds that pass.
+        machine: returns CPU seconds of all processes since boot.
+        ours: returns CPU seconds of this process and its ended children.
+        clock: returns wall seconds.
 
     Attributes:
-        load: over the block; None before it ends, or if it was too short.
+        load: load over the block; None before it ends, or if it was too short.
     """
 
     def __init__(
@@ -71,12 +70,10 @@ class OthersLoad:
         self.load: Load | None = None
 
     def __enter__(self) -> Self:
-        """Begin to count."""
         self._begun = self._clock(), self._machine(), self._ours()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop."""
         wall, machine, ours = (
             now - then
             for now, then in zip(

@@ -1,4 +1,4 @@
-"""Read the planned waypoints off a model's outputs."""
+"""Read the planned waypoints from a model's outputs."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Self, TypeAlias
@@ -23,25 +23,25 @@ Arrays: TypeAlias = Mapping[str, npt.NDArray[np.generic]]
 
 
 class PlanAdapter(pydantic.BaseModel):
-    """How to read waypoints off a model's outputs.
+    """How to read waypoints from a model's outputs.
 
     Attributes:
         output: the output that holds the plan, [1, n, 2] or, with modes,
             [1, modes, n, 2]; metres.
         deltas: True where it holds steps from waypoint to waypoint, not positions.
-        command_input: the input that picks the mode: its first element, or the largest
+        command_input: the input that selects the mode: its first element, or the argmax
             of a one-hot vector.
-        command_modes: the mode of each command, where they are not the same numbers.
-        default_mode: the mode where no input picks one; several modes need one of
+        command_modes: the mode of each command, where the numbers differ.
+        default_mode: the mode where no input selects one; several modes need one of
             these three.
-        scores: the output [1, modes] whose largest value picks the mode; not with
+        scores: the output [1, modes] whose largest value selects the mode; not with
             ``command_input``.
-        step_s: seconds from waypoint to waypoint; None is 0.5, of six alone.
-        first_s: when the first is to be reached; None is one step. Waypoints at 0 s
-            and before, where the ego is and was, are dropped.
-        shape: how a flat output is laid out, [n, values] or [modes, n, values].
+        step_s: seconds between waypoints; None means 0.5, only for six waypoints.
+        first_s: time of the first waypoint; None means one step. Waypoints at 0 s and
+            before, where the ego is and was, are dropped.
+        shape: layout of a flat output, [n, values] or [modes, n, values].
         columns: which of a waypoint's values are its coordinates: a heading or a speed
-            may stand beside them.
+            may be stored with them.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -73,13 +73,13 @@ class PlanAdapter(pydantic.BaseModel):
 
     @classmethod
     def of(cls, metadata: Mapping[str, str], outputs: Sequence[str]) -> Self | None:
-        """Read it from a model's metadata; else an output named ``plan`` is the plan.
+        """Read the adapter from a model's metadata, or use an output named ``plan``.
 
         Returns:
             The adapter; None if the model does not name its plan.
 
         Raises:
-            GraphError: the metadata is malformed or names an output that is not there.
+            GraphError: the metadata is malformed or names an unknown output.
         """
         text = metadata.get(PLAN)
         if text is None:
@@ -103,8 +103,7 @@ class PlanAdapter(pydantic.BaseModel):
         """Return the waypoints, metres in the model's frame, float64 [waypoints, 2].
 
         Raises:
-            GraphError: the output has another rank or size, there is no such mode, or
-                nothing picks one.
+            GraphError: the output has the wrong shape, or no mode is selected.
         """
         value = self._laid_out(np.asarray(outputs[self.output], np.float64))
         if value.ndim == 4:
@@ -115,10 +114,10 @@ class PlanAdapter(pydantic.BaseModel):
         return np.cumsum(points, axis=0) if self.deltas else points
 
     def trajectory(self, points: npt.NDArray[np.float64]) -> Trajectory:
-        """Return waypoints, in whichever frame, with their times.
+        """Return waypoints, in any frame, with their times.
 
         Raises:
-            GraphError: how far apart they are is not known.
+            GraphError: the time between them is unknown.
             EvaluationError: there are none, or none after the observation.
         """
         if self.step_s is None and len(points) != CONTRACT_WAYPOINTS:
@@ -134,11 +133,7 @@ class PlanAdapter(pydantic.BaseModel):
         return Trajectory.ahead(points, times)
 
     def check_modes(self, modes: int) -> None:
-        """Check that something picks one of the modes.
-
-        Raises:
-            GraphError: nothing does, and there are several.
-        """
+        """Check that something selects one of several modes; GraphError if not."""
         picks = self.default_mode, self.command_input, self.scores
         if modes > 1 and all(each is None for each in picks):
             raise GraphError(
@@ -148,7 +143,7 @@ class PlanAdapter(pydantic.BaseModel):
             )
 
     def choice(self, outputs: Arrays) -> int:
-        """Return the mode that the scores pick: their largest, the first of equals.
+        """Return the mode with the largest score, the first of equals.
 
         Raises:
             GraphError: no output of scores is named.
@@ -195,6 +190,7 @@ class PlanAdapter(pydantic.BaseModel):
                     f"{self.scores} has {count} scores, and {self.output} {modes} modes"
                 )
             return self.choice(outputs)
+        # A command is a number, or a one-hot vector.
         if self.command_input is not None and self.command_input in inputs:
             given: Any = np.asarray(inputs[self.command_input]).reshape(-1)
             command = int(given[0] if len(given) == 1 else np.argmax(given))

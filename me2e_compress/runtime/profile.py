@@ -1,4 +1,4 @@
-"""Measure how long a model takes on this machine, alone and warm."""
+"""Measure the latency of a warm model, alone on this machine."""
 
 import platform
 import time
@@ -32,23 +32,23 @@ def profile(
     """Measure the latency of a model on every frame, one at a time.
 
     Recurrent state is fed forward and reset where scenes begin; reading a frame is
-    not counted. The recording is repeated as often as it takes.
+    not counted. The recording is repeated as often as needed.
 
     Args:
-        model: ONNX file, or the TOML of a stack.
-        frames: What it sees.
-        samples: How many latencies; None for one a frame.
-        warm_up: Inferences before the first that counts.
-        threads: Of onnxruntime; the closed loop uses one.
-        provider: What runs it.
-        said: What is known of it beside its own metadata.
-        on_sample: Called with samples done and to do.
+        model: ONNX file, or the TOML file of a stack.
+        frames: the inputs.
+        samples: number of latencies; None takes one a frame.
+        warm_up: inferences before the first that counts.
+        threads: onnxruntime's number of threads; the closed loop uses one.
+        provider: the execution provider.
+        said: metadata that overrides the model's own.
+        on_sample: called with samples done and to do.
 
     Raises:
-        EvaluationError: There is nothing to measure.
-        GraphError: The model cannot be run.
-        ProviderError: The provider is not there.
-        FramesError: A frame does not fit.
+        EvaluationError: there is nothing to measure.
+        GraphError: the model cannot be run.
+        ProviderError: the provider is not available.
+        FramesError: a frame does not fit.
     """
     wanted = len(frames) if samples is None else samples
     check_work(wanted, warm_up, frames)
@@ -62,18 +62,14 @@ def profile(
 
 
 def machine_words(threads: int, provider: Provider = CPU) -> str:
-    """Return what measures, in words: processor, threads, provider."""
+    """Describe the machine: processor, threads, provider."""
     runs = "" if provider == CPU else f", {PROVIDERS.text(provider)}"
     on = counted(threads, "thread") if threads else "all threads"
     return f"{processor()}, onnxruntime on {on}{runs}"
 
 
 def check_work(samples: int, warm_up: int, frames: Frames) -> None:
-    """Check that there is something to measure.
-
-    Raises:
-        EvaluationError: no sample, no frame, or a negative warm-up.
-    """
+    """Check that there is at least one sample and one frame to measure."""
     if samples < 1 or warm_up < 0 or not len(frames):
         raise EvaluationError(
             f"{samples} samples after {warm_up} of warm-up on {len(frames)} frames: "
@@ -84,8 +80,8 @@ def check_work(samples: int, warm_up: int, frames: Frames) -> None:
 class TimedSession:
     """A session that records how long each run took.
 
-    Attributes:
-        taken_us: Microseconds, one a run; of a stack, all of its files together.
+    ``taken_us`` has the microseconds of each run; for a stack, of all its files
+    together.
     """
 
     def __init__(
@@ -118,7 +114,7 @@ class TimedSession:
 
 
 def processor() -> str:
-    """Return the name of this machine's processor, as the system knows it."""
+    """Return the name of this machine's processor, as the system reports it."""
     table = Path("/proc/cpuinfo")
     if table.is_file():
         for line in table.read_text("utf-8").splitlines():

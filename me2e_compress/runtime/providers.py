@@ -1,4 +1,4 @@
-"""Who runs the nodes of a session: onnxruntime's providers, and users' libraries."""
+"""Execution providers of onnxruntime, and users' operator libraries."""
 
 import abc
 import dataclasses
@@ -17,15 +17,16 @@ from me2e_compress.errors import ProviderError
 from me2e_compress.registry import Registry
 
 Chain: TypeAlias = list[str | tuple[str, dict[str, str]]]
-"""Providers in onnxruntime's words; what one cannot run the next one does."""
+"""Providers in onnxruntime's form; each runs what those before it cannot."""
 
 WRONG_FUSIONS = ("Pad_Fusion",)
-"""Optimizations of onnxruntime (1.31) that give another answer: this one folds a Pad of
-zeros into the MaxPool behind it, whose own padding is minus infinity."""
+"""Optimizations of onnxruntime (1.31) that change the result: this one folds a Pad of
+zeros into the MaxPool after it, whose own padding is minus infinity."""
 SLOW_FUSIONS = ("SkipLayerNormFusion",)
-"""Those that make the CPU slower: the fused kernel of Add and LayerNormalization takes
-4.0 to 6.9 times as long as the two (64 to 768 columns, 100 to 10,000 rows, one thread
-and two), 2.7 times on 20 rows, and as long on one (``benchmarks/bench_levers.py``)."""
+"""Optimizations that slow down the CPU: the fused kernel of Add and LayerNormalization
+takes 4.0 to 6.9 times as long as the two (64 to 768 columns, 100 to 10,000 rows, one
+thread and two), 2.7 times on 20 rows, and as long on one
+(``benchmarks/bench_levers.py``)."""
 
 _CPU = "CPUExecutionProvider"
 _CUDA = "CUDAExecutionProvider"
@@ -36,14 +37,14 @@ _ENTRY = b"RegisterCustomOps"  # of every library of onnxruntime operators
 
 @dataclasses.dataclass(frozen=True)
 class Provider(abc.ABC):
-    """What runs the nodes of a session; the fields are its options.
+    """An execution provider; the fields are its options.
 
     Class attributes:
-        name: what the command line calls it.
-        native: what onnxruntime calls it.
+        name: its name on the command line.
+        native: its name in onnxruntime.
         advice: what to do where it is not installed.
-        left_out: optimizations that onnxruntime is not to make for it.
-        target: the target whose int8 it runs.
+        left_out: optimizations that are disabled for it.
+        target: the target whose int8 format it runs.
 
     Attributes:
         plugins: libraries of onnxruntime operators that the graph needs.
@@ -57,10 +58,10 @@ class Provider(abc.ABC):
     plugins: tuple[Path, ...] = dataclasses.field(default=(), kw_only=True)
 
     def check(self) -> None:
-        """Check that the provider is installed, and the libraries are libraries.
+        """Check that the provider is installed and that its libraries exist.
 
         Raises:
-            ProviderError: one is not; the message names it and what to install.
+            ProviderError: one is missing; the message names it and what to install.
         """
         for library in self.plugins:
             if not library.is_file():
@@ -73,7 +74,7 @@ class Provider(abc.ABC):
             )
 
     def claims(self, op_type: str) -> bool:
-        """Return whether a user's library names an operator: then it runs it."""
+        """Return whether a user's library names an operator, and so runs it."""
         return any(_holds(each, op_type.encode()) for each in self.plugins)
 
     def is_installed(self) -> bool:
@@ -81,10 +82,10 @@ class Provider(abc.ABC):
         return self.native in ort.get_available_providers()
 
     def attach(self, options: ort.SessionOptions) -> None:
-        """Make the options of a session know the users' operators.
+        """Register the users' operators in the options of a session.
 
         Raises:
-            ProviderError: not installed, or no library of operators.
+            ProviderError: the provider is not installed, or a library has no operators.
         """
         self.check()
         for library in self.plugins:
@@ -99,13 +100,10 @@ class Provider(abc.ABC):
         """Return the providers of a session; None where its options name them."""
 
     def confirm(self, running: Sequence[str]) -> None:
-        """Check that a session runs on it: onnxruntime goes on without, on the CPU.
-
-        Args:
-            running: the session's providers.
+        """Check that a session runs on it: onnxruntime silently falls back to the CPU.
 
         Raises:
-            ProviderError: it does not.
+            ProviderError: the provider is not among those ``running``.
         """
         if self.native not in running:
             raise ProviderError(
@@ -128,7 +126,7 @@ class CpuProvider(Provider):
     left_out: ClassVar[tuple[str, ...]] = (*WRONG_FUSIONS, *SLOW_FUSIONS)
 
     def chain(self) -> Chain:
-        """Return the CPU."""
+        """Return the CPU provider."""
         return [_CPU]
 
 
@@ -149,11 +147,7 @@ class CudaProvider(Provider):
     tf32: bool = False
 
     def attach(self, options: ort.SessionOptions) -> None:
-        """Load CUDA and cuDNN of installed packages too.
-
-        Raises:
-            ProviderError: not installed, or no library of operators.
-        """
+        """Attach as usual, and load CUDA and cuDNN from installed packages."""
         super().attach(options)
         ort.preload_dlls()
 
@@ -169,10 +163,10 @@ class TensorRtProvider(Provider):
 
     Attributes:
         device: index of the GPU.
-        precision: ``fp32``, ``fp16``, ``int8`` (of QDQ pairs), ``best``: both.
-        cache: folder of engines and timings, which are built anew without.
-        plugins: libraries that the graph needs: of onnxruntime operators, else of
-            TensorRT's plugins.
+        precision: ``fp32``, ``fp16``, ``int8`` (of QDQ pairs), or ``best`` for both.
+        cache: folder of engines and timings; without it they are built every time.
+        plugins: libraries that the graph needs, of onnxruntime operators or of
+            TensorRT plugins.
     """
 
     name: ClassVar[str] = "tensorrt"
@@ -184,11 +178,7 @@ class TensorRtProvider(Provider):
     cache: Path | None = None
 
     def attach(self, options: ort.SessionOptions) -> None:
-        """Register the libraries of onnxruntime operators, and load CUDA.
-
-        Raises:
-            ProviderError: not installed.
-        """
+        """Register the libraries of onnxruntime operators, and load CUDA."""
         ours = tuple(each for each in self.plugins if not self._is_tensorrts(each))
         self.check()
         CudaProvider(self.device, plugins=ours).attach(options)
@@ -211,16 +201,16 @@ class TensorRtProvider(Provider):
 
     @staticmethod
     def _is_tensorrts(library: Path) -> bool:
-        """Return whether a library has no operators of onnxruntime; it is not run."""
+        """Return whether a library lacks onnxruntime operators, without running it."""
         return library.is_file() and not _holds(library, _ENTRY)
 
 
 @dataclasses.dataclass(frozen=True)
 class TensorRtRtxProvider(Provider):
-    """TensorRT for RTX GPUs, in the precision that the graph is written in.
+    """TensorRT for RTX GPUs, in the precision in which the graph is written.
 
     Attributes:
-        cache: folder of compiled kernels, which are compiled anew without.
+        cache: folder of compiled kernels; without it they are compiled every time.
         plugins: libraries of onnxruntime operators that the graph needs.
     """
 
@@ -232,14 +222,14 @@ class TensorRtRtxProvider(Provider):
     cache: Path | None = None
 
     def is_installed(self) -> bool:
-        """Return whether the package that brings it is installed."""
+        """Return whether the package that provides it is installed."""
         return super().is_installed() or bool(importlib.util.find_spec(self.package))
 
     def attach(self, options: ort.SessionOptions) -> None:
         """Register the provider's own library, then those of operators.
 
         Raises:
-            ProviderError: not installed, no RTX GPU, or no library of operators.
+            ProviderError: not installed, no RTX GPU, or a library without operators.
         """
         super().attach(options)
         if not super().is_installed():
@@ -254,11 +244,11 @@ class TensorRtRtxProvider(Provider):
         options.add_provider_for_devices(found[:1], cache)
 
     def chain(self) -> None:
-        """Return none: the options of the session name its device."""
+        """Return None: the options of the session name its device."""
 
 
 def _holds(library: Path, word: bytes) -> bool:
-    """Return whether a file holds these bytes; it is looked at, not run."""
+    """Return whether a file holds these bytes, without running it."""
     if not library.is_file() or not library.stat().st_size:
         return False
     with (
@@ -287,12 +277,10 @@ PROVIDERS: Registry[Provider] = Registry(
 def provider_named(text: str, plugins: Sequence[Path] = ()) -> Provider:
     """Build the provider of a text, and check that it is installed.
 
-    Args:
-        text: ``cpu``, ``cuda``, ``tensorrt{precision=fp16, cache=engines}``, …
-        plugins: libraries of onnxruntime operators.
+    ``text`` is e.g. ``cpu``, ``cuda``, ``tensorrt{precision=fp16, cache=engines}``.
 
     Raises:
-        ProviderError: no such provider or option, not installed, or no such library.
+        ProviderError: no such provider, option or library, or it is not installed.
     """
     found = PROVIDERS.parse(text)
     found = dataclasses.replace(found, plugins=(*found.plugins, *plugins))

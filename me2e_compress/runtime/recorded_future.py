@@ -1,4 +1,4 @@
-"""What really happened after a frame was recorded: ground truth for a plan."""
+"""The recorded future after a frame: ground truth for a plan."""
 
 from typing import Literal, TypeAlias
 
@@ -6,27 +6,27 @@ from pydantic import BaseModel, ConfigDict, FiniteFloat, NonNegativeInt
 
 STEPS = 6
 STEP_S = 0.5
-"""Three seconds, as UniAD and VAD plan them."""
+"""Six steps of 0.5 s give the three seconds that UniAD and VAD plan."""
 
 Point: TypeAlias = tuple[FiniteFloat, FiniteFloat]
 Box: TypeAlias = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class RecordedFuture(BaseModel):
-    """Where the ego and the others went, in the ground frame of the model's plan.
+    """The future of the ego and other road users, in the ground frame of the plan.
 
-    Metres and radians counter-clockwise from the x axis, as seen from where the ego
-    stood at the frame.
+    Metres and radians counter-clockwise from the x axis, relative to the ego's position
+    at the frame.
 
     Attributes:
-        version: of this format.
-        waypoints: of the ego after 0.5, 1, ... 3 s; None where the log ended before.
-        forward: where the ego looked at the frame.
+        version: version of this format.
+        waypoints: ego positions after 0.5, 1, ... 3 s; None where the log ended before.
+        forward: heading of the ego at the frame.
         ego: length and width of the ego.
-        centre: of the ego at the frame: the origin may be its lidar.
-        agents: x, y, heading, length and width of every road user, step by step; None
-            where the log does not tell of them.
-        command: where the route went, as the model counts commands.
+        centre: centre of the ego at the frame: the origin may be its lidar.
+        agents: x, y, heading, length and width of every road user at each step; None
+            where the log has none of them.
+        command: the route's command, as the model numbers commands.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -41,5 +41,5 @@ class RecordedFuture(BaseModel):
 
     @property
     def whole(self) -> bool:
-        """Whether the log went on for all of the three seconds."""
+        """Whether the log covers all of the three seconds."""
         return len(self.waypoints) == STEPS and None not in self.waypoints

@@ -1,4 +1,4 @@
-"""Which outputs come back as inputs at the next frame."""
+"""Find which outputs are fed back as inputs at the next frame."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -18,11 +18,9 @@ SUFFIX, BEFORE, AFTER = "_out", "prev_", "next_"
 
 @dataclasses.dataclass(frozen=True)
 class SessionPort:
-    """An input or output as onnxruntime sees it.
+    """An input or output as onnxruntime describes it.
 
-    Attributes:
-        type: element type, e.g. ``tensor(float)``.
-        shape: dimensions; a name or None where the size is open.
+    ``type`` is e.g. ``tensor(float)``; open dimensions of ``shape`` are a name or None.
     """
 
     type: str
@@ -34,19 +32,20 @@ def recurrence(
     inputs: Mapping[str, SessionPort],
     outputs: Mapping[str, SessionPort],
 ) -> dict[str, str]:
-    """Pair recurrent inputs with the outputs that answer them.
+    """Pair recurrent inputs with the outputs that are fed back to them.
 
     The metadata ``me2e.recurrent`` decides for the inputs and outputs it names, and for
-    all where it is empty. Any other input ``X`` belongs to the output ``X_out``, an
-    input ``prev_X`` also to ``next_X``, of the same element type and rank.
+    all where it is empty. Any other input ``X`` pairs with the output ``X_out``, and an
+    input ``prev_X`` also with ``next_X``, if element type and rank agree.
 
     Raises:
-        GraphError: the metadata is not such a mapping, names an unknown port, or
-            pairs ports of different types.
+        GraphError: the metadata is malformed, names an unknown port, or pairs ports of
+            different types.
     """
     named = declared_pairs(metadata)
     if named == {}:
         return {}
+    # The metadata comes first, then the naming rules.
     pairs = {source: to for source, to in (named or {}).items() if to is not None}
     for source, answer in pairs.items():
         _check(source, answer, inputs, outputs)
@@ -60,10 +59,10 @@ def recurrence(
 
 
 def declared_pairs(metadata: Mapping[str, str]) -> dict[str, str | None] | None:
-    """Return what the metadata says; None where it says nothing.
+    """Return the pairs that the metadata declares; None where it declares nothing.
 
     Raises:
-        GraphError: it is not such a mapping.
+        GraphError: the metadata is not a mapping of names.
     """
     text = metadata.get(RECURRENT)
     return None if text is None else _parse(text)
@@ -72,7 +71,7 @@ def declared_pairs(metadata: Mapping[str, str]) -> dict[str, str | None] | None:
 def not_fed_back(
     name: str, inputs: Mapping[str, SessionPort], outputs: Mapping[str, SessionPort]
 ) -> str:
-    """Say why an input that no frame holds is not fed back; nothing of a plain one."""
+    """Explain why a missing input is not fed back; empty for a plain input."""
     answer = _answer(name, outputs)
     if answer is None and name.startswith(BEFORE):
         after = AFTER + name.removeprefix(BEFORE)
@@ -88,7 +87,7 @@ def not_fed_back(
 
 
 def _answer(source: str, outputs: Mapping[str, SessionPort]) -> str | None:
-    """Return the output that the naming rules give an input."""
+    """Return the output that the naming rules pair with an input."""
     names = [source + SUFFIX]
     if source.startswith(BEFORE):
         names.append(AFTER + source.removeprefix(BEFORE))
@@ -133,7 +132,7 @@ def recurrent_inputs(model: ir.Model) -> dict[str, str]:
 def sides(
     model: ir.Model,
 ) -> tuple[dict[str, SessionPort], dict[str, SessionPort]]:
-    """Return the inputs and the outputs of a graph in memory, those of known rank."""
+    """Return the inputs and the outputs of known rank of a graph in memory."""
     return _ports(model.graph.inputs), _ports(model.graph.outputs)
 
 

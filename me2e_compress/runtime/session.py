@@ -1,4 +1,4 @@
-"""Sessions: one graph, ready to run."""
+"""Sessions that run one graph, and the replay of recordings."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -51,7 +51,7 @@ _WEIGHTS_FILE = "session.optimized_model_external_initializers_file_name"
 
 
 Level: TypeAlias = Literal["none", "basic", "extended", "layout", "all"]
-"""How far onnxruntime optimizes a graph; each level does what those before it do."""
+"""How far onnxruntime optimizes a graph; each level includes those before it."""
 
 _LEVELS: Mapping[Level, ort.GraphOptimizationLevel] = {
     "none": ort.GraphOptimizationLevel.ORT_DISABLE_ALL,
@@ -68,29 +68,27 @@ class Session:
 
     Args:
         model: the graph, or the file that holds it.
-        threads: threads within an operator; 0 lets onnxruntime take every core.
-        optimize: False runs the nodes exactly as they stand (``ORT_DISABLE_ALL``), as
-            the level ``none`` does; True goes to the last level.
-        stock: True makes every optimization that onnxruntime makes elsewhere, those
-            that the provider leaves out too.
-        frugal: True runs nodes in the priority-based order, in which a reduction
-            written right after its producer frees that tensor at once, and without the
-            memory pattern, which reserves one block for everything that ever lives.
-        release: True gives working memory back after every run, so that several
-            sessions stand side by side in the memory of one.
-        rewritten: a file to write the graph to as onnxruntime's optimizations leave
-            it, its weights in a file beside it; it fits this machine's kernels only.
-        provider: what runs the nodes, and the libraries of operators it knows.
-        profiled: a folder for what onnxruntime's profiler writes, all in all, when
+        threads: threads within an operator; 0 takes every core.
+        optimize: False runs the nodes exactly as written (``ORT_DISABLE_ALL``), like
+            the level ``none``; True is the level ``all``.
+        stock: also makes the optimizations that the provider leaves out.
+        frugal: runs nodes in the priority-based order, in which a reduction written
+            right after its producer frees that tensor at once.
+        release: frees working memory after every run, so that several sessions fit in
+            the memory of one.
+        rewritten: a file for the graph as onnxruntime optimizes it, with a file of
+            weights beside it; it fits this machine's kernels only.
+        provider: execution provider, and the libraries of operators it knows.
+        profiled: a folder for the output of onnxruntime's profiler, written when
             :meth:`end_profile` is called.
-        said: what is known of the model beside its own metadata; it wins.
+        said: metadata that overrides the model's own.
 
     Attributes:
-        inputs: by name, what must be fed, in order.
-        outputs: by name, what comes out, in order.
-        metadata: the model's own metadata, and what is said beside it.
+        inputs: the inputs by name, in order.
+        outputs: the outputs by name, in order.
+        metadata: the model's own metadata, with ``said``.
         recurrent: ``{input: output}`` of the state that is fed forward.
-        provider: what runs it.
+        provider: the execution provider.
 
     Raises:
         GraphError: onnxruntime cannot run this graph; the message names the operator.
@@ -118,6 +116,7 @@ class Session:
         options.log_severity_level = 4
         # Idle threads that spin slow down whatever else runs on the machine.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        # The optimizations: level, memory and order of nodes.
         level: Level = optimize if isinstance(optimize, str) else _DEFAULT[optimize]
         options.graph_optimization_level = _LEVELS[level]
         # One block for all tensors of a run: twice the memory on VAD-tiny, no gain.
@@ -135,6 +134,7 @@ class Session:
         self._each_run = ort.RunOptions()
         if release:
             self._each_run.add_run_config_entry(_SHRINK, "cpu:0")
+        # Open the graph, and read its ports and metadata.
         self._lent: Weights = {}
         without = () if stock else None
         if isinstance(model, ir.Model):
@@ -151,7 +151,7 @@ class Session:
         self.recurrent = recurrence(self.metadata, self.inputs, self.outputs)
 
     def first_state(self, held: Mapping[str, Array]) -> dict[str, Array]:
-        """Return the first values of recurrent inputs: what is held, else zeros.
+        """Return the first values of recurrent inputs: from ``held``, else zeros.
 
         Raises:
             GraphError: an input of unknown shape has no first value.
@@ -168,15 +168,10 @@ class Session:
         *,
         first: bool = False,
     ) -> dict[str, Array]:
-        """Run once.
-
-        Args:
-            feeds: one array for every input; other names are ignored.
-            outputs: which to return; None for all.
-            first: whether a scene begins here; it makes no difference to one graph.
+        """Run one inference; ``first`` makes no difference to a single graph.
 
         Raises:
-            FramesError: an input is missing, or has not the type or shape it must.
+            FramesError: an input is missing or has the wrong type or shape.
             GraphError: a node failed on these inputs.
         """
         if missing := [name for name in self.inputs if name not in feeds]:
@@ -196,7 +191,7 @@ class Session:
         return dict(zip(names, values, strict=True))
 
     def end_profile(self) -> Path:
-        """Write what the profiler recorded; return the file, an event a line."""
+        """Write the profile; return its file, which has one event a line."""
         return Path(self._ort.end_profiling())
 
 
@@ -206,18 +201,18 @@ def replay(
     outputs: Sequence[str] | None = None,
     state: Mapping[str, Array] | None = None,
 ) -> Iterator[dict[str, Array]]:
-    """Run a model over a recording, its own recurrent state fed forward.
+    """Run a model over a recording, its recurrent state fed forward.
 
-    At the start of a scene a recurrent input is what the frame says or, where the
-    frame says nothing, its first value: zeros, but in a stack that says otherwise.
-    Afterwards it is what the model answered a frame ago, whatever the frame says.
+    At the start of a scene a recurrent input comes from the frame or, if the frame has
+    none, is its first value: zeros, unless a stack defines another one. Afterwards it
+    is the model's output of the previous frame, even if the frame has an array for it.
 
     Args:
         session: the model.
         frames: the recording.
-        outputs: which to yield; None for all.
-        state: what the recurrent inputs hold before a first frame that continues a
-            scene: where a replay that was interrupted goes on.
+        outputs: the outputs to yield; None yields all.
+        state: recurrent inputs before a first frame that continues a scene, to resume
+            an interrupted replay.
 
     Yields:
         The outputs of every frame, in order.
@@ -244,14 +239,13 @@ def replay(
 def detached(outputs: Mapping[str, Array]) -> dict[str, Array]:
     """Copy outputs out of onnxruntime's memory.
 
-    An output lies in the working memory of its session and keeps all of that, 1.7 GB
-    on VAD-tiny, for as long as it lives itself.
+    An output keeps the whole working memory of its session alive, 1.7 GB on VAD-tiny.
     """
     return {name: np.array(value) for name, value in outputs.items()}
 
 
 def run_once(model: ir.Model, feeds: Mapping[str, Array]) -> dict[str, Array]:
-    """Run a graph once in a session of its own: for evaluating a few constants.
+    """Run a graph once in a new session, to evaluate a few constants.
 
     Raises:
         GraphError: onnxruntime cannot run this graph.
@@ -265,11 +259,7 @@ def _ports(arguments: Sequence[ort.NodeArg]) -> dict[str, SessionPort]:
 
 
 def zeros(name: str, port: SessionPort) -> Array:
-    """Return the first value of a recurrent input.
-
-    Raises:
-        GraphError: its shape is open.
-    """
+    """Return zeros for a recurrent input; GraphError if its shape is open."""
     shape = [size for size in port.shape if isinstance(size, int)]
     if len(shape) < len(port.shape) or port.type not in DTYPES:
         raise GraphError(

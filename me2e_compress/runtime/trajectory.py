@@ -1,4 +1,4 @@
-"""Waypoints with their times: what a planner says, of any number and spacing."""
+"""Timed waypoints of a planner, of any number and spacing."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -13,7 +13,7 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Trajectory:
-    """Where the ego is to be, and when.
+    """The planned path of the ego.
 
     Attributes:
         points: [n, 2] metres, n at least 1; x forward, y left in the ego frame of the
@@ -21,14 +21,14 @@ class Trajectory:
         times_s: [n] seconds after the observation, above 0 and increasing.
 
     Raises:
-        EvaluationError: Of another shape, or times that do not increase from above 0.
+        EvaluationError: another shape, or times that do not increase from above 0.
     """
 
     points: npt.NDArray[np.floating]
     times_s: npt.NDArray[np.floating]
 
     def __post_init__(self) -> None:
-        """Check shapes and times; whether the points are finite, who drives looks."""
+        """Check shapes and times; the driver checks that the points are finite."""
         shape, times = list(self.points.shape), self.times_s
         if len(shape) != 2 or shape[1] != 2 or not shape[0]:
             raise EvaluationError(f"waypoints have shape {shape}, they must be [n, 2]")
@@ -43,20 +43,20 @@ class Trajectory:
     def ahead(
         cls, points: npt.NDArray[np.floating], times_s: npt.NDArray[np.floating]
     ) -> Self:
-        """Make one of the waypoints that lie after the observation; drop the others.
+        """Build a trajectory of the waypoints after the observation; drop the others.
 
         Raises:
-            EvaluationError: None does.
+            EvaluationError: there is none.
         """
         if not (times_s > 0).any():
             raise EvaluationError("no waypoint lies after the observation")
         return cls(points[times_s > 0], times_s[times_s > 0])
 
     def at(self, times_s: npt.NDArray[np.floating]) -> Floats:
-        """Return the places [m, 2] at other times [m] from 0 on.
+        """Return the positions [m, 2] at other times [m] from 0 on.
 
-        Straight from waypoint to waypoint, from the ego at 0 s; after the last, on at
-        the last velocity.
+        They are interpolated linearly, from the ego at 0 s; after the last waypoint
+        they continue at the last velocity.
         """
         times = np.concatenate([[0.0], self.times_s])
         points = np.vstack([np.zeros((1, 2)), self.points])

@@ -1,4 +1,4 @@
-"""What int8 costs, module by module, and which nodes are to blame."""
+"""Measure the loss of int8 module by module, and find the nodes to blame."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -12,17 +12,13 @@ BLAME = 0.5
 
 @dataclasses.dataclass(frozen=True)
 class ModuleSensitivity:
-    """What one module costs when it alone is int8.
+    """The loss of one module when it alone is int8.
 
-    Attributes:
-        module: its name.
-        nodes: how many of its nodes are int8 then.
-        score: of that variant.
-        driving: its closed-loop score; None where nothing is driven.
-        blamed: groups of nodes, worst first, each with its loss as the only int8
-            nodes of the graph; a group of one is a node found by bisection, a larger
-            one costs that only together, or was left whole when the trials were used
-            up. Empty where the cost is spread over the module.
+    ``nodes`` counts those that are int8 then; ``driving`` is None if nothing is driven.
+    ``blamed`` holds groups of nodes, worst first, each with its loss as the only int8
+    nodes of the graph. A single node was found by bisection; a larger group is costly
+    only together, or was left whole when the trials were used up. It is empty if the
+    loss is spread over the module.
     """
 
     module: str
@@ -34,14 +30,10 @@ class ModuleSensitivity:
 
 @dataclasses.dataclass(frozen=True)
 class Sensitivity:
-    """What was found.
+    """The result of an analysis: modules with int8 nodes, worst first, and together.
 
-    Attributes:
-        findings: the modules that have int8 nodes, worst first.
-        together: the score of all of them.
-        trials: variants that were built and run.
-        float_driving: closed-loop score of the float model; None: nothing is driven.
-        driving: of all modules together; None: nothing is driven.
+    ``float_driving`` and ``driving`` are the closed-loop scores of the float model and
+    of all modules in int8, None if nothing is driven; ``trials`` counts variants.
     """
 
     findings: tuple[ModuleSensitivity, ...]
@@ -61,15 +53,12 @@ def analyse(
     """Score every module alone, then bisect it to the nodes that cost most.
 
     Half of a module's nodes is int8 at a time, then half of the costly half, and so on:
-    a node among n is found in about 2 log2 n trials. Modules are driven, where the
-    trials have a hook for that; halves of modules are not.
-
-    Args:
-        trials: judges variants.
-        modules: which may be int8.
-        node_trials: most trials spent on the nodes of one module; 0 leaves nodes out.
-        progress: called as ``progress(modules done, modules, module)``.
+    a node among n is found in about 2 log2 n trials. Modules are driven if the trials
+    have a hook for that; halves of modules are not. At most ``node_trials`` are spent
+    on the nodes of one module; ``progress`` is called as ``progress(modules done,
+    modules, module)``.
     """
+    # every module alone, bisected if it costs anything
     findings = []
     active = [name for name in modules if names_of(trials, name)]
     for done, module in enumerate(active):
@@ -83,6 +72,7 @@ def analyse(
         driving = trials.driving(Int8Choice((module,)))
         findings.append(ModuleSensitivity(module, len(names), score, driving, blamed))
     findings.sort(key=lambda each: -each.score.loss)
+    # all modules together, beside the float model
     every = Int8Choice(tuple(active))
     together = trials.score(every)
     return Sensitivity(

@@ -1,4 +1,4 @@
-"""From what was found to a recipe."""
+"""Choose what stays float, and write the choice as a recipe."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,24 +20,18 @@ def advise(
 ) -> Int8Choice:
     """Choose what keeps the loss within a limit, with as little in float as possible.
 
-    Starts with all modules in int8. Until the measured losses are within the limits,
-    the costliest module first gives up the nodes that are to blame, the worst first,
-    then all of them. Then each that was given up, the last first, is int8 again if
-    the losses stay within the limits: errors may cancel, or one costly node hide
-    behind another.
+    It starts with all modules in int8. Until the measured losses are within the limits,
+    the costliest module first gives up the blamed nodes, the worst first, then all of
+    its nodes. Then each that was given up, the last first, returns to int8 if the
+    losses stay within the limits: errors may cancel, or one costly node hide behind
+    another.
 
-    Args:
-        trials: judges variants.
-        found: what :func:`analyse` found.
-        limit: largest loss, in its unit.
-        driving_limit: how far the closed-loop score may lie below the float model's,
-            asked once the loss is within its limit; None asks for no drive.
-
-    Returns:
-        The choice; no module at all where none keeps the limits.
+    ``driving_limit`` is how far the closed-loop score may lie below the float model's;
+    it is checked once the loss is within its limit. The choice has no module if nothing
+    keeps the limits.
 
     Raises:
-        EvaluationError: a limit of driving, and trials that have no hook for it.
+        EvaluationError: a limit of driving, but trials without a drive hook.
     """
 
     def fits(given: Sequence[_Sacrifice]) -> bool:
@@ -48,9 +42,11 @@ def advise(
             return False
         return driving_limit is None or _driving_loss(trials, choice) <= driving_limit
 
+    # give up nodes and modules until the limits are kept
     order, given = _sacrifices(found), list[_Sacrifice]()
     while not fits(given):
         given.append(order[len(given)])
+    # take back what turns out not to matter
     for each in reversed(given):
         kept = [other for other in given if other is not each]
         if each.loss <= limit and fits(kept):
@@ -60,7 +56,7 @@ def advise(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Sacrifice:
-    """What may be given up: nodes of a module, or all of it; and its loss alone."""
+    """Nodes of a module, or all of it (None), with their loss as the only int8."""
 
     module: str
     nodes: tuple[str, ...] | None
@@ -112,17 +108,10 @@ def write_recipe(
     rules: str,
     target: str,
 ) -> Path | None:
-    """Write a recipe and, where nodes stay float, the overrides beside it.
+    """Write a recipe and, if nodes stay float, the overrides beside it.
 
-    Args:
-        path: of the recipe.
-        choice: what is int8.
-        passes: before int8, by name; the sizes of open dimensions that one gives.
-        rules: rule set of the plan.
-        target: runtime of the int8 graph.
-
-    Returns:
-        The file of overrides; None where none is needed.
+    ``passes`` run before int8, by name, with sizes for open dimensions. Returns the
+    file of overrides, None if none is needed.
     """
     lines = [_entry(name, dims) for name, dims in passes.items()]
     overrides = path.with_name(path.stem + ".overrides.toml")

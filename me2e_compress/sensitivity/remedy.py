@@ -1,4 +1,4 @@
-"""Where int8 loses quality, and what gives it back: nodes or modules in float."""
+"""Find the nodes or modules that restore quality when kept in float."""
 
 import dataclasses
 from collections import Counter
@@ -21,10 +21,7 @@ MOST_TRIALS = 12
 class Int8Node:
     """A node that is int8, named so that an override can name it.
 
-    Attributes:
-        name: of the node.
-        op: its operator.
-        module: its ME2E module; empty if unknown.
+    ``module`` is its ME2E module, empty if unknown.
     """
 
     name: str
@@ -32,21 +29,17 @@ class Int8Node:
     module: str
 
     def __str__(self) -> str:
-        """Return name, operator and module."""
         where = f", module {self.module}" if self.module else ""
         return f"{self.name} ({self.op}{where})"
 
 
 @dataclasses.dataclass(frozen=True)
 class Remedy:
-    """What is kept in float to be true to the float model.
+    """What is kept in float to stay true to the float model, and the fidelity then.
 
-    Attributes:
-        nodes: that alone make much of the noise, in the order in which they were found.
-        modules: kept in float as a whole, where the noise is spread over their nodes.
-        fidelity: with these in float, on the frames of the search.
-        shortfalls: what is below the floor then; empty where they cure it.
-        trials: variants that were built and run.
+    ``nodes`` alone make much of the noise, in the order in which they were found;
+    ``modules`` are kept whole, where the noise is spread over their nodes.
+    ``shortfalls`` are empty if these cure everything.
     """
 
     nodes: tuple[Int8Node, ...]
@@ -61,7 +54,7 @@ class Remedy:
         return not self.shortfalls
 
     def overrides(self) -> str:
-        """Write what ``--overrides`` takes; empty where nothing was found."""
+        """Return what ``--overrides`` takes; empty if nothing was found."""
         return overrides_text(
             (
                 *(keep_float(each.name, "") for each in self.nodes),
@@ -78,8 +71,8 @@ group that is being narrowed down: everything else is float. Without group: none
 def int8_nodes(plan: QuantPlan) -> tuple[Int8Node, ...]:
     """List the nodes that a plan makes int8, in graph order.
 
-    Residual Adds are left out: they follow their convolution. So are nodes without a
-    name of their own.
+    Residual Adds are left out, since they follow their convolution, and so are nodes
+    without a unique name.
     """
     chosen = [each for each in plan.placed if each.rule != RESIDUAL and each.node]
     often = Counter(each.node for each in chosen)
@@ -103,19 +96,14 @@ def find_remedy(
     """Search the nodes that must be float for every output to be above the floor.
 
     The noise of the worst output is followed by bisection: half of the nodes is int8 at
-    a time, one trial a step; what the other half makes is what is left of the noise,
-    squares added up. A node that alone makes half of the noise's amplitude is kept
-    float; where no such node is found, the module is that most of the noise comes
-    from. Then the whole is measured again, and the next one is looked for.
+    a time, one trial a step; the other half makes what is left of the noise, as a sum
+    of squares. A node that alone makes half of the noise's amplitude is kept float; if
+    there is no such node, the module from which most of the noise comes is. Then the
+    whole is measured again, and the next one is looked for.
 
-    Args:
-        nodes: those that are int8, in graph order.
-        start: of all of them in int8.
-        measure: tells the fidelity of a variant.
-        floor: what is to be reached.
-        unsteady: outputs that are not judged.
-        most_trials: most variants to build.
-        progress: called as ``progress(trials done, most trials, words)``.
+    ``nodes`` are the int8 ones in graph order, ``start`` is the fidelity with all of
+    them; ``unsteady`` outputs are not judged; ``progress`` is called as
+    ``progress(trials done, most trials, words)``.
     """
     search = _Search(nodes, measure, floor, unsteady, most_trials, progress)
     return search.run(start)
@@ -144,7 +132,7 @@ class _Search:
         self._modules: list[str] = []
 
     def run(self, start: Fidelity) -> Remedy:
-        """Follow the worst output until none is below the floor, or trials are out."""
+        """Follow the worst output until none is below the floor, or trials run out."""
         found = start
         while below := self._floor.shortfalls(found, self._unsteady):
             # A step of the bisection, and the trial that confirms it.
@@ -155,7 +143,7 @@ class _Search:
         return Remedy(tuple(nodes), tuple(self._modules), found, below, self._done)
 
     def _keep(self, worst: Shortfall) -> bool:
-        """Keep more nodes float; False where nothing is left that would help."""
+        """Keep more nodes float; False if nothing is left that would help."""
         left = [each for each in self._nodes if each not in self._floats()]
         group = self._bisect(left, worst)
         if len(group) == 1:

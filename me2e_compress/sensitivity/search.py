@@ -1,4 +1,4 @@
-"""Which modules to make int8 under budgets of time, size and energy."""
+"""Choose the modules to make int8 under budgets of time, size and energy."""
 
 import dataclasses
 import itertools
@@ -20,10 +20,7 @@ MOST_MODULES = 16
 class Budget:
     """What a variant may cost.
 
-    Attributes:
-        limit: the most it may cost.
-        unit: of the cost, e.g. ``bytes`` or ``s``.
-        cost: measures a graph.
+    ``unit`` is that of the cost, e.g. ``bytes`` or ``s``; ``cost`` measures a graph.
     """
 
     limit: float
@@ -33,16 +30,12 @@ class Budget:
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
-    """One assignment.
+    """One assignment: the modules that are int8, and what they cost.
 
-    Attributes:
-        modules: those that are int8.
-        loss: predicted: the losses of its modules alone, squared and added, the root
-            of that: errors of different modules are taken to be independent.
-        costs: predicted, one a budget: those of the float model less what each module
-            alone saves.
-        score: measured; None where it was not tried.
-        measured_costs: measured; None where it was not tried.
+    The predicted ``loss`` is the root of the sum of squares of its modules' own losses:
+    errors of different modules are taken to be independent. The predicted ``costs``,
+    one per budget, are those of the float model less what each module alone saves.
+    ``score`` and ``measured_costs`` are None if it was not tried.
     """
 
     modules: tuple[str, ...]
@@ -60,25 +53,16 @@ def search(
     most_tried: int = 8,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> tuple[Candidate, ...]:
-    """Find the assignment that loses least within every budget.
+    """Find the assignment with the least loss within every budget.
 
-    Every module is scored and weighed alone; all assignments are predicted from that,
-    and the best of those that should fit are built, scored and weighed in turn until
-    one does fit; the last that is tried is the cheapest of all.
-
-    Args:
-        trials: judges variants.
-        modules: those that may be int8.
-        budgets: all are to be met; at least one.
-        most_tried: assignments that are built.
-        progress: is called with modules done and in all, and the next one.
-
-    Returns:
-        What was tried; the last one fits.
+    Every module is scored and weighed alone, which predicts all assignments. The best
+    of those that should fit, at most ``most_tried``, are built, scored and weighed in
+    turn until one does fit, the cheapest of all last. Returns what was tried, the fit
+    last; ``progress`` is called with modules done and in all, and the next one.
 
     Raises:
-        EvaluationError: too many modules, or nothing fits; the message gives the least
-            costs that were found.
+        EvaluationError: too many modules, or nothing fits; it gives the least costs
+            found.
     """
     active = [name for name in modules if names_of(trials, name)]
     if len(active) > MOST_MODULES:
@@ -116,13 +100,7 @@ def nothing_fits(
     whole: Sequence[float],
     found: Sequence[Sequence[float]],
 ) -> str:
-    """Say that no assignment is within the budgets, and what the least costs are.
-
-    Args:
-        limits: the budgets: the most that may be spent, and its unit.
-        whole: what the float model costs.
-        found: what each assignment costs.
-    """
+    """Return the message that nothing is within the budgets, with the least costs."""
 
     def said(costs: Iterable[float]) -> str:
         pairs = zip(costs, limits, strict=True)
@@ -143,7 +121,7 @@ def _costs(budgets: Sequence[Budget], made: ir.Model) -> tuple[float, ...]:
 
 
 def _share(budgets: Sequence[Budget], costs: Sequence[float]) -> float:
-    """Return how much of the budget that is met worst is spent; 1 is all of it."""
+    """Return the share spent of the tightest budget; 1 is all of it."""
     return max(cost / budget.limit for cost, budget in zip(costs, budgets, strict=True))
 
 
@@ -163,7 +141,7 @@ def _predict(
     savings: dict[str, tuple[float, ...]],
     whole: tuple[float, ...],
 ) -> list[Candidate]:
-    """Predict all assignments, the least loss first, then the least costs."""
+    """Predict all assignments, sorted by loss, then by costs."""
     subsets = itertools.chain.from_iterable(
         itertools.combinations(modules, size) for size in range(len(modules) + 1)
     )

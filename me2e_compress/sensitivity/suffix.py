@@ -1,4 +1,4 @@
-"""Run again only what a change can reach: everything else answers as it did."""
+"""Re-run only the part of a graph that a change can reach."""
 
 import dataclasses
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -19,10 +19,8 @@ from me2e_compress.targets.quantized import PAIR
 class Suffix:
     """The part of a float graph behind some of its nodes.
 
-    Attributes:
-        boundary: names of the values that enter it and are computed before it.
-        outputs: names of the graph's outputs that it gives.
-        share: its MACs over those of the graph.
+    ``boundary`` names the values that enter it and are computed before it, ``outputs``
+    the graph's outputs that it computes; ``share`` is its share of the graph's MACs.
     """
 
     boundary: tuple[str, ...]
@@ -31,12 +29,7 @@ class Suffix:
 
     @classmethod
     def behind(cls, model: ir.Model, names: Collection[str]) -> Self | None:
-        """Find what some nodes reach; None in a graph with subgraphs.
-
-        Args:
-            model: the float graph.
-            names: of the nodes.
-        """
+        """Find what the named nodes reach; None in a graph with subgraphs."""
         if any(True for _ in model.graph.subgraphs()):
             return None  # their bodies read values by name
         count, total, inside = graph.macs_counter(model), 0, 0
@@ -57,12 +50,7 @@ class Suffix:
     def capture(self, model: ir.Model, reference: Reference) -> Reference:
         """Run the float graph once for the values at the boundary.
 
-        Args:
-            model: the float graph.
-            reference: its answers on one frame.
-
-        Returns:
-            The same answers, to frames that hold the boundary too.
+        Returns the reference's answers, with frames that hold the boundary too.
         """
         probe = model.clone()
         values = _values(probe)
@@ -80,15 +68,17 @@ class Suffix:
         return Reference(reference.session, _Kept(tuple(frames)), reference.answers)
 
     def cut(self, variant: ir.Model) -> ir.Model | None:
-        """Cut it out of a variant of the graph; None where it does not stand alone.
+        """Cut the suffix out of a variant; None if it does not stand alone.
 
-        That is where int8 was put before the boundary too: on what a Concat joins.
+        That happens if int8 was put before the boundary too: on what a Concat joins.
         """
+        # where the suffix begins in this variant
         part = variant.clone()
         values = _values(part)
         entering = [values[name] for name in self.boundary if name in values]
         if len(entering) < len(self.boundary) or _quantized(entering):
             return None
+        # keep the suffix's outputs alone, and read the boundary from new inputs
         ports = [ir.Value(shape=e.shape, type=e.type) for e in entering]
         kept = [each for each in part.graph.outputs if each.name in self.outputs]
         part.graph.outputs.clear()
@@ -96,6 +86,7 @@ class Suffix:
         for old, new in zip(entering, ports, strict=True):
             old.replace_all_uses_with(new)
         rewrite.sweep(part)
+        # the ports take the boundary's names once the old nodes are swept
         for name, port in zip(self.boundary, ports, strict=True):
             port.name = name
             part.graph.inputs.append(port)
@@ -122,7 +113,7 @@ def _values(model: ir.Model) -> dict[str, ir.Value]:
 
 
 def _quantized(values: Iterable[ir.Value]) -> bool:
-    """Whether what computes some values holds pairs."""
+    """Return whether Q/DQ pairs compute any of these values."""
     left = [each.producer() for each in values]
     seen = set[ir.Node]()
     while left:
@@ -137,7 +128,7 @@ def _quantized(values: Iterable[ir.Value]) -> bool:
 
 
 def _states(session: Session) -> Mapping[str, Array]:
-    """Return the first value of every state of known shape: zeros."""
+    """Return zeros for every state of known shape."""
     ports = {name: session.inputs[name] for name in session.recurrent}
     return {
         name: np.zeros([each for each in port.shape if isinstance(each, int)], dtype)

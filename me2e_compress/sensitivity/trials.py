@@ -1,4 +1,4 @@
-"""One float model, calibrated once, of which many int8 variants are judged."""
+"""Judge many int8 variants of one float model that is calibrated once."""
 
 import dataclasses
 from collections.abc import Callable
@@ -26,12 +26,7 @@ _GLOB = str.maketrans({"[": "[[]", "?": "[?]", "*": "[*]"})
 
 @dataclasses.dataclass(frozen=True)
 class Int8Choice:
-    """What is int8.
-
-    Attributes:
-        modules: these, in the order of the module map.
-        floats: names of nodes in them that stay float.
-    """
+    """The modules that are int8, in map order, and their nodes that stay float."""
 
     modules: tuple[str, ...]
     floats: tuple[str, ...] = ()
@@ -54,22 +49,17 @@ Drive: TypeAlias = Callable[[Int8Choice, ir.Model], float]
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """How an int8 variant does.
-
-    Attributes:
-        fidelity: against the float model, on the frames.
-        weight_bytes: of all its weights.
-    """
+    """The fidelity of an int8 variant to the float model, and its weights' bytes."""
 
     fidelity: Fidelity
     weight_bytes: int
 
     @property
     def loss(self) -> float:
-        """What is to be small: metres that the plan moves, mean over the frames.
+        """Metres that the plan moves, mean over the frames; smaller is better.
 
-        For a model whose plan is not known, the amplitude of the noise of its worst
-        output, relative to the signal: 10^(-SQNR / 20).
+        For a model whose plan is not known, the noise amplitude of its worst output,
+        relative to the signal: 10^(-SQNR / 20).
         """
         if self.fidelity.plan is not None:
             return self.fidelity.plan.mean_m
@@ -85,21 +75,12 @@ class Score:
 class Trials:
     """Makes int8 variants of a model and judges them; each choice once.
 
-    Args:
-        model: the float graph after the exact passes, shapes inferred.
-        modules: its module map.
-        rules: of the plans.
-        target: how int8 is written. Fidelity is judged on what is written.
-        ranges: of every tensor that any variant needs.
-        frames: to judge on; read once for every variant.
-        drive: the hook for closed-loop scores; None where nothing is driven.
-        threads: of onnxruntime; 0 takes all.
-        provider: what runs the variants.
-
-    Attributes:
-        model: as given; ``modules`` and ``ranges`` too.
-        reference: what the float model answered.
-        done: how many variants were built and run.
+    ``model`` is the float graph after the exact passes, shapes inferred; fidelity is
+    judged on the graph as ``target`` writes it; ``ranges`` cover every tensor that any
+    variant needs; ``frames`` are read once for every variant; ``drive`` gives
+    closed-loop scores, None drives nothing; 0 ``threads`` takes all. ``reference``
+    holds the float model's answers, ``done`` counts the variants that were built and
+    run.
     """
 
     def __init__(
@@ -149,12 +130,7 @@ class Trials:
         return self._target.place(self.model, self.plan(choice), self.ranges)
 
     def score(self, choice: Int8Choice) -> Score:
-        """Judge a choice.
-
-        Raises:
-            GraphError: onnxruntime cannot run the variant.
-            EvaluationError: an output is not finite.
-        """
+        """Build, run and judge a choice."""
         if choice not in self._known:
             graph_of_choice = self.variant(choice)
             self._known[choice] = Score(
@@ -165,7 +141,7 @@ class Trials:
         return self._known[choice]
 
     def driving(self, choice: Int8Choice) -> float | None:
-        """Ask the hook for the closed-loop score of a choice; None without a hook."""
+        """Return the closed-loop score of a choice; None without a hook."""
         if self._drive is None:
             return None
         if choice not in self._driven:

@@ -1,5 +1,5 @@
-"""The world that is driven in, on highway-env: routes, traffic, scenarios, cameras.
+"""The simulated world on highway-env: routes, traffic, scenarios, cameras.
 
 It knows no policy and no model: at each frame it is given a `Control`. Routes are read
-without highway-env; what moves and what is seen needs the extra ``highway``.
+without highway-env; movement and rendering need the extra ``highway``.
 """

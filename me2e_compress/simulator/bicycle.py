@@ -9,7 +9,7 @@ centre moves along ``heading + b``, not along the heading, where the slip angle 
 import math
 
 MAX_STEERING_RAD = 0.6
-"""What the front wheels of the ego can do."""
+"""Largest angle of the ego's front wheels."""
 
 
 def slip_of(steering_rad: float) -> float:
@@ -47,16 +47,11 @@ def advance(
 def steering_through(forward_m: float, left_m: float, length_m: float) -> float:
     """Return the steering angle whose circle leads the centre through a point ahead.
 
-    The chord to a point at distance D leaves the heading by the slip angle b plus
-    half the turn: ``bearing = b + asin(D sin b / length)``. The left side grows with
-    b, so Newton's method from the linear solution needs few steps. Ignoring b
-    (``2 left / D^2`` as the curvature) answers 2.25 times too much at D = 4 m for a
-    5 m car; the car then cuts into every bend.
-
-    Args:
-        forward_m: The point in the ego frame, from the centre.
-        left_m: The same, positive to the left.
-        length_m: Length of the ego.
+    The point is in the ego frame. The chord to a point at distance D leaves the heading
+    by the slip angle b plus half the turn: ``bearing = b + asin(D sin b / length)``.
+    The left side grows with b, so Newton's method from the linear solution needs few
+    steps. Ignoring b (``2 left / D^2`` as the curvature) answers 2.25 times too much at
+    D = 4 m for a 5 m car; the car then cuts into every bend.
     """
     distance = max(math.hypot(forward_m, left_m), 0.1)
     bearing = math.atan2(left_m, max(forward_m, 0.1))

@@ -1,4 +1,4 @@
-"""Where the six cameras sit on the ego and how they project.
+"""Positions of the six cameras on the ego, and their projections.
 
 Conventions: the ego frame is x forward, y left, z up, its origin on the ground under
 the centre of the ego's box. A camera frame is x right, y down, z forward. Pixels are
@@ -56,21 +56,12 @@ CAMERA_NAMES = tuple(camera.name for camera in CAMERAS)
 
 @dataclass(frozen=True, eq=False)
 class CameraRig:
-    """The six cameras at one image size.
-
-    Args:
-        height: Rows of an image, 16 to 4096.
-        width: Columns of an image, 16 to 4096.
-
-    Raises:
-        EvaluationError: The size is out of range.
-    """
+    """The six cameras at one image size, 16 to 4096 rows and columns."""
 
     height: int = 96
     width: int = 160
 
     def __post_init__(self) -> None:
-        """Check the size."""
         for name, side in (("height", self.height), ("width", self.width)):
             if not SMALLEST_SIDE_PX <= side <= LARGEST_SIDE_PX:
                 raise EvaluationError(

@@ -140,11 +140,9 @@ class RoutePath:
     ) -> tuple[float, float]:
         """Return (arc length, lateral offset) of a point, positive to the left.
 
-        Args:
-            x: Metres.
-            y: Metres.
-            near_m: Where the point was last seen; only the path from 10 m before to
-                30 m after is searched then. Routes may cross themselves.
+        ``near_m`` is the arc length where the point was last seen; only the path from
+        10 m before to 30 m after it is searched then, since routes may cross
+        themselves.
         """
         low, high = 0, len(self._direction)
         if near_m is not None:

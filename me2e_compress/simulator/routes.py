@@ -27,11 +27,8 @@ class Route:
         scenario: One of the 44 types (`catalogue.SCENARIO_ABILITIES`).
         ability: The first ability that Bench2Drive counts the type under.
         seed: Decides every parameter that is not given.
-        parameters: Values by name; what is given here is not drawn from the seed,
-            so editing one changes that one and nothing else.
-
-    Raises:
-        EvaluationError: An id that is not a file name, or an unknown scenario.
+        parameters: Values by name; what is given here is not drawn from the seed, so
+            editing one changes that one and nothing else.
     """
 
     id: str
@@ -41,7 +38,6 @@ class Route:
     parameters: dict[str, Parameter] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check the id, the scenario and the ability."""
         if not is_route_id(self.id):
             raise EvaluationError(
                 f"route id {self.id!r}: only letters, digits, '_' and '-' are allowed"
@@ -65,7 +61,7 @@ class Route:
 
 
 def is_route_id(text: str) -> bool:
-    """Return whether a text can be the id of a route, and so the name of a file."""
+    """Return whether a text can be the id of a route, and so part of a file name."""
     return 0 < len(text) <= 200 and all(c.isalnum() or c in "_-" for c in text)
 
 
@@ -78,6 +74,7 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
     Raises:
         EvaluationError: The file is missing, not a manifest, or repeats an id.
     """
+    # a faulty manifest is reported by its first fault
     try:
         routes = _MANIFEST.validate_json(documents.content(path), strict=True)
     except OSError as error:
@@ -88,6 +85,7 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"]) or "the file"
         raise EvaluationError(f"{path}: {where}: {first['msg']}") from error
+    # ids are unique
     seen: dict[str, int] = {}
     for index, route in enumerate(routes):
         if route.id in seen:
@@ -99,11 +97,7 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
 
 
 def save_routes(routes: Sequence[Route], path: Path) -> None:
-    """Write a manifest atomically, one route a line.
-
-    Raises:
-        EvaluationError: The file cannot be written.
-    """
+    """Write a manifest atomically, one route a line."""
     lines = ",\n".join(json.dumps(asdict(route)) for route in routes)
     try:
         write_bytes(path, f"[\n{lines}\n]\n".encode())
@@ -114,10 +108,8 @@ def save_routes(routes: Sequence[Route], path: Path) -> None:
 def pick_routes(routes: Sequence[Route], which: str) -> tuple[Route, ...]:
     """Return the routes that ``which`` asks for.
 
-    Args:
-        routes: What there is.
-        which: ``all``, a number N (N routes spread evenly over the manifest), or
-            ids separated by commas.
+    It is ``all``, a number N (N routes spread evenly over the manifest), or ids
+    separated by commas.
 
     Raises:
         EvaluationError: An unknown id, or a number that is too large.

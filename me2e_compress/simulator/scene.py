@@ -1,8 +1,8 @@
-"""What can be seen of the world at one instant: frozen, metric, right-handed.
+"""Snapshots of the world at one instant: frozen, metric, right-handed.
 
-The plane is x east, y north, headings in radians counter-clockwise from east; the
-ego frame is x forward, y left. highway-env's own world has its y axis pointing
-down; only `world` knows that, and converts once when it takes a snapshot.
+The plane is x east, y north, headings in radians counter-clockwise from east; the ego
+frame is x forward, y left. highway-env's own world has its y axis pointing down; only
+`world` knows that, and converts once when it takes a snapshot.
 """
 
 from dataclasses import dataclass

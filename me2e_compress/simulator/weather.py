@@ -17,7 +17,7 @@ class Weather:
         brightness: Factor on all pixels, 0 to 4: exposure, or a dirty lens.
         noise: Standard deviation of the sensor's noise in grey levels, 0 to 64.
         dropped: Names of cameras that fail: their images are black.
-        seed: Of rain and noise.
+        seed: Seed of rain and noise.
 
     Raises:
         EvaluationError: An option is out of range or a camera is unknown.
@@ -32,7 +32,6 @@ class Weather:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the options."""
         if self.fog_m is not None and not 1.0 <= self.fog_m <= 100_000.0:
             raise EvaluationError(
                 f"weather option fog_m = {self.fog_m} is out of range: "

@@ -1,4 +1,4 @@
-"""Variants held against each other: size, latency, fidelity and the road."""
+"""Studies: compare variants by size, latency, fidelity and driving."""
 
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant

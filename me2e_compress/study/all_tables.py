@@ -1,4 +1,4 @@
-"""Every table of a study, the one of near misses among them."""
+"""All tables of a study, including near misses and endings of routes."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ COLUMNS = ("TTC < 1.5 s, %", "least TTC s", "PET s", "distance m", "at fault %")
 
 
 def all_tables(outcome: "StudyResult") -> tuple[Table, ...]:
-    """Every table of a study, in the order of reading; a preview is named so."""
+    """Return every table of a study, in reading order; a preview is marked as such."""
     compared = [differences(outcome)] if len(outcome.variants) > 1 else []
     found = (
         *scoreboards(outcome),
@@ -38,7 +38,7 @@ def all_tables(outcome: "StudyResult") -> tuple[Table, ...]:
 
 
 def route_table(outcome: "StudyResult") -> Table | None:
-    """Show how each route ended for each driver; None where they are too many."""
+    """Show how each route ended for each driver; None if there are too many routes."""
     driven = [each for each in outcome.drives if each.routes]
     if not driven or len(driven[0].routes) > MOST_ROUTES:
         return None
@@ -59,7 +59,7 @@ def route_table(outcome: "StudyResult") -> Table | None:
 
 
 def near_misses(outcome: "StudyResult") -> Table:
-    """Show how near every drive came to collisions, which few routes end in."""
+    """Show how near every drive came to collisions, which end few routes."""
     several = len(outcome.study.conditions) > 1
     return Table(
         "Near misses",

@@ -1,8 +1,8 @@
-"""Two drives held against each other route by route, whatever differs between them.
+"""Comparison of two drives route by route, whatever differs between them.
 
-A condition that changes one thing of another (``against``) asks what the change costs
-each variant, and whether it costs one more than the baseline: the mean of paired
-differences of differences. A pair holds any two drives against each other.
+A condition that changes one thing about another (``against``) shows what the change
+costs each variant, and whether it costs more than it costs the baseline: a mean of
+paired differences of differences. A pair compares any two drives.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,16 +22,12 @@ TWICE = (2.0 * WIDEST[0], 2.0 * WIDEST[1])
 
 @dataclass(frozen=True)
 class Change:
-    """One drive minus another, over the same routes.
+    """One drive minus another over the same routes, in points.
 
     Attributes:
         drive: ``VARIANT.CONDITION``.
-        against: The other drive.
-        driving_score: Points.
-        success_rate: Points.
-        beyond_driving_score: How much more than the baseline's, points; None for the
-            baseline itself, and for a pair.
-        beyond_success_rate: The same.
+        beyond_driving_score: Change minus the baseline's change; None for the baseline
+            itself, and for a pair.
     """
 
     drive: str
@@ -57,14 +53,7 @@ class Change:
 def changes(
     conditions: Sequence[Condition], drives: Sequence[Drive], baseline: str, seed: int
 ) -> tuple[Change, ...]:
-    """Hold every drive against the one that its condition changes.
-
-    Args:
-        conditions: Those that say ``against`` count.
-        drives: What was driven; a drive without the other is left out.
-        baseline: Name of the variant whose change the others' is held against.
-        seed: Of the bootstrap.
-    """
+    """Compare every drive with the one that its condition changes, if there is one."""
     there = _by_cell(drives)
     found = list[Change]()
     for condition in (each for each in conditions if each.against):
@@ -90,13 +79,7 @@ def changes(
 def held_against(
     pairs: Sequence[tuple[str, str]], drives: Sequence[Drive], seed: int
 ) -> tuple[Change, ...]:
-    """Hold pairs of drives against each other.
-
-    Args:
-        pairs: ``VARIANT.CONDITION`` of both; one that was not driven is left out.
-        drives: What was driven.
-        seed: Of the bootstrap.
-    """
+    """Compare pairs of drives (``VARIANT.CONDITION``) if both were driven."""
     there = _by_cell(drives)
     cells = [(_cell(one), _cell(other)) for one, other in pairs]
     return tuple(
@@ -158,7 +141,6 @@ def _beyond(
 
 
 def _values(routes: Sequence[RouteOutcome]) -> tuple[list[float], list[float]]:
-    """Return driving scores and success, both in percent."""
     return (
         [each.driving_score for each in routes],
         [100.0 * each.succeeded for each in routes],

@@ -1,4 +1,4 @@
-"""A condition of a study: what decisions cost, and what the cameras see."""
+"""A condition of a study: latency of decisions, world step, weather."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,27 +23,27 @@ TRACE = "trace"
 
 @dataclass(frozen=True)
 class Condition:
-    """What a variant drives under.
+    """The conditions that a variant drives under.
 
     Args:
-        name: As a variant's.
-        latency: What decisions cost, as ``evaluate`` takes it: ``none``, ``fps:F``, or
-            ``trace``, which is each model's own latencies, also within another source:
+        name: Follows the rules of a variant's name.
+        latency: Latency of decisions, as for ``evaluate``: ``none``, ``fps:F``, or
+            ``trace``, each model's own latencies, also within another source:
             ``agents{source=trace, per_agent_us=3000}``.
-        mean_of: Instead of a latency: every decision costs what decisions of this drive
-            cost on average, ``VARIANT.CONDITION``, a condition that stands before.
+        mean_of: Instead of a latency: every decision takes the mean of this drive,
+            ``VARIANT.CONDITION``, whose condition comes earlier.
         latency_model: ``drop`` or ``fifo``, see `LatencyModel`.
         in_order: Replay traces in their order, which keeps bursts.
-        limit_fps: Frame limiter: a decision costs no less than its period.
-        seed: Of draws from traces; None takes the study's.
+        limit_fps: Frame limiter: a decision takes at least one period.
+        seed: Seed of draws from traces; None takes the study's.
         dt_ms: Step of the world; results at different steps are not compared.
         weather: ``fog_m=80,night=0.5,noise=12,dropped=FRONT``; empty for a clear day.
-        against: Another condition, of which this one changes one thing: drives are
-            held against those under it, route by route.
+        against: Another condition that differs from this one in one thing: drives are
+            compared with those under it, route by route.
 
     Raises:
-        StudyError: A bad name, or options that do not go together.
-        EvaluationError: An option that `evaluate` refuses, too.
+        StudyError: The name is invalid, or options do not go together.
+        EvaluationError: An option is one that `evaluate` refuses, too.
     """
 
     name: str
@@ -58,7 +58,6 @@ class Condition:
     against: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse what nothing can be driven under."""
         check_name("condition", self.name)
         if bool(self.latency) == bool(self.mean_of):
             raise StudyError(f"condition {self.name}: give a latency or mean_of")
@@ -76,14 +75,13 @@ class Condition:
             raise StudyError(self._refusal())
 
     def source(self, seed: int) -> LatencySource:
-        """Return what decisions cost; one that lacks its trace waits for a model's.
+        """Return the latency source; one that lacks its trace waits for a model's.
 
-        Args:
-            seed: Of draws, where the condition has none of its own.
+        ``seed`` applies if the condition has none of its own.
 
         Raises:
-            EvaluationError: No such source, or an option that it refuses.
-            StudyError: It names a file: that is a variant's.
+            EvaluationError: There is no such source, or an option is invalid.
+            StudyError: It names a file, which belongs to a variant.
         """
         if self._names_a_file:
             raise StudyError(self._refusal())
@@ -95,7 +93,7 @@ class Condition:
 
     @property
     def traced(self) -> bool:
-        """Whether each model is charged what was measured of it."""
+        """Whether each model is charged its own measured latencies."""
         return not self.mean_of and self.source(0).lacks_trace
 
     @property
@@ -105,12 +103,7 @@ class Condition:
         return variant, condition
 
     def drives(self, latency: LatencySource, image_size: tuple[int, int]) -> Conditions:
-        """Return what a policy drives under.
-
-        Args:
-            latency: What its decisions cost.
-            image_size: Rows and columns of each camera.
-        """
+        """Return the conditions of a drive; ``image_size`` is rows and columns."""
         return Conditions(
             latency,
             step_us(self.dt_ms),
@@ -120,15 +113,11 @@ class Condition:
         )
 
     def described(self, device: str) -> str:
-        """Say what it is in words, for the head of a table.
-
-        Args:
-            device: That each model's own latencies are of.
-        """
+        """Describe it for the head of a table; ``device`` is that of the traces."""
         return ", ".join([f"{self.name}: {self._cost(device)}", *self._changes()])
 
     def to_json(self) -> dict[str, Any]:
-        """Return every option; ``charged`` is the latency, None where it is a mean."""
+        """Return every option; ``charged`` is the latency, None for a mean."""
         return {
             "name": self.name,
             "charged": self.latency or None,
@@ -182,15 +171,11 @@ def _per_second(fps: float) -> str:
 
 
 def check_conditions(conditions: Sequence[Condition], variants: Sequence[str]) -> None:
-    """Check what conditions say of each other.
-
-    Args:
-        conditions: In their order.
-        variants: Names of what drives.
+    """Check the references between conditions.
 
     Raises:
-        StudyError: A mean of a drive that does not stand before, or a condition held
-            against one that is not there.
+        StudyError: A mean is of a drive that does not come earlier, or a condition is
+            compared with one that does not exist.
     """
     before = list[str]()
     names = [each.name for each in conditions]
@@ -210,10 +195,10 @@ def check_conditions(conditions: Sequence[Condition], variants: Sequence[str]) -
 
 
 def check_conditions_elsewhere(evaluator: str, conditions: Sequence[Condition]) -> None:
-    """Refuse conditions that highway alone understands.
+    """Refuse conditions that only highway understands.
 
     Raises:
-        StudyError: A condition says more than its name and the latency ``none``.
+        StudyError: A condition has more than a name and the latency ``none``.
     """
     for each in conditions:
         if each != Condition(each.name, "none"):
@@ -231,7 +216,7 @@ def check_pairs(
     """Check that pairs name drives of the study.
 
     Raises:
-        StudyError: One does not.
+        StudyError: A variant or condition is unknown.
     """
     for name in (name for pair in pairs for name in pair):
         variant, _, condition = name.partition(".")

@@ -1,4 +1,4 @@
-"""What a study is: variants, the conditions they drive under, the one they face."""
+"""Definition of a study: variants, conditions, baseline, routes."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,20 +25,20 @@ from me2e_compress.workflows.other_evaluators import HIGHWAY, is_highway
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to have a driver: a file as it is, or what passes make of it.
+    """One driver to compare: a file as it is, or the result of passes.
 
     Args:
         name: Letters, digits, ``_``, ``+`` and ``-``; names its folder of results.
         policy: A policy by name, ``blind:8``, or the path of an ONNX file.
-        passes: What is applied to the file; none leaves it as it is.
+        passes: Passes applied to the file; none leaves it as it is.
         module_map: Preset or TOML file for the passes; None finds the preset.
         adapter: TOML file that adapts the model to the policy contract.
         trace: Latencies recorded on a device; None measures them here.
-        host_stage: Changes the model's plan on the host, as a text; its time is no
-            part of a trace, see the latency source ``host-stage``.
+        host_stage: Changes the model's plan on the host, as a text; a trace does not
+            include its time, see the latency source ``host-stage``.
 
     Raises:
-        StudyError: A bad name, or passes, an adapter or a trace without a model.
+        StudyError: The name is invalid, or passes, an adapter or a trace lack a model.
     """
 
     name: str
@@ -50,7 +50,6 @@ class Variant:
     host_stage: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse what could not be run."""
         check_name("variant", self.name)
         options = (
             *(self.passes, self.module_map, self.adapter, self.trace),
@@ -64,22 +63,22 @@ class Variant:
 
     @property
     def is_model(self) -> bool:
-        """Whether an ONNX file drives."""
+        """Whether the driver is an ONNX file."""
         return isinstance(driver_named(self.policy), OnnxDriver)
 
 
 @dataclass(frozen=True)
 class Timing:
-    """How latencies are measured, and what device they stand for.
+    """How latencies are measured, and which device they represent.
 
     Args:
-        samples: Inferences that count, of each model.
-        threads: Of onnxruntime.
-        baseline_median_s: Median latency of the baseline on the device imagined; one
-            scale makes it so, for all models alike. None takes this machine as it is.
+        samples: Timed inferences per model.
+        threads: Threads of onnxruntime.
+        baseline_median_s: Median latency of the baseline on the target device; it sets
+            one scale for all models. None takes this machine as it is.
 
     Raises:
-        StudyError: A number that is not positive.
+        StudyError: A number is not positive.
     """
 
     samples: int = 200
@@ -87,7 +86,6 @@ class Timing:
     baseline_median_s: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be measured."""
         median_s = self.baseline_median_s
         if self.samples < 1 or self.threads < 1:
             raise StudyError(
@@ -103,30 +101,27 @@ class Study:
     """Variants x conditions on the same routes.
 
     Args:
-        title: Heads the report.
+        title: Title of the report.
         variants: In the order of the tables.
         conditions: In the order of the tables.
-        baseline: Name of the variant that the others are held against.
-        routes: What each of them drives.
-        set_size: How many routes the whole set has.
+        baseline: Name of the variant that the others are compared with.
+        set_size: Number of routes of the whole set.
         frames: Folder of recorded frames that passes calibrate on.
-        held_out: Folder of other frames: fidelity and latency are measured on them.
-        timing: How latencies are measured.
-        seed: Of bootstraps, of passes and of draws from traces.
-        provider: What runs the models, wherever one is run.
-        to_record: Frames that it records itself; None takes folders.
-        blocks: Which variants drive under which conditions; none is all under all.
+        held_out: Folder of other frames, for measuring fidelity and latency.
+        seed: Seed of bootstraps, of passes and of draws from traces.
+        provider: Execution provider for all models.
+        to_record: Frames that the study records itself; None uses the folders.
+        blocks: Which variants drive under which conditions; empty means all under all.
             Under each condition the baseline drives too.
-        pairs: Drives that are held against each other, ``VARIANT.CONDITION`` of both.
+        pairs: Drives to compare, ``VARIANT.CONDITION`` of both.
         report: What is made of the results: a comparison, or the paper's tables, one
-            a block.
-        evaluator: What drives: ``highway``, or another by its name and options, which
-            has routes and conditions of its own.
+            per block.
+        evaluator: ``highway``, or another evaluator by its name and options, with
+            routes and conditions of its own.
 
     Raises:
-        StudyError: Nothing to drive, a name twice, a baseline that is not a variant, a
-            condition that names one that is not there, a negative seed, or passes or a
-            trace that need frames where there are none.
+        StudyError: There is nothing to drive, a name is repeated or unknown, the seed
+            is negative, or passes or a trace lack frames.
     """
 
     title: str
@@ -147,7 +142,6 @@ class Study:
     evaluator: str = HIGHWAY
 
     def __post_init__(self) -> None:
-        """Refuse what could not be finished."""
         check_unique("variant", (variant.name for variant in self.variants))
         check_unique("condition", (condition.name for condition in self.conditions))
         names = [variant.name for variant in self.variants]
@@ -171,17 +165,17 @@ class Study:
 
     @property
     def preview(self) -> str:
-        """What titles say of a part of the routes; empty where all are driven."""
+        """Suffix of titles if only a part of the routes is driven; empty otherwise."""
         driven, whole = len(self.routes), self.set_size
         partial = 0 < driven < whole
         return f" (preview: {driven} of {whole} routes)" if partial else ""
 
     @property
     def elsewhere(self) -> bool:
-        """Whether another evaluator than highway drives.
+        """Whether an evaluator other than highway drives.
 
         Raises:
-            EvaluationError: highway is given options, which the study has itself.
+            EvaluationError: Options are given to highway; the study has its own.
         """
         return not is_highway(self.evaluator)
 
@@ -228,10 +222,10 @@ class Study:
             yield from (file for step in each.passes for file in step.files())
 
     def check_recordings(self) -> None:
-        """Open the recordings that it names, and look for the files of its variants.
+        """Open the study's recordings, and check that the variants' files exist.
 
         Raises:
-            StudyError: One of them is not a recording, or a file is not there.
+            StudyError: A recording is invalid, or a file is missing.
         """
         for each in self.variants:
             for key, file in (("adapter", each.adapter), ("trace", each.trace)):
@@ -246,10 +240,7 @@ class Study:
                 raise StudyError(f"{name}: {error}") from error
 
     def driven_under(self, condition: Condition) -> tuple[Variant, ...]:
-        """Return the variants that drive under a condition; none under one of no block.
-
-        Where any drives, the baseline does.
-        """
+        """Return the variants under a condition, with the baseline if there are any."""
         if not self.blocks:
             return self.variants
         blocks = [each for each in self.blocks if condition.name in each.conditions]
@@ -257,13 +248,10 @@ class Study:
         return tuple(each for each in self.variants if each.name in wanted)
 
     def of_blocks(self, names: Sequence[str]) -> "Study":
-        """Return the part of it that some blocks need.
-
-        Args:
-            names: Of the blocks; ``2`` is ``table-2``.
+        """Return the part of the study that some blocks need; ``2`` names ``table-2``.
 
         Raises:
-            StudyError: No such block.
+            StudyError: There is no such block.
         """
         there = {each.name: each for each in self.blocks}
         chosen = list[StudyBlock]()
@@ -284,5 +272,5 @@ class Study:
 
     @property
     def reference(self) -> Variant:
-        """The baseline."""
+        """The baseline variant."""
         return next(each for each in self.variants if each.name == self.baseline)

@@ -1,4 +1,4 @@
-"""The demo with a driver: compressed, then both drive the same routes."""
+"""The demo with a driver: compress it, then drive the same routes with both."""
 
 import dataclasses
 from collections.abc import Callable
@@ -37,14 +37,7 @@ FLOAT = "float"
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class DriveResult(Result):
-    """How the driver drives before and after.
-
-    Attributes:
-        study: everything that was found.
-        written: its files.
-        variant: the one that was compressed.
-        ending: what the user has now.
-    """
+    """How the driver drives before and after compression."""
 
     study: StudyResult
     written: StudyFiles
@@ -53,20 +46,20 @@ class DriveResult(Result):
 
     @property
     def headline(self) -> str:
-        """How many routes, of how many."""
+        """Number of routes, and of routes in the set."""
         driven, whole = self.study.coverage
         return f"{driven} of {whole} routes, before and after"
 
     def lines(self) -> tuple[str, ...]:
-        """Return the verdict of the road, what the user has, another target."""
+        """Return the verdict on the driving, and next steps."""
         return (road_verdict(self.study, self.variant), *self.ending)
 
     def alerts(self) -> tuple[str, ...]:
-        """Return what puts the figures in doubt."""
+        """Return warnings that cast doubt on the figures."""
         return self.study.alerts()
 
     def tables(self) -> tuple[Table, ...]:
-        """Return size, time, plan and road, before and after."""
+        """Return size, time, plan and driving, before and after."""
         return (before_and_after(self.study, self.variant),)
 
     def details(self) -> tuple[Table, ...]:
@@ -74,32 +67,30 @@ class DriveResult(Result):
         return (*scoreboards(self.study), differences(self.study))
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a drive."""
+        """Return one row per drive."""
         return self.study.records()
 
     def to_json(self) -> object:
-        """Return everything that was found."""
+        """Return the whole study as JSON."""
         return self.study.to_json()
 
 
 @dataclasses.dataclass(frozen=True)
 class DriverDemo:
-    """The driver that ships, compressed, and both held against each other.
+    """Compress the shipped driver and compare both on the road.
 
     Attributes:
-        name: of the driver.
-        out: the folder.
-        recipe_name: a shipped recipe.
-        routes: that both drive: a number or ``ID,ID``.
-        workers: routes at a time.
-        provider: what runs the graphs.
-        force: replace files that are not as we left them, too.
+        name: Name of the driver.
+        recipe_name: A shipped recipe.
+        routes: Routes that both drive: a number or ``ID,ID``.
+        workers: Number of concurrent routes.
+        provider: Execution provider for the graphs.
+        force: Also replace files that were changed since we wrote them.
 
     Raises:
-        RecipeError: no such recipe.
-        EvaluationError: no such route.
-        GraphError: the folder is a file, or holds a file of the user's that would be
-            written.
+        RecipeError: There is no such recipe.
+        EvaluationError: There is no such route.
+        GraphError: The output folder is a file, or a user's file would be overwritten.
     """
 
     name: str
@@ -112,7 +103,7 @@ class DriverDemo:
     _told: list[Section] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
-        """Check recipe, routes and outputs: the work takes minutes."""
+        """Check recipe, routes and outputs first: the work takes minutes."""
         recipe.load(self.recipe_name)
         pick_routes(load_routes(), self.routes)
         check_folder(self.out, ())
@@ -126,7 +117,7 @@ class DriverDemo:
 
     @property
     def steps(self) -> dict[str, Callable[[Listener], Result]]:
-        """What is done, by name, in order."""
+        """The steps by name, in order."""
         return {
             "compress": self.compress,
             "weigh": self.weigh,
@@ -135,10 +126,10 @@ class DriverDemo:
         }
 
     def compress(self, listener: Listener) -> CompressResult:
-        """Copy the driver, let it see routes, make it small.
+        """Copy the driver, record frames, and compress it.
 
-        Int8 is for what drives here: placed for TensorRT it is slower than float on
-        the CPU.
+        The int8 plan is for this machine's runtime: placed for TensorRT, it is slower
+        than float on the CPU.
         """
         export_stack(self.name, self._source, ExportOptions(force=self.force))
         for folder, count, seed in (
@@ -168,13 +159,13 @@ class DriverDemo:
         return found
 
     def weigh(self, listener: Listener) -> ModuleChanges:
-        """Weigh the modules before and after."""
+        """Compare the modules before and after."""
         found = compare_modules(self._source, self._small)
         self._told.append(Section("The modules", found.tables()))
         return found
 
     def compare(self, listener: Listener) -> Result:
-        """Compare the small graph with the driver on other frames."""
+        """Compare the compressed graph with the driver on other frames."""
         found = compare(
             self._source,
             self._small,
@@ -213,7 +204,7 @@ class DriverDemo:
         return DriveResult(found, written, self.recipe_name, ending)
 
     def _files(self) -> Section:
-        """List what lies beside the page."""
+        """List the files linked from the page."""
         report, plan = (beside(self._small, what) for what in ("report", "plan"))
         files = (
             ("the driver", self._source),
@@ -228,7 +219,6 @@ class DriverDemo:
         return Section("Files", files=(*there, ("for programs", JSON)))
 
     def _words(self) -> tuple[str, ...]:
-        """Return the command that does all this."""
         words = ("me2e-compress", "demo", "-o", str(self.out))
         chosen = ["--routes", self.routes, "--recipe", self.recipe_name]
         if self.provider != CPU:
@@ -236,7 +226,7 @@ class DriverDemo:
         return (*words, *chosen)
 
     def _elsewhere(self) -> tuple[str, ...]:
-        """Say what to do for TensorRT, where that does not drive here."""
+        """Say how to compress for TensorRT if it does not run here."""
         target = self.provider.target
         if target == "tensorrt":
             return ()

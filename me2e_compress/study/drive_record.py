@@ -1,7 +1,7 @@
-"""What the tables need of a drive, without its frames: one line a route.
+"""The part of a drive that tables need, without its frames: one line per route.
 
-A drive of 220 routes is 30 MB of episodes and 0.1 MB of these: small enough to keep in
-a repository, and quick to read.
+A drive of 220 routes takes 30 MB of episodes and 0.1 MB of these lines: small enough to
+keep in a repository, and quick to read.
 """
 
 import json
@@ -34,24 +34,20 @@ _STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
 @with_config(_STRICT)
 @dataclass(frozen=True)
 class RouteSummary:
-    """One route of one drive.
+    """One route of one drive; unrecorded values are None.
 
     Attributes:
-        route: Its id.
-        scenario: Its type.
         driving_score: Percent.
         completion: Percent of the route.
-        succeeded: The whole route without an infraction.
-        ending: Why it was over, in words.
-        infractions: Kind, microseconds if known, and with whom or against what.
-        efficiency: Percent; None where no traffic moved, or the ego did not.
-        comfort: Share of smooth segments; None where there was no whole one.
-        duration_us: Until the last frame.
-        decisions: How many.
-        latency_us: What they cost on the vehicle: `PERCENTS` of them.
-        latency_sum_us: All of it.
-        ttc_exposure: Percent of the frames with a time to collision below 1.5 s; like
-            all below, None where it was not recorded or there was none.
+        succeeded: Whether the whole route was driven without an infraction.
+        infractions: Kind, microseconds if known, and the other party or obstacle.
+        efficiency: Percent; None if no traffic moved, or the ego did not.
+        comfort: Share of smooth segments; None if there was no whole one.
+        duration_us: Time of the last frame.
+        decisions: Number of decisions.
+        latency_us: `PERCENTS` of their latencies on the vehicle.
+        latency_sum_us: Sum of their latencies.
+        ttc_exposure: Percent of the frames with a time to collision below 1.5 s.
         smallest_ttc: Seconds.
         smallest_pet: Post-encroachment time of crossing paths, seconds.
         smallest_distance: Metres.
@@ -79,14 +75,14 @@ class RouteSummary:
 
     @property
     def collisions(self) -> tuple[tuple[str, str], ...]:
-        """Kind and partner of each collision."""
+        """Kind and other party of each collision."""
         return tuple(
             (kind, detail) for kind, _, detail in self.infractions if kind in COLLISIONS
         )
 
     @classmethod
     def of(cls, episode: Episode) -> Self:
-        """Sum up an episode."""
+        """Summarize an episode."""
         charged = [each.latency_us for each in episode.decisions]
         latency_us = np.percentile(charged or [0], PERCENTS, method="higher")
         return cls(
@@ -118,13 +114,8 @@ _ROUTE = TypeAdapter(RouteSummary)
 class DriveRecord:
     """One variant under one condition over routes.
 
-    Attributes:
-        variant: Its name.
-        condition: Its name.
-        set_size: How many routes the whole set has.
-        made_by: What decided it: version, digests of the policy and of the routes,
-            latency and the like, as `evaluate` keeps them.
-        routes: One a route.
+    ``made_by`` is the fingerprint of the evaluation without its routes: version,
+    digests of policy and routes, latency and so on.
     """
 
     variant: str
@@ -141,34 +132,26 @@ class DriveRecord:
         made_by: Mapping[str, Any],
         episodes: Iterable[Episode],
     ) -> Self:
-        """Sum up the episodes of a drive.
-
-        Args:
-            variant: Its name.
-            condition: Its name.
-            made_by: The fingerprint of the evaluation; its list of routes is left out,
-                the lines name them.
-            episodes: One a route.
-        """
+        """Summarize episodes; ``made_by`` loses its redundant list of routes."""
         kept = {key: value for key, value in made_by.items() if key != "routes"}
         routes = tuple(map(RouteSummary.of, episodes))
         return cls(variant, condition, int(made_by["set_size"]), kept, routes)
 
     @property
     def mean_latency_us(self) -> int | None:
-        """What a decision cost on average; None where none was taken."""
+        """Mean latency of a decision; None without decisions."""
         decisions = sum(each.decisions for each in self.routes)
         taken = sum(each.latency_sum_us for each in self.routes)
         return round(taken / decisions) if decisions else None
 
     @property
     def decisions_a_second(self) -> float:
-        """How many were taken, over the time driven; of routes of no length 0."""
+        """Decisions over the time driven; 0 if no time passed."""
         time_us = sum(each.duration_us for each in self.routes)
         return 1e6 * sum(each.decisions for each in self.routes) / max(time_us, 1)
 
     def save(self, path: Path) -> None:
-        """Write it as JSON lines: what made it, then a line a route.
+        """Write it as JSON lines: the fingerprint, then one line per route.
 
         Raises:
             StudyError: The file cannot be written.
@@ -188,11 +171,11 @@ class DriveRecord:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises:
-            StudyError: It cannot be read, is none or was cut off, or names a route
-                twice.
+            StudyError: The file is unreadable, malformed or truncated, or repeats a
+                route.
         """
         try:
             head, *rows = map(documents.from_json, _lines(path))
@@ -211,7 +194,7 @@ class DriveRecord:
         return record
 
     def difference_from(self, made_by: Mapping[str, Any]) -> str:
-        """Say what made it otherwise than this; empty if nothing did."""
+        """Say how another fingerprint differs from its own; empty if it does not."""
         for key in sorted({*made_by, *self.made_by} - {"routes"}):
             old, new = self.made_by.get(key), made_by.get(key)
             if old != new:

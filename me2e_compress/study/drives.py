@@ -1,4 +1,4 @@
-"""Every variant under every condition, driven and scored."""
+"""Drive and score every variant under every condition."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -33,12 +33,10 @@ class Drive:
     """One variant under one condition.
 
     Attributes:
-        variant: Its name.
-        condition: Its name.
-        scores: Over all routes; None where it was not driven.
-        difference: To the baseline under the same condition, paired by route; None
-            for the baseline itself and where one of the two was not driven.
-        routes: One a route, in the order of the study.
+        scores: Over all routes; None if it was not driven.
+        difference: Difference from the baseline under the same condition, paired by
+            route; None for the baseline itself and if one of the two was not driven.
+        routes: One per route, in the order of the study.
         reason: Why it was not driven; empty if it was.
     """
 
@@ -65,14 +63,8 @@ class Drive:
 class DriveSetup:
     """What all drives of a study share.
 
-    Args:
-        study: Variants, conditions, routes.
-        clock: Latencies of the models.
-        workspace: Where results go.
-        engine: Where routes are driven.
-        listener: Is called with progress and warnings.
-        means_us: What each mean of a drive came to, by its condition.
-        image_sizes: Rows and columns that each variant's policy wants.
+    ``means_us`` caches the mean latency of each ``mean_of`` condition, ``image_sizes``
+    the rows and columns that each variant's policy wants.
     """
 
     study: Study
@@ -89,7 +81,8 @@ class DriveSetup:
         """Drive the variants of one condition, the baseline first.
 
         Raises:
-            EvaluationError: A folder is of another evaluation or cannot be written.
+            EvaluationError: A folder belongs to another evaluation or cannot be
+                written.
         """
         driven = self.study.driven_under(condition)
         prepared = [each for each in prepared if each.variant in driven]
@@ -109,7 +102,7 @@ class DriveSetup:
         )
 
     def job(self, prepared: PreparedVariant, condition: Condition) -> Job | None:
-        """Return who drives under what; None if that, or its latency, is not known."""
+        """Return driver and conditions; None if they or the latency are unknown."""
         if prepared.failure:
             return None
         latency = self._latency(prepared, condition)
@@ -124,7 +117,7 @@ class DriveSetup:
     def _latency(
         self, prepared: PreparedVariant, condition: Condition
     ) -> LatencySource | None:
-        """Return what decisions cost; a mean is that of a drive that is done."""
+        """Return the latency of decisions; a mean needs its drive to be done."""
         if not condition.mean_of:
             return self.clock.source(prepared.variant, condition, self.study.seed)
         if condition.name not in self.means_us:
@@ -150,12 +143,12 @@ class DriveSetup:
         return round(fmean(taken))
 
     def record(self, prepared: PreparedVariant, condition: Condition) -> DriveRecord:
-        """Drive, and keep it without its frames; what is kept is not driven again.
+        """Drive, and keep the result without its frames; kept drives are not repeated.
 
         Raises:
-            EvaluationError: A folder is of another evaluation or cannot be written, or
-                a process was killed.
-            StudyError: It cannot be driven, or what is kept is of another evaluation.
+            EvaluationError: A folder belongs to another evaluation or cannot be
+                written, or a process was killed.
+            StudyError: It cannot be driven, or the kept drive is of another evaluation.
         """
         variant, job = prepared.variant, self.job(prepared, condition)
         if job is None:
@@ -173,7 +166,7 @@ class DriveSetup:
         return record
 
     def _kept(self, path: Path) -> DriveRecord | None:
-        """Read what is kept of a drive; a file that is none is made again."""
+        """Read a kept drive; an invalid file is made again."""
         if not path.is_file():
             return None
         try:
@@ -200,13 +193,7 @@ class DriveSetup:
     def some(
         self, prepared: PreparedVariant, condition: Condition, routes: Sequence[Route]
     ) -> tuple[Episode, ...]:
-        """Drive what is missing of some of the study's routes, and return these.
-
-        Raises:
-            EvaluationError: A folder is of another evaluation or cannot be written, or
-                a process was killed.
-            StudyError: It cannot be driven.
-        """
+        """Drive what is missing of some of the routes; errors are those of `record`."""
         job = self.job(prepared, condition)
         if job is None:
             raise StudyError(self._why_not(prepared))

@@ -1,4 +1,4 @@
-"""Drives of a study by another evaluator than highway-env."""
+"""Drive variants by an evaluator other than highway-env."""
 
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.study.condition import Condition
@@ -18,17 +18,13 @@ def episodes_elsewhere(
     condition: Condition,
     workspace: Workspace,
 ) -> tuple[Episode, ...]:
-    """Return the episodes of a variant, from its folder where they were kept.
+    """Return the episodes of a variant, from its folder if they were kept.
 
-    Args:
-        evaluator: Its name and options; the policy becomes its option ``policy``.
-        prepared: Who drives.
-        condition: Under what.
-        workspace: Where results go.
+    ``evaluator`` is its name and options; the policy becomes its option ``policy``.
 
     Raises:
-        EvaluationError: No such evaluator, one without the option ``policy``, or it
-            cannot evaluate.
+        EvaluationError: There is no such evaluator, it has no option ``policy``, or it
+            fails.
     """
     model = prepared.model
     policy = prepared.variant.policy if model is None else str(model)

@@ -1,4 +1,4 @@
-"""A study as a TOML file."""
+"""Read a study from a TOML file."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +27,7 @@ STUDIES = Path(__file__).parent / "shipped"
 
 
 def study_path(study: str | Path) -> Path:
-    """Find a study: a file, or, where there is none, one that ships by its name."""
+    """Return a study's file, or the shipped study of that name."""
     path = Path(study)
     shipped = STUDIES / f"{path}.toml"
     return shipped if not path.exists() and shipped.is_file() else path
@@ -43,25 +43,25 @@ def load_study(
 ) -> Study:
     """Read a study.
 
-    Files are looked for beside the study's own file; a policy that is not one there
-    is a model that ships. Nothing that it names is run here.
+    Files are looked up next to the study's own file; a policy that is not a file there
+    is a shipped model. Nothing that it names is run here.
 
     Args:
-        path: The TOML file, or the name of a study that ships.
-        routes: Drive these instead of the study's.
-        provider: What runs the models, instead of the study's, as a text.
-        plugins: Libraries of operators or plugins, besides the study's.
-        trust_code: Take a study that names code: a Python function that makes a policy,
-            or libraries, both of which may lie beside it.
+        path: The TOML file, or the name of a shipped study.
+        routes: Routes to drive instead of the study's.
+        provider: Execution provider instead of the study's, as a text.
+        plugins: Libraries of operators or plugins, in addition to the study's.
+        trust_code: Accept a study that names code: a Python function that makes a
+            policy, or libraries, both of which may lie next to it.
 
     Raises:
-        GraphError: A policy is neither a file nor a model that ships.
-        StudyError: No such file, not TOML, a key that is unknown, missing or of
-            another type, frames that are none, code that is not trusted, or a study
-            that could not be finished.
-        RecipeError: An unknown recipe or pass.
-        EvaluationError: Unknown routes or latency.
-        ProviderError: A provider or library that is not there.
+        GraphError: A policy is neither a file nor a shipped model.
+        StudyError: The file is missing or not valid TOML, a key is unknown, missing or
+            of another type, frames are invalid, code is not trusted, or the study is
+            inconsistent.
+        RecipeError: A recipe or pass is unknown.
+        EvaluationError: Routes or latency are unknown.
+        ProviderError: A provider or library is missing.
     """
     path = study_path(path)
     try:
@@ -171,7 +171,7 @@ _KINDS: dict[object, type[_Table]] = {
 
 
 def _complaint(error: ValidationError) -> str:
-    """Describe the first error; an unknown key goes first, it may explain others."""
+    """Describe the first error; unknown keys go first, as they may explain others."""
     found = error.errors(include_url=False)
     unknown = [each for each in found if each["type"] == "extra_forbidden"]
     first = (unknown or found)[0]
@@ -183,14 +183,14 @@ def _complaint(error: ValidationError) -> str:
 
 
 def _code(table: _Study) -> list[str]:
-    """List what a study has run that is neither ours nor an installed package's."""
+    """List the code that a study runs besides ours and installed packages'."""
     policies = [each.policy for each in table.variant if each.policy not in SHIPPED]
     made = [each for each in policies if isinstance(driver_named(each), PythonDriver)]
     return [*made, *table.plugins]
 
 
 class _Reader:
-    """Turns tables into a study; knows where its file lies."""
+    """Turns tables into a study, with paths relative to its file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -1,4 +1,4 @@
-"""Names of what a study holds: each the beginning of a file's name, and used once."""
+"""Names within a study: unique, and usable as file names."""
 
 import re
 from collections import Counter
@@ -13,8 +13,7 @@ def check_name(kind: str, name: str) -> None:
     """Check that a name can name a folder.
 
     Raises:
-        StudyError: It has other characters, or begins with one that is not a letter
-            or a digit.
+        StudyError: It has other characters, or does not begin with a letter or digit.
     """
     if _NAME.fullmatch(name) is None:
         raise StudyError(
@@ -23,10 +22,10 @@ def check_name(kind: str, name: str) -> None:
 
 
 def check_unique(kind: str, names: Iterable[str]) -> None:
-    """Check that there are names, and each once.
+    """Check that there are names, without repetition.
 
     Raises:
-        StudyError: There are none, or one stands there twice.
+        StudyError: There are none, or one is repeated.
     """
     counts = Counter(names)
     if not counts:

@@ -1,4 +1,4 @@
-"""What a study found."""
+"""Results of a study."""
 
 import os
 import platform
@@ -28,11 +28,8 @@ LATENCY_PERCENTILES = (50, 99)
 class VariantOutcome:
     """What a variant is, apart from how it drives.
 
-    Attributes:
-        prepared: Its driver and its file.
-        size_mb: Of the file with its weights, 1e6 bytes.
-        latency_ms: Percentile to milliseconds on the device.
-        fidelity: Its plan against the baseline's.
+    ``size_mb`` includes the weights (1e6 bytes); ``latency_ms`` maps percentiles to
+    milliseconds on the device.
     """
 
     prepared: PreparedVariant
@@ -42,14 +39,14 @@ class VariantOutcome:
 
     @property
     def name(self) -> str:
-        """The variant's name."""
+        """Name of the variant."""
         return self.prepared.variant.name
 
     @classmethod
     def of(
         cls, prepared: PreparedVariant, clock: Clock, fidelity: PlanFidelity
     ) -> "VariantOutcome":
-        """Collect what was found."""
+        """Collect the findings about a variant."""
         size = prepared.size_bytes
         name = prepared.variant.name
         why = prepared.failure or "no model"
@@ -66,7 +63,7 @@ class VariantOutcome:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return what the variant is; all that was measured by a clock is `latency`."""
+        """Return all facts; everything timed is below the key `latency`."""
         prepared = self.prepared
         return {
             "name": self.name,
@@ -85,18 +82,17 @@ class VariantOutcome:
 
 @dataclass(frozen=True, repr=False)
 class StudyResult(Result):
-    """Everything that a study found, and what it was made with.
+    """All results of a study, and what they were made with.
 
     Attributes:
-        study: What was asked.
-        variants: One a variant, in the study's order.
+        variants: In the study's order.
         drives: Condition by condition, the variants in the study's order.
-        contrasts: The same moments as two drivers lived them.
+        contrasts: Pictures of moments at which two drives differ.
         device_scale: How many times slower the device is than the machine timed on.
-        machine: What it was made on, in words.
-        versions: Of the packages that decide the result.
-        load: What other processes took while latencies were measured; None where none
-            was measured here.
+        machine: The machine of the study, in words.
+        versions: Versions of the packages that decide the result.
+        load: Load by other processes while latencies were measured; None if none was
+            measured here.
     """
 
     study: Study
@@ -115,7 +111,7 @@ class StudyResult(Result):
 
     @property
     def coverage(self) -> tuple[int, int]:
-        """Routes that were driven, and those of the whole set."""
+        """Number of routes driven, and of routes in the whole set."""
         if self.study.routes:
             return len(self.study.routes), self.study.set_size
         scores = [each.scores for each in self.drives if each.scores is not None]
@@ -123,7 +119,7 @@ class StudyResult(Result):
 
     @property
     def headline(self) -> str:
-        """Title, variants, conditions, routes."""
+        """Title, and numbers of variants, conditions and routes."""
         study, (driven, whole) = self.study, self.coverage
         return (
             f"{study.title}: {counted(len(study.variants), 'variant')} under"
@@ -132,25 +128,30 @@ class StudyResult(Result):
         )
 
     def lines(self) -> tuple[str, ...]:
-        """Return none: the tables say it."""
+        """Return nothing: the tables say it all."""
         return ()
 
     def alerts(self) -> tuple[str, ...]:
-        """Return the variants that failed, and why; whether the machine was busy."""
+        """Return the variants that failed, and whether the machine was busy."""
         failed = [each.prepared for each in self.variants if each.prepared.failure]
         busy = [str(self.load)] if self.load is not None and self.load.busy else []
         left_out = (
             f"variant {each.variant.name} was left out: {each.failure}"
             for each in failed
         )
-        return (*left_out, *busy)
+        broken = (
+            f"{each.variant}, {each.condition}: {each.scores.failed}"
+            for each in self.drives
+            if each.scores is not None and each.scores.failed
+        )
+        return (*left_out, *broken, *busy)
 
     def tables(self) -> tuple[Table, ...]:
-        """Return every table, in the order of reading."""
+        """Return every table, in reading order."""
         return all_tables(self)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a drive."""
+        """Return one row per drive."""
         return [self._record(each) for each in self.drives]
 
     def _record(self, drive: Drive) -> dict[str, object]:
@@ -180,13 +181,13 @@ class StudyResult(Result):
 
     @property
     def changes(self) -> tuple[Change, ...]:
-        """What the change of a condition costs each variant."""
+        """Cost of each change of a condition, by variant."""
         study = self.study
         return changes(study.conditions, self.drives, study.baseline, study.seed)
 
     @property
     def pairs(self) -> tuple[Change, ...]:
-        """The drives that the study holds against each other."""
+        """Comparisons of the pairs that the study names."""
         return held_against(self.study.pairs, self.drives, self.study.seed)
 
     def variant(self, name: str) -> VariantOutcome:
@@ -194,9 +195,9 @@ class StudyResult(Result):
         return next(each for each in self.variants if each.name == name)
 
     def to_json(self) -> dict[str, Any]:
-        """Return a document; the same study and seed give the same bytes but latency.
+        """Return a document; the same study and seed give the same bytes but latencies.
 
-        Latencies, and the scale taken from them, stand under the keys ``latency``.
+        Latencies, and the scale derived from them, are below the keys ``latency``.
         """
         study = self.study
         return {
@@ -223,7 +224,7 @@ class StudyResult(Result):
 
 
 def this_machine(load: Load | None = None) -> str:
-    """Name processor, cores and system, and a load that puts latencies in doubt."""
+    """Name processor, cores and system, and a load that makes latencies doubtful."""
     cores = f"{os.cpu_count() or 1} cores"
     named = f"{processor()}, {cores}, {platform.system()} {platform.machine()}"
     return f"{named}; {load}" if load is not None and load.busy else named

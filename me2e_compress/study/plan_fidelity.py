@@ -1,4 +1,4 @@
-"""How far a variant's plan moves from the baseline's, before anything drives."""
+"""Deviation of a variant's plan from the baseline's, before anything drives."""
 
 import math
 from collections.abc import Iterator
@@ -22,13 +22,9 @@ EXACT = "no noise: equal to the bit"
 
 @dataclass(frozen=True)
 class PlanFidelity:
-    """The plan of a variant held against the baseline's on held-out frames.
+    """The plan of a variant compared with the baseline's on held-out frames.
 
-    Attributes:
-        mean_m: Mean displacement of the waypoints.
-        max_m: Largest.
-        plan_sqnr_db: Signal to noise of the plan.
-        frames: How many were compared.
+    ``mean_m`` and ``max_m`` are displacements of the waypoints.
     """
 
     mean_m: Measure
@@ -38,7 +34,7 @@ class PlanFidelity:
 
     @classmethod
     def unknown(cls, reason: str) -> "PlanFidelity":
-        """Nothing was compared."""
+        """Return the result for a variant that was not compared."""
         return cls(
             Measure(None, "m", reason),
             Measure(None, "m", reason),
@@ -63,7 +59,7 @@ def judge(
 ) -> PlanFidelity:
     """Run both models over the held-out frames.
 
-    A model with other inputs or outputs is not an error: it was not measured, and the
+    A model with other inputs or outputs is not an error: it is not measured, and the
     reason says why.
     """
     if study.held_out is None:

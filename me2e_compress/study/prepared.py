@@ -30,15 +30,13 @@ class PreparedVariant:
     """A variant whose driver is ready.
 
     Attributes:
-        variant: Which.
-        driver: What drives.
         model: The ONNX file; None for a driver without one.
         source: Name of the file that passes were applied to.
         pipeline: The passes, as text; empty if the model is its own source.
-        sha256: Of the model.
-        size_bytes: Of the model with its weights.
+        size_bytes: Size of the model with its weights.
         failure: Why there is no model that can drive; empty if there is one.
-        weights: The checkpoint that the model was made of, in a line; empty: not known.
+        weights: Origin of the weights in a line, such as a checkpoint; empty if
+            unknown.
     """
 
     variant: Variant
@@ -55,10 +53,10 @@ class PreparedVariant:
 def prepare_all(
     study: Study, workspace: Workspace, listener: Listener
 ) -> list[PreparedVariant]:
-    """Find or make every variant's driver; one that fails leaves the others.
+    """Find or make every variant's driver; one that fails does not stop the others.
 
     Raises:
-        Me2eError: The baseline's failed: there is nothing to hold the others against.
+        Me2eError: The baseline's failed, so there is nothing to compare with.
     """
     return [
         _prepared_or_failed(study, each, workspace, listener) for each in study.variants
@@ -84,9 +82,9 @@ def prepare_variant(
     """Find or make a variant's driver, and open it once.
 
     Raises:
-        StudyError: No such model, or a file that a pass reads is missing.
+        StudyError: There is no such model, or a file that a pass reads is missing.
         EvaluationError: It cannot drive.
-        Me2eError: A pass refused the graph or broke.
+        Me2eError: A pass refused the graph or failed.
     """
     driver = driver_named(variant.policy, variant.adapter)
     if not isinstance(driver, OnnxDriver):
@@ -119,7 +117,7 @@ def prepare_variant(
 
 
 def _reported_beside(model: Path, sha256: str) -> tuple[str, str] | None:
-    """Read source and passes from the report beside a file, if it is of this file."""
+    """Read source and passes from the report next to a file, if it matches."""
     report = _report_of(model)
     if report is None or report.output.sha256 != sha256:
         return None
@@ -127,7 +125,7 @@ def _reported_beside(model: Path, sha256: str) -> tuple[str, str] | None:
 
 
 def _unaltered(model: Path) -> bool:
-    """Whether a file is the one that its report was written of."""
+    """Return whether a file still matches its report."""
     try:
         return _reported_beside(model, graph.sha256_of(model)) is not None
     except (OSError, DecodeError):
@@ -159,9 +157,9 @@ def _compressed(
     workspace: Workspace,
     listener: Listener,
 ) -> Path:
-    """Apply the passes, unless the same was done before; the report is written last.
+    """Apply the passes, unless a file exists that still matches its report.
 
-    What is there is taken if it is still the file that its report was written of.
+    The report is written last.
     """
     frames = None if study.frames is None else CalibrationSet(study.frames)
     path = workspace.model(variant, _key(study, variant, source, frames))
@@ -191,7 +189,7 @@ def _compressed(
 def _key(
     study: Study, variant: Variant, source: Path, frames: CalibrationSet | None
 ) -> str:
-    """Hash everything that decides what the passes make."""
+    """Hash everything that decides the result of the passes."""
     modules = variant.module_map
     decisive = (
         __version__,

@@ -1,4 +1,4 @@
-"""The frames of a study that records its own."""
+"""Frames of a study that records its own."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,13 +10,13 @@ from me2e_compress.workflows.listener import Listener
 
 
 def recorded(study: Study, workspace: Workspace, listener: Listener) -> Study:
-    """Return the study with folders of frames, recorded unless they are there.
+    """Return the study with folders of frames, recorded unless they exist.
 
-    The held-out ones are of the next seed, so of other routes.
+    The held-out frames use the next seed, hence other routes.
 
     Raises:
         EvaluationError: The baseline is not a model that drives.
-        FramesError: One of the folders holds something else.
+        FramesError: One of the folders has other content.
     """
     asked = study.to_record
     if asked is None:

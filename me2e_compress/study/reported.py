@@ -1,4 +1,4 @@
-"""A study from its definition to the files that report it."""
+"""Run a study and write its report."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,24 +26,15 @@ def run_and_report(
     *,
     force: bool = False,
 ) -> tuple[StudyResult | PaperResult, tuple[Path, ...]]:
-    """Run a study and write what it found; the paper's tables land block by block.
+    """Run a study and write its report; the paper's tables are written block by block.
 
-    Args:
-        study: What is asked; its ``report`` says what is made of the results.
-        folder: Where models, traces, results and the report go.
-        command: What makes it again, word by word.
-        engine: Where routes are driven; None for one process of this machine.
-        listener: Is called with progress and warnings.
-        records: Folder of finished drives that the paper's tables are made of, and
-            nothing is driven.
-        weigh: Folders of other stacks' files, counted in the paper's table 4.
-        force: Replace a report that is not as we left it, too.
-
-    Returns:
-        What was found, and the files: report, tables, record.
+    ``command`` is the command line that reproduces it. With ``records``, a folder of
+    finished drives, the paper's tables are made of these and nothing is driven;
+    ``weigh`` are folders of other stacks' files for the paper's table 4. Returns the
+    results and the files: report, tables, record.
 
     Raises:
-        StudyError: Records for a study that is not the paper's.
+        StudyError: Records are given for a study that is not the paper's.
         Me2eError: See `run_study` and `run_paper`.
     """
     if study.report == "comparison":

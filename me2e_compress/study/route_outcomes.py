@@ -1,4 +1,4 @@
-"""What became of each route, and when two drives of it part."""
+"""Outcome of each route, and where two drives of it diverge."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,17 +32,14 @@ class RouteOutcome:
     """One route of one drive.
 
     Attributes:
-        route: Its id.
-        scenario: Its type.
         driving_score: Percent.
-        succeeded: The whole route without an infraction.
-        ending: Why it was over, in words.
+        succeeded: Whether the whole route was driven without an infraction.
         infractions: Kind and time in microseconds, in order of time; the time is None
-            where the evaluator does not tell.
-        duration_us: Until the last frame.
+            if unknown.
+        duration_us: Time of the last frame.
         apart_m: Greatest distance to the baseline's ego at the same time; None for the
             baseline itself and for a route without frames.
-        apart_us: When that was.
+        apart_us: Time of that distance.
     """
 
     route: str
@@ -57,7 +54,7 @@ class RouteOutcome:
 
     @property
     def fate(self) -> str:
-        """How it ended, in words: the infractions, or that it was completed."""
+        """The infractions in words, or how the route ended."""
         kinds = [WORDS[InfractionKind(kind)] for kind, _ in self.infractions]
         return ", ".join(dict.fromkeys(kinds)) or self.ending
 
@@ -78,13 +75,7 @@ class RouteOutcome:
 def outcomes(
     episodes: Sequence[Episode], reference: Sequence[Episode] | None
 ) -> tuple[RouteOutcome, ...]:
-    """Sum up a drive, one a route, in its order.
-
-    Args:
-        episodes: The drive.
-        reference: The baseline's, on the same routes in the same order; None if this
-            is the baseline's.
-    """
+    """Summarize a drive by route; ``reference`` is None for the baseline's own."""
     if reference is None:
         return tuple(_outcome(each, None, None) for each in episodes)
     return tuple(

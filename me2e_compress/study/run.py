@@ -1,4 +1,4 @@
-"""A whole study, from what is asked to what was found."""
+"""Run a study."""
 
 from pathlib import Path
 
@@ -29,25 +29,24 @@ def run_study(
     *,
     force: bool = False,
 ) -> StudyResult:
-    """Make the models, time them, hold them against the baseline, drive them.
+    """Make the models, time them, compare them with the baseline, drive them.
 
-    Run again with the same folder it goes on: models, traces and routes that are there
-    are not made again. Studies may share a folder where they share variants.
+    With the same folder it resumes: finished models, traces and routes are reused.
+    Studies may share a folder if they share variants.
 
     Args:
-        study: What is asked, or its TOML file.
+        study: A study, or its TOML file.
         folder: Where models, traces and results go.
-        engine: Where routes are driven; None for one process of this machine. Another
-            evaluator than highway drives where it will.
+        engine: Where routes are driven; None for one process of this machine. An
+            evaluator other than highway ignores it.
         listener: Is called with progress and warnings.
-        pictures: On how many routes two drives are shown side by side.
-        force: Replace a report that is not as we left it, too.
+        pictures: Number of routes on which two drives are shown side by side.
+        force: Also replace a report that was changed since we wrote it.
 
     Raises:
         GraphError: The folder is a file or an input.
-        Me2eError: The baseline cannot drive, frames do not fit, or the folder is of
-            another study; one line that names the culprit. Another variant that fails
-            is left out, with a warning.
+        Me2eError: The baseline cannot drive, frames do not fit, or the folder belongs
+            to another study. Another variant that fails is left out, with a warning.
     """
     study, folder = _read(study), Path(folder)
     if study.elsewhere and engine not in (None, LocalEngine()):

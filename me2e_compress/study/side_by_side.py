@@ -1,4 +1,4 @@
-"""The same moment of a route as two drivers lived it, where they part."""
+"""Pictures of the moment at which two drives of a route diverge."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -24,10 +24,8 @@ class Contrast:
     """A picture of one moment of two drives.
 
     Attributes:
-        route: What the baseline made of the route.
-        other: What the variant made of it.
-        variant: Its name.
-        condition: Under what both drove.
+        route: The baseline's outcome.
+        other: The variant's outcome.
         time_us: The moment; a drive that was over by then shows its end.
         picture: PNG: the baseline in grey under the variant.
     """
@@ -42,7 +40,7 @@ class Contrast:
 
 @dataclass(frozen=True)
 class _Pair:
-    """A route that two drives might be shown on."""
+    """A candidate: one route of two drives."""
 
     drive: Drive
     route: RouteOutcome
@@ -54,7 +52,7 @@ class _Pair:
 
     @property
     def seen(self) -> bool:
-        """A drive without frames hung or crashed: it has nothing to show."""
+        """Whether both drives have frames; a hung or crashed one has none."""
         return bool(self.route.duration_us and self.other.duration_us)
 
     @property
@@ -67,7 +65,7 @@ class _Pair:
 
     @property
     def moment_us(self) -> int:
-        """When the worse one did what the other did not; else when they were apart."""
+        """Time of the worse drive's infraction, else of the greatest distance."""
         if self.gap < SCORED and self.other.apart_us is not None:
             return self.other.apart_us
         worse, better = self.route, self.other
@@ -86,15 +84,10 @@ def take_pictures(
     drives: Sequence[Drive],
     limit: int,
 ) -> tuple[Contrast, ...]:
-    """Drive again, up to the moment, the routes on which variants part the most.
+    """Drive the routes on which variants diverge the most again, up to the moment.
 
-    Pictures that are there are not taken again.
-
-    Args:
-        setup: What the drives share.
-        prepared: The variants.
-        drives: What they did.
-        limit: How many routes; each is another, and variants take turns.
+    Existing pictures are reused. At most ``limit`` distinct routes are shown, and
+    variants alternate.
 
     Raises:
         EvaluationError: A picture cannot be written.
@@ -146,7 +139,7 @@ def _chosen(baseline: str, drives: Sequence[Drive], limit: int) -> list[_Pair]:
 
 @dataclass
 class _Film:
-    """Keeps where everything was, and the cameras of the latest moment alone."""
+    """Keeps all positions, and the camera images of the latest moment only."""
 
     until_us: int
     moments: list[Moment] = field(default_factory=list)
@@ -160,7 +153,7 @@ class _Film:
 
 
 class _Enough(Exception):  # noqa: N818 - it ends a drive, nothing went wrong
-    """The moment was seen."""
+    """Ends a drive once the moment was seen."""
 
 
 def _picture(
@@ -171,7 +164,7 @@ def _picture(
     route: Route,
     time_us: int,
 ) -> Path:
-    """Drive both again up to a moment and lay them over each other, unless that is."""
+    """Drive both up to a moment and overlay them, unless the picture exists."""
     path = setup.workspace.picture(variant.variant, condition, route.id, time_us)
     jobs = [setup.job(each, condition) for each in (variant, baseline)]
     if path.is_file() or None in jobs:

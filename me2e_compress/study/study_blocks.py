@@ -1,4 +1,4 @@
-"""What a study is put together from: blocks of drives, frames of its own."""
+"""Parts of a study: blocks of drives, and frames of its own."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,13 +11,10 @@ from me2e_compress.study.names import check_name
 class StudyBlock:
     """A part of a study: some of its variants under some of its conditions.
 
-    Args:
-        name: As a variant's.
-        variants: Names, in the order of its tables.
-        conditions: Names, in the order of its tables.
+    Variants and conditions are names, in the order of the block's tables.
 
     Raises:
-        StudyError: A bad name, or nothing to drive.
+        StudyError: A name is invalid, or there is nothing to drive.
     """
 
     name: str
@@ -25,16 +22,15 @@ class StudyBlock:
     conditions: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        """Refuse what drives nothing."""
         check_name("block", self.name)
         if not self.variants or not self.conditions:
             raise StudyError(f"block {self.name}: there is nothing to drive")
 
     def check(self, variants: Sequence[str], conditions: Sequence[str]) -> None:
-        """Hold its names against those that there are.
+        """Check that its variants and conditions exist.
 
         Raises:
-            StudyError: It names another.
+            StudyError: One does not.
         """
         for kind, named, there in (
             ("variant", self.variants, variants),
@@ -50,15 +46,15 @@ class StudyBlock:
 
 @dataclass(frozen=True)
 class FramesToRecord:
-    """Frames that a study records itself: its baseline's on fresh routes.
+    """Frames of the baseline that a study records itself, on fresh routes.
 
     Args:
-        frames: So many to calibrate on.
-        held_out: So many to measure fidelity and latency on, of the next seed.
-        seed: Of the routes.
+        frames: Number of frames to calibrate on.
+        held_out: Number of frames to measure fidelity and latency on, of the next seed.
+        seed: Seed of the routes.
 
     Raises:
-        StudyError: None at all, or a negative seed.
+        StudyError: There are none at all, or the seed is negative.
     """
 
     frames: int
@@ -66,7 +62,6 @@ class FramesToRecord:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if min(self.frames, self.held_out) < 1:
             raise StudyError(
                 f"record: {self.frames} frames and {self.held_out} held out: both must"

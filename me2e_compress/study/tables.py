@@ -1,4 +1,4 @@
-"""The tables of a study: one content for the terminal, Markdown and HTML."""
+"""Tables of a study: one content for the terminal, Markdown and HTML."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -26,9 +26,9 @@ COSTS = ("size MB", "p50 ms", "p99 ms", "plan m", "SQNR dB")
 
 
 def scoreboards(outcome: "StudyResult") -> tuple[Table, ...]:
-    """Show how every variant drives, and what it weighs and takes.
+    """Show the driving scores, size and latency of every variant.
 
-    One table a condition; one variant alone has one table of all its conditions.
+    There is one table per condition, or one of all conditions for a single variant.
     """
     if len(outcome.variants) > 1:
         return tuple(_scoreboard(outcome, each) for each in outcome.study.conditions)
@@ -107,7 +107,7 @@ def _differences_note(found: Sequence[PairedDifference]) -> str:
 
 
 def abilities(outcome: "StudyResult") -> tuple[Table, ...]:
-    """Show the success rate by ability: tables as those of the scoreboard."""
+    """Show the success rate by ability, in tables like the scoreboards."""
     if len(outcome.variants) > 1:
         return tuple(
             _abilities(
@@ -146,7 +146,7 @@ def _abilities(
 
 
 def change_tables(outcome: "StudyResult") -> tuple[Table, ...]:
-    """Show what changes of conditions cost, and pairs of drives; none, if none."""
+    """Show costs of changed conditions, and pairs of drives, if there are any."""
     baseline = outcome.study.baseline
     found = outcome.changes, outcome.pairs
     titles = (
@@ -273,7 +273,7 @@ def between_cell(low: float | None, high: float | None, form: str) -> Cell:
 
 
 def measure_cell(measure: Measure, form: str) -> Cell:
-    """Show a number, or a dash that knows why."""
+    """Show a number, or a dash with its reason."""
     if measure.value is None:
         infinite = measure.reason == EXACT
         return Cell(INFINITE if infinite else MISSING, reason=measure.reason)
@@ -281,5 +281,5 @@ def measure_cell(measure: Measure, form: str) -> Cell:
 
 
 def number(value: float, form: str) -> str:
-    """Write a number with a minus as wide as a plus, and no negative zero."""
+    """Format a number with a true minus sign and no negative zero."""
     return plain_number(value, form).replace("-", MINUS)

@@ -1,4 +1,4 @@
-"""Latency of every model of a study, and the device that it stands for."""
+"""Latency of every model of a study, scaled to a device."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,11 +24,11 @@ class Clock:
 
     Attributes:
         traces: As measured, by the variant's name.
-        scale: How many times slower the device is than the machine of the traces;
-            one number for all variants.
-        reason: Why a variant has no trace, in words; empty if all have one.
-        load: What other processes took while traces were measured here, the worst of
-            them; None where none was measured.
+        scale: How many times slower the device is than the machine of the traces; one
+            number for all variants.
+        reason: Why a variant has no trace; empty if all have one.
+        load: The highest load by other processes while traces were measured; None if
+            none was measured here.
     """
 
     traces: Mapping[str, LatencyTrace]
@@ -48,7 +48,7 @@ class Clock:
     def source(
         self, variant: Variant, condition: Condition, seed: int
     ) -> LatencySource | None:
-        """Return what a variant's decisions cost; None without the trace for it."""
+        """Return the latency source of a variant; None if it lacks its trace."""
         source = condition.source(seed)
         if not source.lacks_trace:
             return source
@@ -65,12 +65,11 @@ def time_all(
 ) -> Clock:
     """Load the traces that are given or kept, and measure the others, interleaved.
 
-    What is measured together shares its noise. A trace that is kept is of the same
-    model, machine, threads and frames, and has at least as many samples (studies of one
-    folder share the longest); one that is not is measured again. Files written before
-    traces named their frames are taken to be of the same ones. Without a kept trace of
-    the baseline nothing that is kept can stand beside what is measured now: then all
-    are measured again.
+    Models measured together share their noise. A kept trace must be of the same model,
+    machine, threads and frames, with at least as many samples (studies in one folder
+    share the longest); otherwise it is measured again. Files from before traces named
+    their frames are assumed to match. Without a kept trace of the baseline, kept traces
+    cannot be compared with new ones, so all are measured again.
 
     Raises:
         EvaluationError: A trace cannot be read or written, or the baseline's median,
@@ -102,7 +101,7 @@ def time_all(
 def _load(
     prepared: Sequence[PreparedVariant], traces: Mapping[str, LatencyTrace]
 ) -> Load | None:
-    """Return the worst load under which a trace was measured here."""
+    """Return the highest load under which a trace was measured here."""
     names = [each.variant.name for each in prepared if not each.variant.trace]
     found = [traces[name].others for name in names if name in traces]
     known = [each for each in found if each is not None]
@@ -116,7 +115,7 @@ def _missing(
     workspace: Workspace,
     listener: Listener,
 ) -> list[PreparedVariant]:
-    """List what is to be measured: all, where new traces cannot stand beside old."""
+    """List what is to be measured: all, if new traces cannot be compared with old."""
     ours = [each for each in prepared if each.model and not each.variant.trace]
     missing = [each for each in ours if each.variant.name not in traces]
     if kept_baseline is not None or not missing:
@@ -138,9 +137,9 @@ def _measured(
     kept: LatencyTrace | None,
     listener: Listener,
 ) -> dict[str, LatencyTrace]:
-    """Measure in turn, with the baseline among them to tie days together.
+    """Measure in turn, always with the baseline.
 
-    Where the baseline's trace is kept, the others are put on its scale: machines are
+    If the baseline's trace is kept, the others are put on its scale: machines are
     slower on some days than on others.
     """
     if not missing:
@@ -192,7 +191,7 @@ def _kept(
 def _other(
     trace: LatencyTrace, each: PreparedVariant, frames: str | None, study: Study
 ) -> str | None:
-    """Return what a trace is of, if this study measures something else; else None."""
+    """Return what a trace measured if it was something else; else None."""
     wanted = study.timing.samples
     machine = describe_machine(study.timing.threads, study.provider)
     if trace.model_sha256 != each.sha256:
@@ -208,7 +207,7 @@ def _other(
 
 
 def _scale(study: Study, traces: Mapping[str, LatencyTrace]) -> float:
-    """Choose the one scale that gives the baseline the median asked for."""
+    """Choose the one scale that gives the baseline the requested median."""
     wanted_s = study.timing.baseline_median_s
     if wanted_s is None:
         return 1.0

@@ -1,4 +1,4 @@
-"""A comparison of two drivers on one screen: size, time, plan, and the road."""
+"""A comparison of two drivers on one screen: size, time, plan, driving."""
 
 from me2e_compress.metrics.differences import PairedDifference, shown_by
 from me2e_compress.metrics.measure import Measure
@@ -9,12 +9,7 @@ from me2e_compress.workflows.result import Cell, Table
 
 
 def before_and_after(outcome: StudyResult, name: str) -> Table:
-    """Show size, time, plan and road of the baseline and of a variant.
-
-    Args:
-        outcome: of a study with one condition.
-        name: the variant.
-    """
+    """Compare the baseline and a variant of a study with one condition."""
     before, after = outcome.variant(outcome.study.baseline), outcome.variant(name)
     moved, most = after.fidelity.mean_m, after.fidelity.max_m
     far = "" if most.value is None else f"{most.value:.2f} m at most"
@@ -92,7 +87,7 @@ def _score(drive: Drive) -> Cell:
 
 
 def _difference(drive: Drive) -> str:
-    """Return the points that it gained, with their 95 % interval."""
+    """Return the difference in points, with its 95 % interval."""
     if drive.difference is None:
         return ""
     score = drive.difference.driving_score

@@ -1,4 +1,4 @@
-"""What a study has yet to drive, and about how long that takes."""
+"""Remaining drives of a study, and an estimate of their duration."""
 
 import json
 from collections.abc import Sequence
@@ -34,15 +34,7 @@ ENOUGH = 20
 
 @dataclass(frozen=True)
 class PlannedDrive:
-    """One variant under one condition, before it is driven.
-
-    Attributes:
-        variant: Its name.
-        condition: Its name.
-        done: Routes that are driven.
-        routes: All of them.
-        hours: For those that are left, on the workers.
-    """
+    """Remaining work of one drive; ``hours`` are for all workers together."""
 
     variant: str
     condition: str
@@ -53,14 +45,13 @@ class PlannedDrive:
 
 @dataclass(frozen=True, repr=False)
 class Workload(Result):
-    """What a study drives.
+    """Remaining work of a study.
 
     Attributes:
-        title: The study's.
         drives: Condition by condition.
-        set_size: How many routes the whole set has.
-        workers: Routes at a time.
-        measured: Whether hours follow from what the folder's own routes took.
+        set_size: Number of routes of the whole set.
+        workers: Number of concurrent routes.
+        measured: Whether hours are based on the folder's own routes.
     """
 
     title: str
@@ -71,12 +62,12 @@ class Workload(Result):
 
     @property
     def hours(self) -> float:
-        """Of all drives."""
+        """Sum over all drives."""
         return sum(each.hours for each in self.drives)
 
     @property
     def headline(self) -> str:
-        """Drives, routes, time."""
+        """Numbers of drives and routes, and time."""
         drives = counted(len(self.drives), "drive")
         if not self.set_size:
             return f"{self.title}: {drives}, of routes that the evaluator knows"
@@ -90,7 +81,7 @@ class Workload(Result):
         )
 
     def tables(self) -> tuple[Table, ...]:
-        """Return a row a drive."""
+        """Return a table with one row per drive."""
         rows = [
             (
                 Cell(each.variant),
@@ -104,7 +95,7 @@ class Workload(Result):
         return (Table("Drives", columns, tuple(rows), words=2),)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a drive."""
+        """Return one row per drive."""
         return [dict(vars(each)) for each in self.drives]
 
     def to_json(self) -> object:
@@ -118,15 +109,10 @@ class Workload(Result):
 
 
 def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
-    """Count what is left to drive, and estimate the hours.
+    """Count the missing routes, and estimate the hours.
 
-    Frames of the world and decisions are what a route costs, and a condition decides
-    how many frames there are to a decision.
-
-    Args:
-        study: What is asked.
-        folder: Where it goes.
-        workers: Routes at a time.
+    A route costs world frames and decisions; the condition decides the number of frames
+    per decision.
     """
     place = Workspace(Path(folder))
     known = _logged(place.folder)
@@ -163,8 +149,8 @@ def _left(
 def held_frames(study: Study, condition: Condition) -> int:
     """Return how many frames a decision is held: n + 1 of equation 4.
 
-    Frames are the condition's steps. Under a trace, or a mean of one, it is that of the
-    baseline's median on the device, so far as the study says it; nobody is in view.
+    Frames are the condition's steps. For a trace, or a mean of one, it is based on the
+    baseline's median on the device, if the study states it, with no road users in view.
     """
     if condition.latency_model == LatencyModel.FIFO:
         return 1
@@ -182,7 +168,7 @@ def held_frames(study: Study, condition: Condition) -> int:
 
 
 def _logged(folder: Path) -> tuple[float, float] | None:
-    """Fit seconds a frame and a decision to the logs; None where they are too few."""
+    """Fit seconds per frame and per decision to the logs; None with too few logs."""
     rows = [
         json.loads(line)
         for log in sorted(folder.glob("results/*.log"))

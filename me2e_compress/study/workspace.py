@@ -1,4 +1,4 @@
-"""Where a study keeps what it made, so that it goes on after a kill."""
+"""Folder layout of a study, which lets it resume after a kill."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,39 +13,35 @@ JSON, MARKDOWN, HTML = "study.json", "tables.md", "report.html"
 
 @dataclass(frozen=True)
 class Workspace:
-    """A folder; studies that share it share compressed models, traces and drives.
-
-    Args:
-        folder: It is made when needed.
-    """
+    """A folder; studies that share it share compressed models, traces and drives."""
 
     folder: Path
 
     @staticmethod
     def drive(variant: Variant, condition: Condition) -> str:
-        """Return what the files of one variant under one condition are called."""
+        """Return the base name of the files of one variant under one condition."""
         return f"{variant.name}.{condition.name}"
 
     def results(self, variant: Variant, condition: Condition) -> Path:
-        """Return the folder of results of one variant under one condition."""
+        """Return the results folder of one variant under one condition."""
         return self._made("results") / self.drive(variant, condition)
 
     def record(self, variant: Variant, condition: Condition) -> Path:
-        """Return the file that keeps a finished drive without its frames."""
+        """Return the path of a finished drive, kept without its frames."""
         return self.folder / "records" / f"{self.drive(variant, condition)}.jsonl"
 
     def model(self, variant: Variant, key: str) -> Path:
-        """Return where the model goes that passes make: a key is a recipe's hash."""
+        """Return the path of a compressed model; ``key`` is the hash of its recipe."""
         return self._made("models") / f"{variant.name}.{key[:16]}.onnx"
 
     def trace(self, variant: Variant) -> Path:
-        """Return where the latencies of a variant's model go."""
+        """Return the path of the latency trace of a variant's model."""
         return self._made("traces") / f"{variant.name}.json"
 
     def picture(
         self, variant: Variant, condition: Condition, route: str, time_us: int
     ) -> Path:
-        """Return where the picture goes of one moment of it and of the baseline."""
+        """Return the path of a picture of one moment."""
         drive = self.drive(variant, condition)
         name = f"{route}.{time_us // 1000}ms.{drive}.overlay.png"
         return self._made("pictures") / name

@@ -1,4 +1,4 @@
-"""What a study leaves on disk: JSON for programs, Markdown, one HTML page."""
+"""Files that a study writes: JSON for programs, Markdown, one HTML page."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,13 +17,7 @@ from me2e_compress.workflows.claims import writing
 
 @dataclass(frozen=True)
 class StudyFiles:
-    """The files of a study.
-
-    Attributes:
-        record: JSON, everything that was found.
-        tables: Markdown.
-        report: One HTML page that needs nothing beside it.
-    """
+    """Paths of the JSON record, Markdown tables and HTML report of a study."""
 
     record: Path
     tables: Path
@@ -38,18 +32,18 @@ def write_study(
     *,
     force: bool = False,
 ) -> StudyFiles:
-    """Write JSON, Markdown and HTML, each whole or not at all.
+    """Write JSON, Markdown and HTML, each atomically.
 
     Args:
-        outcome: What was found.
-        folder: It is made when needed.
-        command: What makes it again, word by word.
-        sections: What the page tells besides.
-        force: Replace files that are not as we left them, too.
+        outcome: Results to write.
+        folder: Created if needed.
+        command: The command line that reproduces the study, word by word.
+        sections: Additional sections of the page.
+        force: Also replace files that were changed since we wrote them.
 
     Raises:
         StudyError: The folder cannot be written.
-        GraphError: One of the files is not as we left it.
+        GraphError: A file was changed since we wrote it.
     """
     folder = Path(folder)
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)

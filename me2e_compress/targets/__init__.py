@@ -1,6 +1,6 @@
-"""What a graph must look like for the program that will run it.
+"""Targets describe the form of graph that a runtime requires.
 
-To add a target: write its class, then add it to this table.
+To add a target, write its class, then add it to this table.
 """
 
 from me2e_compress.errors import RecipeError

@@ -1,4 +1,4 @@
-"""What every target is, what its lint finds, and the lint rules that all share."""
+"""The base of targets, their lint findings, and the lint rules that all share."""
 
 import abc
 import dataclasses
@@ -25,10 +25,10 @@ class LintFinding:
     """One problem of a graph for its target.
 
     Attributes:
-        severity: ``error``: the target refuses the graph, or computes something else;
-            ``warning``: it runs, but not as int8 or not as fast as it could.
+        severity: ``error``: the target refuses the graph or computes something else;
+            ``warning``: it runs, but not as int8 or slower than it could.
         rule: id of the rule.
-        node: name of the node; empty where the finding is about the whole graph.
+        node: name of the node; empty for a finding about the whole graph.
         message: what was found and what is expected.
     """
 
@@ -39,7 +39,7 @@ class LintFinding:
 
 
 LintRule: TypeAlias = Callable[[ir.Model], Iterator[LintFinding]]
-"""Inspects a graph whose shapes are inferred and yields what it finds."""
+"""Inspects a graph whose shapes are inferred and yields findings."""
 
 
 def error(rule: str, node: ir.Node | None, message: str) -> LintFinding:
@@ -48,12 +48,12 @@ def error(rule: str, node: ir.Node | None, message: str) -> LintFinding:
 
 
 def warning(rule: str, node: ir.Node | None, message: str) -> LintFinding:
-    """Return a finding with which the target runs the graph badly."""
+    """Return a finding with which the target still runs the graph, but badly."""
     return LintFinding("warning", rule, _name(node), message)
 
 
 def valid(model: ir.Model) -> Iterator[LintFinding]:
-    """Run ONNX's checker, plugins aside."""
+    """Run ONNX's checker, ignoring plugins."""
     if reason := refusal(model, plugins=True):
         yield error("onnx", None, f"not valid ONNX: {reason}")
 
@@ -96,14 +96,14 @@ def _name(node: ir.Node | None) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Target(abc.ABC):
-    """A program that runs graphs: how int8 is written for it, and what it refuses.
+    """A runtime of graphs: how int8 is written for it, and what it refuses.
 
     Derive a frozen dataclass; its fields are its options.
 
     Class attributes:
-        name: what recipes and the command line call it.
-        half_since: the first opset in which it takes int8 in a float16 graph, scales
-            in float16; None where it has no such kernels.
+        name: its name in recipes and on the command line.
+        half_since: the first opset in which it supports int8 in a float16 graph, with
+            float16 scales; None if it has no such kernels.
         opens: whether :meth:`read_back` opens the graph, in onnxruntime.
     """
 
@@ -113,30 +113,29 @@ class Target(abc.ABC):
 
     @abc.abstractmethod
     def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
-        """Name the activations whose ranges :meth:`place` needs."""
+        """List the activations whose ranges :meth:`place` needs."""
 
     @abc.abstractmethod
     def place(self, model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
         """Return a copy of a float graph in which a plan's nodes are int8."""
 
     def kept_float(self, plan: QuantPlan, model: ir.Model) -> tuple[KeptFloat, ...]:
-        """List the plan's nodes that stay float in that copy, and why."""
+        """List the plan's nodes that stay float in that copy, with the reasons."""
         return ()
 
     def fused_objection(self, node: ir.Node) -> str | None:
-        """Say why a fused operator reads no int8 here; None where it does.
+        """Explain why a fused operator cannot read int8; None if it can.
 
-        Args:
-            node: of an operator that says which of its inputs may be int8.
+        ``node`` is of an operator that declares which of its inputs may be int8.
         """
         return f"{self.name} has no int8 kernel for {node.op_type}"
 
     def check_types(self, plan: QuantPlan, model: ir.Model) -> None:
-        """Check that int8 can be written into the float type that the graph has.
+        """Check that the graph's float type can be quantized.
 
         Raises:
-            PreconditionError: it is float16, and the target has no such kernels, or the
-                opset no such scales; the message names the way out.
+            PreconditionError: it is float16, and the target lacks such kernels, or the
+                opset float16 scales; the message has a remedy.
         """
         types = {v.name: v.dtype for node in model.graph for v in node.outputs}
         halves = [e for e in plan.chosen if types[e.output] == ir.DataType.FLOAT16]
@@ -153,24 +152,18 @@ class Target(abc.ABC):
         )
 
     def costs(self, model: ir.Model, layers: Collection[ir.Node]) -> Costs | None:
-        """Estimate what int8 saves and costs; None where nothing is known of that.
+        """Estimate the savings and costs of int8 for candidate layers; None if unknown.
 
-        Args:
-            model: the float graph, shapes inferred.
-            layers: the nodes that could be int8.
+        Shapes of the float graph are inferred.
         """
         return None
 
     def lint_rules(self) -> tuple[LintRule, ...]:
-        """Return the rules that a graph for it is held against."""
+        """Return the target's lint rules."""
         return ()
 
     def lint(self, model: ir.Model) -> tuple[LintFinding, ...]:
-        """List everything that is wrong with a graph for this target, errors first.
-
-        Args:
-            model: the graph; it stays as it is.
-        """
+        """List all findings of a graph, errors first; the graph is not changed."""
         copy = model.clone()
         graph.infer_shapes(copy)
         found = [finding for rule in self.lint_rules() for finding in rule(copy)]
@@ -179,12 +172,9 @@ class Target(abc.ABC):
     def read_back(
         self, model: ir.Model, provider: Provider = CPU
     ) -> tuple[LintFinding, ...]:
-        """Open a graph, and list what runs otherwise than it says; errors first.
+        """Open a graph, and list what runs differently from its types; errors first.
 
-        A target whose program is not at hand finds nothing.
-
-        Args:
-            model: a graph in which :meth:`lint` found no error; it stays as it is.
-            provider: what is to run it, of the program's.
+        The graph must pass :meth:`lint` without errors. A target without a runtime here
+        finds nothing.
         """
         return ()

@@ -1,4 +1,4 @@
-"""Recognise quantized graphs: pairs of QuantizeLinear and DequantizeLinear, by whom."""
+"""Recognise quantized graphs and their pairs of quantization nodes."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -19,32 +19,28 @@ INTEGER_OPS = frozenset(
         "QLinearSigmoid", "QLinearSoftmax", "QLinearWhere",
     }
 )  # fmt: skip
-"""Operators on integers (ONNX, com.microsoft): what runtimes' quantizers write."""
+"""Operators on integers (ONNX, com.microsoft) that quantizers of runtimes write."""
 
 
 def pairs_of(model: ir.Model) -> Iterator[ir.Node]:
-    """Walk the QuantizeLinear and DequantizeLinear nodes, those of functions too."""
+    """Yield the QuantizeLinear and DequantizeLinear nodes, also in functions."""
     for node in graph.nodes_of(model):
         if graph.is_standard(node) and node.op_type in PAIR:
             yield node
 
 
 def is_quantized(value: ir.Value | None) -> bool:
-    """Return whether a value comes out of a QuantizeLinear."""
+    """Return whether a value is the output of a QuantizeLinear."""
     return _comes_from(value, QUANTIZE)
 
 
 def is_dequantized(value: ir.Value | None) -> bool:
-    """Return whether a value comes out of a DequantizeLinear."""
+    """Return whether a value is the output of a DequantizeLinear."""
     return _comes_from(value, DEQUANTIZE)
 
 
 def describe_quantized(model: ir.Model) -> str | None:
-    """Describe in words how a graph is quantized; None if it is not.
-
-    Returns:
-        How many operators of which kind, on which grid, and by whom if that is known.
-    """
+    """Describe operators, grid and producer of a quantized graph; None for others."""
     counts = Counter(
         node.op_type
         for node in model.graph.all_nodes()
@@ -80,5 +76,5 @@ def _grid(model: ir.Model) -> str:
 
 
 def _type(zero: ir.Value | None) -> str:
-    """Return the type of a zero point; where there is none, ONNX takes uint8."""
+    """Return the type of a zero point; without one, ONNX uses uint8."""
     return "uint8" if zero is None or zero.dtype is None else zero.dtype.name.lower()

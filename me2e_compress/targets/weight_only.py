@@ -1,4 +1,4 @@
-"""Store weights as int8 whose layers run in float."""
+"""Store the weights of float layers as int8."""
 
 import onnx_ir as ir
 
@@ -10,18 +10,15 @@ from me2e_compress.targets.weights import QuantizedWeight, weights_of
 
 
 def store_weights(model: ir.Model, plan: QuantPlan) -> None:
-    """Put int8 and a DequantizeLinear in the place of weights that alone become int8.
+    """Replace weights by int8 and a DequantizeLinear where layers stay float.
 
     Given:   y = Gemm<transB = 1>(x, w, b)                      w [N, K]
     Result:  y = Gemm(x, DequantizeLinear<axis = 1>(w_int8), b)    w_int8 [K, N]
 
     The weight is stored as [K, N] with one scale a column: so onnxruntime (1.31) reads
-    the integers themselves, in one kernel (MatMulNBits); a transposed weight it would
-    dequantize again for every frame.
-
-    Args:
-        model: the graph in which the plan's other nodes are placed; written in place.
-        plan: what was decided of it.
+    the integers directly, in one kernel (MatMulNBits); it would dequantize a transposed
+    weight again for every frame. The graph, in which the plan's other nodes are placed,
+    is changed in place.
 
     Raises:
         PreconditionError: the graph is older than opset 13.

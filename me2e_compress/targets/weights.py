@@ -1,4 +1,4 @@
-"""Weights as int8, one scale a channel: those that a plan chose."""
+"""Quantize the planned weights to int8, one scale per channel."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -23,11 +23,11 @@ class QuantizedWeight:
     """A weight on the symmetric int8 grid: ``integers * scales`` along an axis.
 
     Attributes:
-        name: what its initializers are called after.
-        integers: int8, of the weight's shape; of a MatMul's [1, ..., K, N] that is one
-            matrix for all its rows, [K, N].
+        name: base name of its initializers.
+        integers: int8, in the weight's shape; a MatMul's [1, ..., K, N] becomes one
+            matrix, [K, N].
         scales: float32 [channels], or [] for one step everywhere.
-        axis: which axis of the integers the channels run along; None without channels.
+        axis: the channel axis of the integers; None without channels.
     """
 
     name: str
@@ -39,18 +39,13 @@ class QuantizedWeight:
 def weights_of(
     model: ir.Model, chosen: Iterable[Decision]
 ) -> dict[str, QuantizedWeight]:
-    """Quantize the weights of int8 layers; layers that share one share the result.
+    """Quantize the weights of int8 layers, by the name of the layer's first output.
 
-    Args:
-        model: the float graph that was planned.
-        chosen: what becomes int8; decisions without a weight are passed over.
-
-    Returns:
-        The weights by the name of the layer's first output.
+    Layers that share a weight share the result; decisions without a weight are ignored.
 
     Raises:
-        PreconditionError: the graph is older than opset 13, or something that the plan
-            calls a weight is not one.
+        PreconditionError: the graph is older than opset 13, or a planned weight is not
+            a constant.
     """
     if (opset := opset_of(model)) < MIN_OPSET:
         raise PreconditionError(
@@ -63,6 +58,7 @@ def weights_of(
         for each in chosen
         if each.weight is not None
     }
+    # Weights that nodes compute are evaluated together.
     values = dict.fromkeys(value for value, _ in layers.values())
     made = [str(each.name) for each in values if each.producer() is not None]
     computed = evaluate_constants(model, made)
@@ -76,18 +72,11 @@ def weights_of(
 def quantize_weight(
     weight: npt.NDArray[np.float32], axis: int | None
 ) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.float32]]:
-    """Round a weight to int8, symmetric, one scale an index along an axis, or one.
+    """Round a weight to symmetric int8, with one scale per index of an axis, or one.
 
     ``scale = max|w| / 127`` over everything but the axis, ``q = round(w / scale)``,
-    halves to the even neighbour, as QuantizeLinear rounds. A channel that is zero
-    throughout gets scale 1.
-
-    Args:
-        weight: float32.
-        axis: which axis is the channel's; None for one scale everywhere.
-
-    Returns:
-        int8 of the same shape, and float32 [channels], or [] without an axis.
+    ties to even, as QuantizeLinear rounds. A channel that is zero throughout gets scale
+    1. Returns int8 of the same shape, and float32 [channels], or [] without an axis.
     """
     others = tuple(each for each in range(weight.ndim) if each != axis)
     reach = np.abs(weight).max(axis=others, initial=0.0, keepdims=True)

@@ -1,4 +1,4 @@
-"""Checks that anybody's additions can run in their own tests."""
+"""Checks that authors of extensions can run in their own tests."""
 
 from me2e_compress.testing.check_evaluator import check_evaluator
 from me2e_compress.testing.check_observer import check_observer

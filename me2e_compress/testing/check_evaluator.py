@@ -17,15 +17,15 @@ def check_evaluator(
 ) -> tuple[Episode, ...]:
     """Check that an evaluator yields each route once, and always the same.
 
-    It has the form of :func:`check_form`; it yields at least one episode, no route
-    twice; a second evaluation yields equal episodes in the same order; and what it
-    yields can be kept: a route's name is that of a file, its numbers are finite and in
-    their bounds, its frames are in order of time.
+    It passes :func:`check_form`; it yields at least one episode, no route twice; a
+    second evaluation yields equal episodes in the same order; and episodes can be
+    stored: a route's name is valid in a file name, its numbers are finite and in their
+    bounds, its frames are in order of time.
 
     Args:
         evaluator: the evaluator.
-        again: one of equal options that drives anew, i.e. with another folder where
-            results are kept; None asks the same evaluator twice.
+        again: one of equal options that drives anew, i.e. with another folder for
+            results; None asks the same evaluator twice.
 
     Returns:
         The episodes.
@@ -39,6 +39,7 @@ def check_evaluator(
     first = tuple(evaluator.episodes())
     if not first:
         raise VerificationError(f"{name} yields no episode")
+    # episodes, each of its own route, that can be stored
     strange = [each for each in first if not isinstance(each, Episode)]
     if strange:
         raise VerificationError(f"{name} yields {strange[0]!r}, no episode")
@@ -47,6 +48,7 @@ def check_evaluator(
         raise VerificationError(f"{name} yields route {route} {count} times")
     for each in first:
         _check_kept(name, each)
+    # the same again
     second = tuple((evaluator if again is None else again).episodes())
     if [each.route for each in second] != [each.route for each in first]:
         raise VerificationError(f"{name} yields other routes, or in another order")

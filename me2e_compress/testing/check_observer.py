@@ -1,4 +1,4 @@
-"""Check that an observer does what calibration needs of it."""
+"""Check that an observer makes the ranges that calibration needs."""
 
 import numpy as np
 import numpy.typing as npt
@@ -14,15 +14,11 @@ FRAMES, ELEMENTS = 6, 500
 def check_observer(observer: Observer, seed: int = 0) -> tuple[Bounds, Bounds]:
     """Check that an observer makes ranges that int8 can be put on.
 
-    It has the form of :func:`check_form`; it asks for histograms exactly if it reads
-    them; the same statistics give the same ranges; these are two finite float32
-    arrays [tensors], the low bound at most the high one, within what was seen; and
-    the range of a tensor does not depend on the other tensors.
-
-    Args:
-        observer: the observer.
-        seed: of the values that the statistics are of: normal, one-sided,
-            heavy-tailed, constant and zero.
+    It passes :func:`check_form`; it asks for histograms exactly if it reads them; the
+    same statistics give the same ranges; these are two finite float32 arrays [tensors],
+    the low bound at most the high one, within what was seen; and the range of a tensor
+    does not depend on the other tensors. The statistics are of five random tensors:
+    normal, one-sided, heavy-tailed, constant and zero.
 
     Returns:
         Low and high bounds of those five tensors.

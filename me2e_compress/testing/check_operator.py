@@ -1,4 +1,4 @@
-"""Check that a fused operator's body, reference and shapes say the same."""
+"""Check that a fused operator's body, reference and shapes agree."""
 
 import dataclasses
 
@@ -33,17 +33,17 @@ def check_operator(
 ) -> None:
     """Check that an operator computes the same, in whatever dialect it is called.
 
-    It has the form of :func:`check_form`, and an own form that is called ``me2e`` in
-    the domain of that name. For every dialect, at opsets 13 and 17, on random inputs:
-    the body, run in float32, is the float64 reference within 1e-4; the output has the
-    shape and type that are told; calls in the own form are translated into the
-    dialect, unless that refuses them, and compute the same there; and an attribute that
-    the dialect does not have is refused.
+    It passes :func:`check_form`, and has an own form called ``me2e`` in the domain of
+    that name. For every dialect, at opsets 13 and 17, on random inputs: the body, run
+    in float32, is the float64 reference within 1e-4; the output has the declared shape
+    and type; calls in the own form are translated into the dialect, unless that refuses
+    them, and compute the same there; and an attribute that the dialect does not have is
+    refused.
 
     Args:
         operator: the operator; it need not be installed.
-        draw: makes a call in a dialect; None draws what the dialect's operands tell,
-            any shape where they tell none.
+        draw: makes a call in a dialect; None draws what the dialect's operands declare,
+            and any shape if they declare none.
         seed: of the draws.
         calls: how many are drawn for each dialect and opset.
 
@@ -77,7 +77,8 @@ class _Case:
     opset: int
 
     def check_call(self, call: DrawnCall) -> None:
-        """Compare the body and the told shape of a call with its reference."""
+        """Compare the body and the declared shape of a call with its reference."""
+        # what the dialect declares
         model = graph_of(call, self.dialect, self.opset)
         node = model.graph[0]
         self.dialect.check(node)
@@ -88,6 +89,7 @@ class _Case:
             raise self._broken(
                 f"the output is said to be {list(told)}, it is {list(want.shape)}"
             )
+        # what the body computes
         node.outputs[0].shape = node.outputs[0].type = None  # the body says it itself
         known = (self.operator, self.dialect)
         expand(node, opset=self.opset, by="check-operator", known=known)
@@ -98,7 +100,7 @@ class _Case:
         self._compare("the body", found, want)
 
     def check_translated(self, call: DrawnCall) -> None:
-        """Compare a call in the own form, said in the dialect, with its reference."""
+        """Compare a call in the own form, translated, with its reference."""
         own = self.operator.own
         if self.dialect == own:
             return

@@ -1,4 +1,4 @@
-"""Hold a pass to what the manager and the documents promise of passes."""
+"""Check what the manager and the documents promise of passes."""
 
 import dataclasses
 import re
@@ -21,23 +21,23 @@ _KEBAB = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 def check_pass(
     current: Pass, model: ir.Model, context: Context | None = None
 ) -> PassResult:
-    """Hold a pass to everything the manager and the documents promise of passes.
+    """Check everything that the manager and the documents promise of passes.
 
-    It is a frozen dataclass with a kebab-case name and a docstring that shows
+    A pass is a frozen dataclass with a kebab-case name and a docstring that shows
     *Given* and *Result* and names every option. It leaves its input alone (it is given
-    a copy), keeps the interface, reports whether it changed anything, leaves valid
-    ONNX and makes the same graph twice. Every node keeps its past; one that is new or
-    changed names the pass and, as its origins, nodes that were there. If the pass is
-    exact, a second run changes nothing and the outputs are the same.
+    a copy), keeps the interface, reports whether it changed anything, leaves valid ONNX
+    and makes the same graph twice. Every node keeps its provenance; a new or changed
+    one names the pass and, as its origins, nodes that were there. If the pass is exact,
+    a second run changes nothing and the outputs are the same.
 
     Args:
         current: the pass.
         model: a graph to try it on; static input shapes let exact passes be run.
-        context: module map, frames, seed; None detects the map, and takes a graph of
-            no known stack as one module.
+        context: module map, frames, seed; None detects the map, and takes a graph of no
+            known stack as one module.
 
     Returns:
-        What the pass returned.
+        The pass's own result.
 
     Raises:
         VerificationError: it broke a promise; the message says which.
@@ -91,7 +91,13 @@ def _run(current: Pass, ready: ir.Model, context: Context) -> PassResult:
 def _check_exact(
     current: Pass, before: ir.Model, after: ir.Model, context: Context
 ) -> None:
-    second = _run(current, after, context)
+    try:
+        second = _run(current, after, context)
+    except VerificationError as error:
+        raise VerificationError(
+            f"on its second run, {error}; is something left that nothing reads"
+            " (remove_dead)?"
+        ) from error
     if second.changes:
         raise VerificationError(
             f"{current.name} is not idempotent: {second.changes} changes on a second"

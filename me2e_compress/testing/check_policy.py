@@ -29,14 +29,11 @@ Answers: TypeAlias = tuple[Trajectory | PedalsAndWheel, ...]
 def check_policy(driver: Driver) -> Answers:
     """Check that a driver opens a policy that keeps the contract.
 
-    It has the form of :func:`check_form` and one fingerprint. On the first decisions
-    of a route that ships, each answer is a finite plan, float [6, 2] or a `Trajectory`,
-    or controls in their range; the world is not stepped; the same policy answers the
-    same after a reset, and so does one that is opened anew.
-
-    Args:
-        driver: what opens the policy; a Python policy's is
-            ``driver_named("package.module:factory")``.
+    It passes :func:`check_form` and has one fingerprint. On the first decisions of a
+    route that ships, each answer is a finite plan, float [6, 2] or a `Trajectory`, or
+    controls in their range; the world is not stepped; and the policy gives the same
+    answers after a reset, as does one that is opened anew. For a Python policy,
+    ``driver`` is ``driver_named("package.module:factory")``.
 
     Returns:
         The answers, plans with the times of their waypoints.
@@ -88,6 +85,7 @@ def _answers(driver: Driver, policy: Policy) -> Answers:
         if world.time_us != time_us:
             raise VerificationError(f"{driver.name} steps the world")
 
+    # drive until the policy has answered often enough, then check the episode
     (route,) = pick_routes(load_routes(), ROUTE)
     watched = _Watched(policy, policy.needs_images, policy.privileged)
     listeners = Listeners(lambda world: asked.append((world, world.time_us)), answered)

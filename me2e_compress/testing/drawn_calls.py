@@ -16,12 +16,10 @@ _LARGEST_SIZE, _LARGEST_RANK = 5, 4
 
 @dataclasses.dataclass(frozen=True)
 class DrawnCall:
-    """What one call of a fused operator is made of, in some dialect.
+    """The inputs and attributes of one call of a fused operator, in some dialect.
 
-    Attributes:
-        inputs: by name, in the order of the dialect's operands; optional ones at the
-            end may lack.
-        attributes: those that the node has.
+    ``inputs`` are by name, in the order of the dialect's operands; optional ones at the
+    end may be missing.
     """
 
     inputs: Mapping[str, NdArray]
@@ -32,7 +30,7 @@ Draw: TypeAlias = Callable[[Dialect, np.random.Generator], DrawnCall]
 
 
 def drawn(dialect: Dialect, random: np.random.Generator) -> DrawnCall:
-    """Draw a call by what a dialect says of its operands and attributes.
+    """Draw a call from what a dialect declares of its operands and attributes.
 
     A letter among the dimensions is one size in all operands; floats are normal,
     integers 0 to 4; an attribute is one of its choices, or its default.
@@ -49,13 +47,7 @@ def drawn(dialect: Dialect, random: np.random.Generator) -> DrawnCall:
 
 
 def graph_of(call: DrawnCall, dialect: Dialect, opset: int) -> ir.Model:
-    """Build the graph of one node whose inputs are those of the graph.
-
-    Args:
-        call: what the node is made of.
-        dialect: how it is spelt.
-        opset: of ONNX's own operators.
-    """
+    """Build the graph of one node whose inputs are those of the graph."""
     values = [
         ir.Value(
             name=name,
@@ -64,6 +56,7 @@ def graph_of(call: DrawnCall, dialect: Dialect, opset: int) -> ir.Model:
         )
         for name, array in call.inputs.items()
     ]
+    # one node with one output, in a graph of two opset imports
     node = ir.node(
         dialect.op_type,
         values,

@@ -12,17 +12,17 @@ T = TypeVar("T", bound=NamedItem)
 
 
 def check_form(item: T, registry: Registry[T]) -> None:
-    """Check that an item is data that text can say.
+    """Check that an item is a frozen dataclass that text can represent.
 
-    It is a frozen dataclass with a name-like-this and a docstring that tells what
-    every option means, and its text makes an equal item.
+    It must have a name-like-this and a docstring that describes every option, and its
+    text must build an equal item.
 
     Args:
         item: a pass, rule, observer, driver, ...; it need not be installed.
         registry: of its kind, e.g. ``calibration.observers.OBSERVERS``.
 
     Raises:
-        VerificationError: it is not; the message says in what.
+        VerificationError: it is not; the message says why.
     """
     cls = type(item)
     # of its own: an undecorated class inherits that of its base
@@ -38,6 +38,7 @@ def check_form(item: T, registry: Registry[T]) -> None:
             raise VerificationError(
                 f"{cls.__name__}'s docstring lacks {option.name} under Attributes:"
             )
+    # its text builds an equal item
     text = registry.text(item, defaults=True)
     if registry.parse(text, cls) != item:
         raise VerificationError(f"{text} is read back as something else")

@@ -1,5 +1,6 @@
-"""What a command does, as silent typed functions: a file each.
+"""The work of each command as a silent, typed function, one file each.
 
-Each takes files first, then options (a frozen dataclass, checked once), then a listener
-for progress, and returns a :class:`~me2e_compress.workflows.result.Result`.
+A workflow takes files first, then options (a frozen dataclass that checks itself), then
+a listener for progress; it returns a
+:class:`~me2e_compress.workflows.result.Result`.
 """

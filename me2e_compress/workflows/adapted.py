@@ -1,4 +1,4 @@
-"""What a user's adapter says of a graph's state and plan, for those who run it."""
+"""Apply what an adapter says about a graph's state and plan to its metadata."""
 
 from pathlib import Path
 
@@ -12,18 +12,11 @@ from me2e_compress.runtime.recurrence import recurrent_inputs
 
 
 def adapted(model: ir.Model, adapter: str | Path | None) -> dict[str, str]:
-    """Write what an adapter says into the metadata of a graph in memory.
+    """Write an adapter's statements into the metadata of a graph in memory.
 
-    Args:
-        model: the graph, or the interface of a stack.
-        adapter: TOML file, or the name of one that ships; None says nothing.
-
-    Returns:
-        The metadata that were written, for a session that opens the file.
-
-    Raises:
-        EvaluationError: no such adapter, or it is not of this graph.
-        GraphError: the graph's own metadata are malformed.
+    The adapter is a TOML file or the name of one that ships; None changes nothing. The
+    metadata that were written are returned, for a session that opens the file itself.
+    An adapter that does not fit the graph raises EvaluationError.
     """
     if adapter is None:
         return {}
@@ -33,6 +26,7 @@ def adapted(model: ir.Model, adapter: str | Path | None) -> dict[str, str]:
         [str(each.name) for each in side]
         for side in (model.graph.inputs, model.graph.outputs)
     )
+    # every input that the adapter names must exist
     for name in (*found.feeds, *found.images):
         if name not in inputs:
             raise EvaluationError(
@@ -40,6 +34,7 @@ def adapted(model: ir.Model, adapter: str | Path | None) -> dict[str, str]:
                 f" {', '.join(inputs)}"
             )
     model.metadata_props.update(said)
+    # the plan and the recurrent state must be found under the new metadata
     try:
         if found.plan is not None:
             plan_of(found.plan, {}, outputs)

@@ -25,20 +25,12 @@ from me2e_compress.runtime.frames import Array
 
 @dataclass(frozen=True)
 class AdaptedInputs:
-    """Lays the moments of a log out as the inputs of a graph, as its adapter says.
-
-    Attributes:
-        policy: the graph with its adapter.
-    """
+    """The moments of a log as the inputs of a graph, laid out as its adapter says."""
 
     policy: OnnxPolicy
 
     def log_for(self, log: DriveLog) -> DriveLog:
-        """Return a log with the cameras that the graph sees, in the contract's words.
-
-        Raises:
-            FramesError: cameras or a size are said twice.
-        """
+        """Return the log in the contract's axes, with the cameras the graph sees."""
         for option in ("cameras", "size", "width"):
             if getattr(log, option):
                 raise FramesError(
@@ -49,12 +41,13 @@ class AdaptedInputs:
         return dataclasses.replace(log.as_contract(), cameras=seen)
 
     def check(self, log: DriveLog) -> None:
-        """Check nothing: the policy was run on zeros when it was opened."""
+        """Check nothing: the policy ran on zeros when it was opened."""
 
     def ground(self, now: LogMoment) -> Floats | None:
-        """Return [4, 4] to the frame of the plan; None where that is left-handed.
+        """Return the [4, 4] transform from the lidar to the plan's frame.
 
-        What happened next has headings, which mean nothing in a mirror.
+        None stands for left-handed plan axes: the headings of the recorded future mean
+        nothing in a mirrored frame.
         """
         axes = self.policy.adapter.axes
         if axes.is_left_handed:
@@ -66,11 +59,10 @@ class AdaptedInputs:
     def arrays(
         self, log: DriveLog, scene: LogScene, at: int, before: int | None
     ) -> dict[str, Array]:
-        """Return the feeds of a moment; those of a scene's first with first values.
+        """Return the model's inputs at a moment, with first values at a scene's start.
 
         Raises:
-            FramesError: a picture cannot be read, or the log does not tell what an
-                input is made of.
+            FramesError: A picture cannot be read, or the log lacks what an input needs.
         """
         if before is None:
             self.policy.reset(None)
@@ -90,6 +82,7 @@ class AdaptedInputs:
         rows, columns = self.policy.image_size
         images = np.zeros((len(CAMERAS), rows, columns, 3), np.uint8)
         projections = np.tile(np.eye(4), (len(CAMERAS), 1, 1))
+        # cameras that the graph does not see stay black
         for camera in log.seen:
             if camera not in now.pictures:
                 there = ", ".join(now.pictures)
@@ -98,6 +91,7 @@ class AdaptedInputs:
             images[CAMERAS.index(camera)] = picture
             looks = place @ now.lidar_to_image[camera] @ to_ego
             projections[CAMERAS.index(camera)] = looks
+        # the CAN bus holds differences to the moment before
         bus = changes(now, None if before is None else scene[before])
         return Observation(
             now.time_us - scene[0].time_us,
@@ -111,7 +105,7 @@ class AdaptedInputs:
 
 
 def _motion(now: LogMoment) -> EgoKinematics:
-    """Return where the ego is, of a CAN bus that is laid out as the contract's."""
+    """Return the ego state; the CAN bus must be laid out as the contract's."""
     to_world = now.lidar_to_world @ np.linalg.inv(now.lidar_to_ego)
     x, y = to_world[:2, 3].tolist()
     heading = math.atan2(to_world[1, 0], to_world[0, 0])

@@ -1,4 +1,4 @@
-"""Budgets of a search: what may be asked, and joules, measured or modelled."""
+"""Budgets of a search, and the energy of a frame, measured or modelled."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -16,17 +16,13 @@ from me2e_compress.workflows.checks import check_number
 from me2e_compress.workflows.inspect import model_energy
 
 Joules = Literal["J", "modelled J"]
-"""What joules a frame are; the two are never compared."""
+"""The kind of energy figure; measured and modelled joules are never compared."""
 
 
 def check_budgets(
     max_mb: float | None, max_ms: float | None, max_joules: float | None
 ) -> None:
-    """Refuse budgets that nothing could be held against.
-
-    Raises:
-        RecipeError: there is none, or one is not a finite number above 0.
-    """
+    """Check that there is a budget, and that each is a finite number above 0."""
     check_number("--max-mb", max_mb)
     check_number("--max-ms", max_ms)
     check_number("--max-joules", max_joules)
@@ -35,11 +31,7 @@ def check_budgets(
 
 
 def joules_here() -> Joules:
-    """Return what joules are on this machine: measured if a counter answers.
-
-    Raises:
-        EnergyError: a counter answers and cannot be read.
-    """
+    """Return which joules this machine can give: measured if a counter answers."""
     counter = open_counter()
     if not isinstance(counter, Reader):
         return "modelled J"
@@ -57,22 +49,13 @@ def joules_of(
     provider: Provider = CPU,
     on_window: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> dict[str, float]:
-    """Return joules a frame of models, all measured or all modelled.
+    """Return the joules per frame of each model, all measured or all modelled.
 
-    Measured ones are of the fewest windows that an interval can be had of, in turn.
-
-    Args:
-        kind: see :func:`joules_here`.
-        models: ONNX files by name.
-        frames: what they see while they are measured.
-        module_map: preset or TOML file; None finds the preset.
-        threads: of onnxruntime; 0 takes all.
-        provider: what runs them.
-        on_window: is called with windows done and in all, and the model's name.
-
-    Raises:
-        EnergyError: the counter fails, or nothing of a model can be modelled.
+    `models` maps names to ONNX files; `threads` is onnxruntime's, and 0 takes all.
+    Models are measured in turn, over the fewest windows that still give an interval;
+    `on_window` gets the windows done, their total and a name.
     """
+    # the models take turns, so that a drift of the machine meets all of them
     if kind == "J":
         schedule = EnergySchedule(windows=FEWEST_WINDOWS)
         measured = measure_energy(
@@ -90,6 +73,7 @@ def joules_of(
             for name, path in models.items()
         }
         found = {name: each.modelled_j_per_frame for name, each in modelled.items()}
+    # a budget needs a number for every model
     for name, joules in found.items():
         if joules is None:
             raise EnergyError(f"{models[name]}: its joules are not known")

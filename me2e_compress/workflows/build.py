@@ -1,4 +1,4 @@
-"""A TensorRT engine of a graph, where TensorRT is."""
+"""Build a TensorRT engine of a graph, where TensorRT is installed."""
 
 import dataclasses
 from pathlib import Path
@@ -21,7 +21,7 @@ class BuildOptions:
     """How an engine is built.
 
     Attributes:
-        settings: of TensorRT.
+        settings: settings of the TensorRT builder.
         force: replace outputs that are not as we left them, too.
     """
 
@@ -31,13 +31,7 @@ class BuildOptions:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class EngineResult(Result):
-    """An engine that was written.
-
-    Attributes:
-        model: the graph.
-        output: the engine.
-        engine: what TensorRT built.
-    """
+    """A TensorRT engine that was written."""
 
     model: Path
     output: Path
@@ -45,7 +39,7 @@ class EngineResult(Result):
 
     @property
     def headline(self) -> str:
-        """File, size, version, layers, time."""
+        """The engine file, its size, TensorRT's version and the build time."""
         found = self.engine
         return (
             f"{self.output}: {megabytes(len(found.content))} MB, TensorRT"
@@ -54,7 +48,7 @@ class EngineResult(Result):
         )
 
     def tables(self) -> tuple[Table, ...]:
-        """Return none: the line says it."""
+        """Return no table: the headline says everything."""
         return ()
 
     def records(self) -> list[dict[str, object]]:
@@ -62,7 +56,7 @@ class EngineResult(Result):
         return [{"model": self.model, "output": self.output, **self.to_json()}]
 
     def to_json(self) -> dict[str, object]:
-        """Return what is known of the engine but its bytes."""
+        """Return everything about the engine except its bytes."""
         return {
             "engine_bytes": len(self.engine.content),
             "tensorrt": self.engine.version,
@@ -79,19 +73,16 @@ def build(
 ) -> EngineResult:
     """Build a TensorRT engine of a graph for the GPU of this machine.
 
-    Args:
-        model: the ONNX file, or the name of one that ships.
-        output: the engine.
-        options: None takes the defaults.
-        listener: is called with progress.
+    The model is an ONNX file or the name of one that ships.
 
     Raises:
-        GraphError: no such model, or the output would harm an input.
+        GraphError: The model does not exist, or the output would harm an input.
         MissingPackageError: TensorRT is not installed.
         PreconditionError: TensorRT lacks an option, or refuses the graph.
     """
     options = options or BuildOptions()
     source, output = model_path(model), output_path(output)
+    # the engine is written only when it is whole
     with writing([output], (source,), force=options.force):
         listener.on_progress("build", 0, 1, source.name)
         engine = build_engine(source, options.settings)

@@ -1,4 +1,4 @@
-"""Ranges of every tensor that int8 may need: measured, merged, or another tool's."""
+"""Calibrate int8: measure, merge or import the ranges of tensors."""
 
 import dataclasses
 import gc
@@ -41,30 +41,30 @@ from me2e_compress.workflows.prepare_int8 import PreparedGraph
 
 @dataclasses.dataclass(frozen=True)
 class CalibrateOptions:
-    """How ranges come about.
+    """How ranges are measured, merged or imported.
 
     Attributes:
-        recipe: whose passes before int8 are run; a shipped one or a TOML file.
+        recipe: a shipped recipe or a TOML file; its passes before int8 are run.
         method: ``max-min``, ``moving-average:W``, ``percentile:P``, ``mse``,
             ``entropy``.
-        count: frames, drawn in whole scenes.
-        seed: of the draw.
+        count: number of frames, drawn in whole scenes.
+        seed: seed of that draw.
         module_map: preset or TOML file; None finds the preset.
-        shard: ``2/4``: only the second of four shards, saved as statistics.
-        merge: shards that were saved, instead of frames.
+        shard: ``2/4`` measures only the second of four shards and saves statistics.
+        merge: saved shards to merge, instead of frames.
         imported: a TensorRT cache or onnxruntime table, instead of frames.
         tensorrt_cache: write a TensorRT calibration cache too.
         onnxruntime_table: write onnxruntime's table too, into this folder.
-        threads: of onnxruntime; 0 takes all.
+        threads: threads of onnxruntime; 0 takes all.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
-        adapter: TOML file that says which outputs are fed back; ``compress`` is then
-            given it too.
+        adapter: TOML file that says which outputs are fed back; give it to ``compress``
+            too.
         provider: what runs the graph.
         force: replace outputs that are not as we left them, too.
 
     Raises:
-        RecipeError: no such method, a number below 0, or a shard that is none.
-        FramesError: a shard with outputs that only whole ranges have.
+        RecipeError: The method, a number or the shard is not valid.
+        FramesError: A shard is asked for a file that only whole ranges can fill.
     """
 
     recipe: str | Path = "exact"
@@ -84,7 +84,6 @@ class CalibrateOptions:
     force: bool = False
 
     def __post_init__(self) -> None:
-        """Check what can be checked without a file."""
         OBSERVERS.parse(self.method)
         check_count("--seed", self.seed)
         check_count("--threads", self.threads, most=MOST_THREADS)
@@ -107,22 +106,16 @@ def calibrate(
 ) -> CalibrateResult:
     """Measure the ranges of every tensor that any scheme, rule set or target needs.
 
-    A run that was killed goes on from ``OUTPUT.checkpoint``.
-
-    Args:
-        model: the float ONNX file, or the name of one that ships.
-        frames: folder of recorded frames; None where shards are merged or another
-            tool's cache is read.
-        output: ``RANGES.json``, or ``SHARD.npz`` of a shard.
-        options: None takes the defaults.
-        listener: is called with progress and warnings.
+    The model is a float ONNX file or the name of one that ships; frames are None to
+    merge shards or to import another tool's ranges. The output is ``RANGES.json``, or
+    ``SHARD.npz`` for a shard. A run that was killed goes on from ``OUTPUT.checkpoint``.
 
     Raises:
-        FramesError: no frames or more than one source, or frames that do not fit.
-        PreconditionError: the graph is quantized already, or nothing can be int8.
-        GraphError: no such model, or an output would harm an input.
-        RecipeError: no such recipe.
-        ProviderError: the provider is not there.
+        FramesError: There is not exactly one source, or frames do not fit.
+        PreconditionError: The graph is quantized already, or nothing can become int8.
+        GraphError: The model does not exist, or an output would harm an input.
+        RecipeError: The recipe does not exist.
+        ProviderError: The provider is not available.
     """
     options = options or CalibrateOptions()
     source, output = model_path(model), output_path(output)
@@ -143,6 +136,7 @@ def _calibrate(
 ) -> CalibrateResult:
     passes = with_sizes(recipe.load(options.recipe), options.dims)
     loaded = read_graph(source, listener, options.adapter)
+    # frames are read and the graph is opened before any pass runs
     part = None if frames is None else _part(loaded, Path(frames), options)
     try_first(
         loaded,
@@ -152,13 +146,16 @@ def _calibrate(
         frames=part,
         provider=options.provider,
     )
+    # ranges belong to the graph as the passes before int8 leave it
     ready = PreparedGraph.of(source, loaded, options.module_map, passes)
     tensors = ready.tensors()
     del loaded  # 150 MB of VAD-tiny; graphs are cycles
     gc.collect()
+    # without frames the ranges come from another tool or from shards
     if part is None:
         found = _given(graph.digest(ready.model), tensors, options)
         return _written(found, output, options)
+    # a checkpoint lets a run that was killed go on
     method = options.method
     checkpoint = _checkpoint(output)
     calibrator = Calibrator(
@@ -211,7 +208,7 @@ def _inputs(
 
 
 def _part(loaded: ir.Model, folder: Path, options: CalibrateOptions) -> FrameSubset:
-    """Draw frames that fit the model, or one shard of those."""
+    """Draw frames that fit the model, or one shard of them."""
     recording = CalibrationSet(folder)
     recording.check(loaded)
     drawn = draw(recording, options.count, options.seed)
@@ -219,7 +216,6 @@ def _part(loaded: ir.Model, folder: Path, options: CalibrateOptions) -> FrameSub
 
 
 def _given(digest: str, tensors: tuple[str, ...], options: CalibrateOptions) -> Ranges:
-    """Read another tool's ranges, or put shards together."""
     if options.imported is not None:
         return read_foreign(Path(options.imported), digest, tensors)
     seen = merge([Statistics.load(Path(path)) for path in options.merge])

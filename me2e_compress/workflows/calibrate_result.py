@@ -1,4 +1,4 @@
-"""What a calibration found: ranges, or the statistics of one shard."""
+"""The result of a calibration: ranges, or the statistics of one shard."""
 
 import dataclasses
 from pathlib import Path
@@ -7,19 +7,12 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.workflows.result import Result, Table, counted
 
 _SHOWN = 5
-"""How many of a kind are listed."""
+"""Number of tensors of a kind that are listed."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CalibrateResult(Result):
-    """Ranges, or the statistics of one shard.
-
-    Attributes:
-        output: the file that was written.
-        frames: how many frames were seen.
-        ranges: of every tensor; None of a shard.
-        shard: ``2/4`` of a shard, else None.
-    """
+    """The range of every tensor; or a shard's statistics, with `ranges` of None."""
 
     output: Path
     frames: int
@@ -28,7 +21,7 @@ class CalibrateResult(Result):
 
     @property
     def headline(self) -> str:
-        """File, tensors, method, frames."""
+        """The file, and the number of tensors, the method and the number of frames."""
         if self.ranges is None:
             return f"{self.output}: shard {self.shard}, {counted(self.frames, 'frame')}"
         found = self.ranges
@@ -38,7 +31,7 @@ class CalibrateResult(Result):
         )
 
     def lines(self) -> tuple[str, ...]:
-        """Return the headline, and which ranges deserve a look."""
+        """Return the headline, and the ranges that deserve a look."""
         if self.ranges is None:
             return (self.headline,)
         worst = sorted(self.ranges.outliers.items(), key=lambda item: -item[1])
@@ -50,11 +43,11 @@ class CalibrateResult(Result):
         )
 
     def tables(self) -> tuple[Table, ...]:
-        """Return none: the lines say what there is to read."""
+        """Return no table: the lines say what matters."""
         return ()
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a tensor."""
+        """Return one row per tensor."""
         tensors = {} if self.ranges is None else self.ranges.tensors
         return [
             {"tensor": name, "low": low, "high": high}
@@ -62,7 +55,7 @@ class CalibrateResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return the ranges, and which are always zero; of a shard which it is."""
+        """Return the ranges and the tensors that are always zero, or the shard."""
         if self.ranges is None:
             return {"shard": self.shard, "frames": self.frames}
         return {**dataclasses.asdict(self.ranges), "dead": self.ranges.dead}

@@ -1,4 +1,4 @@
-"""Ranges of every file of a stack, measured while the whole runs."""
+"""Calibrate every file of a stack while the whole stack runs."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -31,36 +31,31 @@ _OF_ONE_FILE = (
     "onnxruntime_table",
     "adapter",
 )
-"""Options that are not for a stack."""
+"""Options that apply to a single file, not to a stack."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class StackCalibrateResult(Result):
-    """Ranges of every file of a stack.
-
-    Attributes:
-        output: the folder that was written.
-        files: by label, what was found for each file.
-    """
+    """The ranges of every file of a stack, by label."""
 
     output: Path
     files: Mapping[str, CalibrateResult]
 
     @property
     def headline(self) -> str:
-        """Folder and files."""
+        """The folder and the files."""
         return f"{self.output}: ranges of {', '.join(self.files)}"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return none: the lines say what there is to read."""
+        """Return no table: the lines say what matters."""
         return ()
 
     def lines(self) -> tuple[str, ...]:
-        """Return what each file says of its ranges."""
+        """Return the lines of every file."""
         return tuple(line for each in self.files.values() for line in each.lines())
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a tensor and file."""
+        """Return one row per file and tensor."""
         return [
             {"file": name, **record}
             for name, each in self.files.items()
@@ -68,7 +63,7 @@ class StackCalibrateResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return by file what a calibration of one file says."""
+        """Return the calibration of each file, by label."""
         return {"files": {name: each.to_json() for name, each in self.files.items()}}
 
 
@@ -79,22 +74,18 @@ def calibrate_stack(
     options: CalibrateOptions | None = None,
     listener: Listener = SILENT,
 ) -> StackCalibrateResult:
-    """Measure the ranges that int8 needs in every file, in one pass of the whole.
+    """Measure the ranges of every file in one run of the whole stack.
 
-    Args:
-        stack: the TOML; its files are float.
-        frames: folder of recorded frames of the stack.
-        output: the folder: ``head.json`` for the file ``head``, for ``compress
-            --ranges``.
-        options: None takes the defaults.
-        listener: is called with progress and warnings.
+    The stack is a TOML with float files, and the frames are recorded for the stack. The
+    output is a folder for ``compress --ranges``: ``head.json`` for the file ``head``.
 
     Raises:
-        FramesError: no frames, frames that do not fit, or an option for one file alone.
-        PreconditionError: a graph is quantized already, or none can be int8.
-        GraphError: files that do not fit each other, or the folder would harm an input.
+        FramesError: There are no fitting frames, or an option is for one file alone.
+        PreconditionError: A graph is quantized already, or nothing can become int8.
+        GraphError: Files do not fit each other, or the folder would harm an input.
     """
     options, output = options or CalibrateOptions(), Path(output)
+    # refuse what cannot be before the files are read
     for name in _OF_ONE_FILE:
         if getattr(options, name):
             word = name.replace("_", "-").replace("imported", "import")
@@ -103,6 +94,7 @@ def calibrate_stack(
         raise FramesError("give recorded frames: ranges are never made up")
     if output.suffix == ".json":
         raise GraphError(f"{output}: of a stack a folder is written: name one (-o)")
+    # the folder is claimed before any work
     whole = SplitStack.load(model_path(stack))
     check_folder(output, (*whole.paths(), frames))
     with writing(trees=[output], force=options.force):
@@ -116,6 +108,7 @@ def _measured(
     recording = CalibrationSet(folder)
     recording.check(whole.interface())
     part = draw(recording, options.count, options.seed)
+    # files that can only stay float have no tensors to measure
     ready = _prepared(whole, options, listener)
     tensors = {name: _tensors(each) for name, each in ready.items()}
     if not any(tensors.values()):
@@ -133,10 +126,10 @@ def _measured(
 def _prepared(
     whole: SplitStack, options: CalibrateOptions, listener: Listener
 ) -> dict[str, PreparedGraph]:
-    """Run the passes before int8 on every file."""
     passes = with_sizes(recipe.load(options.recipe), options.dims)
     modules = map_of_stack(whole, options.module_map)
     found = dict[str, PreparedGraph]()
+    # the stack runs the prepared files, so that each must keep its outputs
     for label, each in whole.files.items():
         try_file(each.path, listener, options.provider)
         loaded = read_graph(each.path, listener)
@@ -151,7 +144,7 @@ def _prepared(
 
 
 def _tensors(ready: PreparedGraph) -> tuple[str, ...]:
-    """Name what needs a range; nothing in a file that can only stay float."""
+    """Name the tensors that need a range; none in a file that can only stay float."""
     try:
         return ready.tensors()
     except PreconditionError:

@@ -1,4 +1,4 @@
-"""Whether a model could drive, port by port, before anything does."""
+"""Check port by port whether a model could drive, before it does."""
 
 import dataclasses
 from pathlib import Path
@@ -22,14 +22,13 @@ from me2e_compress.workflows.result import Result, Status, Table, table
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ModelCheck(Result):
-    """What of a policy fits, and what is missing.
+    """Which ports of a policy fit, and what is missing.
 
     Attributes:
-        policy: as it was named.
-        drives_by: what its answer is, in words; empty where nothing names one.
-        inputs: of the graph, in its order; none of a policy that is no graph.
-        outputs: the same.
-        problems: why it could not drive, a line each; empty where it could.
+        drives_by: the kind of its answer, in words; empty where nothing names one.
+        inputs: the graph's inputs in order; empty if the policy is not a graph.
+        outputs: the graph's outputs, likewise.
+        problems: one line for each reason why it could not drive.
     """
 
     policy: str
@@ -40,26 +39,26 @@ class ModelCheck(Result):
 
     @property
     def fits(self) -> bool:
-        """Whether it could drive."""
+        """Whether the model could drive."""
         return not self.problems
 
     @property
     def status(self) -> Status:
-        """Whether it could drive."""
+        """``ok`` if the model could drive, else ``refused``."""
         return "ok" if self.fits else "refused"
 
     def check(self) -> None:
-        """Go on if it could drive.
+        """Raise unless the model could drive.
 
         Raises:
-            EvaluationError: it could not.
+            EvaluationError: It could not; the message names the first problem.
         """
         if not self.fits:
             raise EvaluationError(f"{self.policy} could not drive: {self.problems[0]}")
 
     @property
     def headline(self) -> str:
-        """Say what it drives by, or how much is in the way."""
+        """Whether the model could drive, and by which kind of answer."""
         if not self.fits:
             return f"{self.policy} could not drive"
         return f"{self.policy} could drive, by {self.drives_by}"
@@ -69,11 +68,11 @@ class ModelCheck(Result):
         return (self.headline,)
 
     def alerts(self) -> tuple[str, ...]:
-        """Return what is in the way."""
+        """Return the problems."""
         return self.problems
 
     def tables(self) -> tuple[Table, ...]:
-        """Return every port of the graph."""
+        """Return one table of every port of the graph."""
         kinds = [("input", each) for each in self.inputs]
         kinds += [("output", each) for each in self.outputs]
         if not kinds:
@@ -86,7 +85,7 @@ class ModelCheck(Result):
         return (table(self.policy, columns, rows, words=5),)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a port."""
+        """Return one row per port."""
         return [dataclasses.asdict(each) for each in (*self.inputs, *self.outputs)]
 
     def to_json(self) -> object:
@@ -103,24 +102,23 @@ def check_model(
     provider: Provider = CPU,
     listener: Listener = SILENT,
 ) -> ModelCheck:
-    """Look whether a policy could drive: open it, hold its ports, run it on zeros.
+    """Check whether a policy could drive: open it, match its ports, run it on zeros.
 
-    Args:
-        policy: an ONNX file, or what else :func:`evaluate` drives.
-        adapter: TOML file that adapts the model to the policy contract.
-        provider: what runs the model.
-        listener: is called with progress.
+    The policy is an ONNX file or any other that :func:`evaluate` drives; an adapter is
+    the TOML file that adapts a model to the policy contract.
 
     Raises:
-        EvaluationError: no such policy or adapter, or the file is no model.
-        GraphError: onnxruntime dies of the graph.
-        ProviderError: the provider is not there.
+        EvaluationError: The policy or adapter does not exist, or the file is no model.
+        GraphError: onnxruntime crashes on the graph.
+        ProviderError: The provider is not available.
     """
     named = str(policy)
     driver = driver_of(named, adapter, provider)
+    # a policy without a graph has no ports: opening it is the check
     if not isinstance(driver, OnnxDriver):
         opened(driver)
         return ModelCheck(named, "what its code answers", (), (), ())
+    # the ports are read without a policy, which would refuse at the first problem
     try_file(driver.path, listener, provider)
     read = Adapter() if driver.adapter is None else Adapter.load(driver.adapter)
     try:
@@ -131,6 +129,7 @@ def check_model(
     recurrent = recurrent_of(session, read)
     fed, used = input_uses(session, read, recurrent), OutputUses.of(session, read)
     outputs = used.ports(session, recurrent)
+    # problems are listed once each; only a model without any is run
     found = [each.problem for each in (*fed, *outputs) if each.problem]
     problems = dict.fromkeys([*found, *used.problems])
     if not problems and (said := _at_work(session, read)):
@@ -139,7 +138,7 @@ def check_model(
 
 
 def _at_work(session: AnySession, adapter: Adapter) -> str:
-    """Return what a run on zeros says against it; empty where nothing does."""
+    """Run the model on zeros; return what went wrong, else an empty string."""
     try:
         OnnxPolicy.of(session, adapter)
     except (GraphError, FramesError, EvaluationError) as error:

@@ -1,4 +1,4 @@
-"""What users give, checked before any work: files, folders, models, numbers."""
+"""Checks of what users give, before any work: files, folders, models, numbers."""
 
 import math
 import os
@@ -20,26 +20,18 @@ from me2e_compress.zoo.shipped import SHIPPED, shipped
 LARGEST = 1e15
 """The largest number of an option: beyond, milliseconds are no whole microseconds."""
 MOST_THREADS = 1024
-"""Of one session: more than machines have cores, and onnxruntime starts them all."""
+"""Most threads of a session: onnxruntime starts all of them, beyond the cores too."""
 
 Given: TypeAlias = str | Path | None
 """An input as the user names it; a word that does not name a file is harmless."""
 
 
 _MOST_DIGITS = 18
-"""Of a size: what a 64-bit integer holds."""
+"""Most digits of a dimension's size, which must fit into a 64-bit integer."""
 
 
 def model_path(text: str | Path, beside: Path = Path()) -> Path:
-    """Find the file that a word means; an existing file wins.
-
-    Args:
-        text: a path, or a name in `SHIPPED`.
-        beside: the folder that the path is relative to.
-
-    Raises:
-        GraphError: neither, or the shipped file is missing or altered.
-    """
+    """Return the file that a path or a shipped name means; an existing file wins."""
     path = beside / text
     if path.is_file():
         return path
@@ -51,16 +43,9 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
 def read_graph(
     path: Path, listener: Listener, adapter: str | Path | None = None
 ) -> ir.Model:
-    """Read a graph, and warn of what was changed in it, and of what it lacks.
+    """Read a graph; warn of a lowered opset and of missing shapes.
 
-    Args:
-        path: of the file.
-        listener: is called with the warnings.
-        adapter: what it says becomes metadata of the graph; see :func:`adapted`.
-
-    Raises:
-        GraphError: not a graph.
-        EvaluationError: the adapter is not of this graph.
+    An adapter's statements become metadata of the graph; see :func:`adapted`.
     """
     model = graph.load(path)
     adapted(model, adapter)
@@ -72,7 +57,7 @@ def read_graph(
 
 
 def lacking_shapes(model: ir.Model) -> str:
-    """Say which plugins give what nobody knows the shape of; empty if none does."""
+    """Describe the plugins whose output shapes are unknown; empty if there are none."""
     if not unshaped_plugins(model):
         return ""
     copy = model.clone()
@@ -88,20 +73,12 @@ def lacking_shapes(model: ir.Model) -> str:
 
 
 def load_map(named: str | Path | None, model: ir.Model) -> ModuleMap:
-    """Load the module map that is named; None finds the preset that fits a graph.
-
-    Raises:
-        ModuleMapError: no such map.
-    """
+    """Load the named module map; None finds the preset that fits the graph."""
     return map_of(model, None if named is None else str(named))
 
 
 def output_path(named: str | Path) -> Path:
-    """Return the file that an output names; others are named after it.
-
-    Raises:
-        GraphError: it names none.
-    """
+    """Return the path of an output, which must name a file."""
     path = Path(named)
     if path.name in ("", ".."):
         raise GraphError(f"{path} is a folder: name a file for the output")
@@ -109,20 +86,19 @@ def output_path(named: str | Path) -> Path:
 
 
 def check_output(outputs: Sequence[Path | None], inputs: Iterable[Given]) -> None:
-    """Refuse files that could not be written, or would harm an input.
+    """Refuse outputs that could not be written, or would harm an input.
 
-    Args:
-        outputs: the files that are to be written.
-        inputs: the files and folders of frames that are read; of a model the files
-            with its weights count too.
+    `inputs` are files and folders of frames that are read; the external weights of a
+    model are protected as well.
 
     Raises:
-        GraphError: an output is an input, a frame of a recording, a folder, a device
-            or named twice, or its folder does not exist.
+        GraphError: An output is an input, a frame of a recording, a folder or a device,
+            is named twice, or its folder does not exist.
     """
     named = dict[Path, Path]()
     # a model may be named by many variants, and is loaded to find its weights
     read = dict.fromkeys(Path(each) for each in inputs if each is not None)
+    # an output must be a regular file in an existing folder, and named once
     for output in filter(None, outputs):
         if not output.parent.is_dir():
             raise GraphError(f"{output}: no such folder {output.parent}")
@@ -132,6 +108,7 @@ def check_output(outputs: Sequence[Path | None], inputs: Iterable[Given]) -> Non
             raise GraphError(f"{output} is a device or a pipe: name a file")
         if named.setdefault(resolved(output), output) is not output:
             raise GraphError(f"{output} is named for two outputs: choose another name")
+        # no input may be overwritten
         for given in read:
             _keep(output, given)
 
@@ -139,16 +116,7 @@ def check_output(outputs: Sequence[Path | None], inputs: Iterable[Given]) -> Non
 def check_folder(
     folder: Path, inputs: Iterable[Given], files: Sequence[str] = ()
 ) -> None:
-    """Refuse a folder that could not be made, or whose files would harm an input.
-
-    Args:
-        folder: that is written into; it may be missing.
-        inputs: as in :func:`check_output`.
-        files: what is written there, by name.
-
-    Raises:
-        GraphError: it is a file or an input, or one of the files is an input.
-    """
+    """Refuse a folder that could not be made, or whose `files` would harm an input."""
     read = list(inputs)
     if not resolved(folder).name:
         raise GraphError(f"{folder} is the root of all files: name a folder")
@@ -163,7 +131,7 @@ def check_folder(
 
 
 def resolved(path: Path) -> Path:
-    """Follow links; of those in a circle, what they are called."""
+    """Resolve symbolic links; a path in a circle of links stays as it is."""
     return Path(os.path.realpath(path))
 
 
@@ -185,7 +153,7 @@ def _keep(output: Path, given: Path) -> None:
 
 
 def _weights(given: Path) -> Iterator[Path]:
-    """Name the files with the external weights of a model; none for other files."""
+    """Yield the external weight files of a model; none for other files."""
     try:
         model = graph.load(given)
     except GraphError:  # not a model, or refused before anything is written
@@ -197,16 +165,7 @@ def _weights(given: Path) -> Iterator[Path]:
 
 
 def check_number(option: str, value: float | None, *, zero: bool = False) -> None:
-    """Refuse anything but a finite number above 0.
-
-    Args:
-        option: its name, for the message.
-        value: what was given; None if nothing was.
-        zero: whether 0 will do too.
-
-    Raises:
-        RecipeError: it is NaN, infinite, too small or beyond `LARGEST`.
-    """
+    """Refuse anything but None, a finite number above 0, or 0 if `zero` is set."""
     if value is None or 0 < value <= LARGEST or (zero and value == 0):
         return
     least = "0 or above" if zero else "above 0"
@@ -219,17 +178,7 @@ def check_number(option: str, value: float | None, *, zero: bool = False) -> Non
 def check_count(
     option: str, value: int, least: int = 0, most: int | None = None
 ) -> None:
-    """Refuse a count that is too small, or too large.
-
-    Args:
-        option: its name, for the message.
-        value: what was given.
-        least: that it may be.
-        most: that it may be; None for any.
-
-    Raises:
-        RecipeError: it is below the least or above the most.
-    """
+    """Refuse a count below `least`, or above `most` unless that is None."""
     if value < least:
         raise RecipeError(f"{option} is {value}: it must be {least} or more")
     if most is not None and value > most:
@@ -237,11 +186,7 @@ def check_count(
 
 
 def sizes(texts: Iterable[str]) -> dict[str, int]:
-    """Read sizes of open dimensions: ``batch=1``, ``image:0=1``.
-
-    Raises:
-        RecipeError: not of that form, or a dimension is given twice.
-    """
+    """Parse sizes of open dimensions, such as ``batch=1`` or ``image:0=1``."""
     found: dict[str, int] = {}
     for text in texts:
         name, _, size = text.rpartition("=")

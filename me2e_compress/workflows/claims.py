@@ -1,11 +1,11 @@
-"""Outputs are claimed before any work: one writer at a time, no file of the user lost.
+"""Claim outputs before any work: one writer at a time, and no user file is lost.
 
-One rule for every command: what exists is replaced only if me2e-compress wrote it and
-nobody touched it since, unless forced. The record, :data:`RECORD`, lies in the folder
-of the outputs: their names, and size and time of each as it was left; while one is
-replaced, also those of the draft that takes its place, so that a kill at any point
-leaves what is known again. While a command writes, it holds a lock on that record,
-which the system takes from a process that dies.
+One rule holds for every command: an existing file is replaced only if me2e-compress
+wrote it and nobody has changed it since, unless forced. The record, :data:`RECORD`,
+lies in the folder of the outputs and holds the name, size and time of each as we left
+it. While a file is replaced, the record also holds those of its draft, so that the
+state after a kill at any point is known. A command that writes holds a lock on the
+record, which the system releases when the process dies.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ State: TypeAlias = list[list[str | int]] | None
 """Name, bytes and nanoseconds of a file, or of all files of a folder; None: missing."""
 
 _UNLOCKABLE = (errno.ENOLCK, errno.ENOTSUP, errno.EINVAL)
-"""What a file system says that has no locks: then nothing is locked."""
+"""Error numbers of file systems without locks, on which nothing is locked."""
 
 
 @contextlib.contextmanager
@@ -43,24 +43,26 @@ def writing(
     """Claim outputs while they are written.
 
     Args:
-        files: that are written.
-        inputs: files and folders that are read, and so not to be written.
-        trees: folders that are written anew as a whole.
-        folders: that one command at a time may work in; what is in them is its own
-            affair.
+        files: files that are written.
+        inputs: files and folders that are read, and must not be overwritten.
+        trees: folders that are replaced as a whole.
+        folders: folders that one command at a time may work in; contents are not
+            checked.
         force: replace files and trees of the user too.
 
     Raises:
-        GraphError: an output is the user's, an input, no regular file, or another
-            process writes it.
+        GraphError: An output belongs to the user, is an input or no regular file, or
+            another process is writing it.
     """
     check_output(files, inputs)
     outputs = [*filter(None, files), *trees]
     with contextlib.ExitStack() as stack:
+        # working folders are only locked, against a second command
         for folder in folders:
             place = _place_of(folder)
             if place.parent.is_dir():
                 stack.enter_context(_opened(place)).lock(resolved(folder).name, folder)
+        # files and trees are also checked, and recorded when they are done
         for output in outputs:
             if output.absolute().parent.is_dir():
                 stack.enter_context(_claim(output, force=force))
@@ -70,11 +72,7 @@ def writing(
 def check_ours(
     files: Iterable[Path], *, trees: Iterable[Path] = (), force: bool = False
 ) -> None:
-    """Refuse, long before they are written, files and whole folders of the user's.
-
-    Raises:
-        GraphError: one is the user's, no regular file, or another process writes it.
-    """
+    """Refuse early what :func:`writing` would refuse."""
     there = [file for file in files if file.parent.is_dir()]
     check_output(there, ())
     for file in (*there, *(tree for tree in trees if tree.parent.is_dir())):
@@ -83,14 +81,13 @@ def check_ours(
 
 
 def _place_of(folder: Path) -> Path:
-    """Return the record that says who works in a folder: beside it, if that may be."""
+    """Return the record that locks a working folder: beside it if that is writable."""
     above = resolved(folder).parent
     return (above if os.access(above, os.W_OK) else folder) / RECORD
 
 
 @contextlib.contextmanager
 def _claim(output: Path, *, force: bool) -> Iterator[None]:
-    """Lock one output, and write down how it was left."""
     with _opened(output.absolute().parent / RECORD) as record:
         claim = _Claim(record, output, force=force)
         with drafts.announced(output, claim.announce):
@@ -101,21 +98,13 @@ def _claim(output: Path, *, force: bool) -> Iterator[None]:
 
 
 class _Claim:
-    """One output that this process alone may write.
-
-    Args:
-        record: of its folder; what it says of the output stays until that changes.
-        output: the file or folder.
-        force: take the user's too.
-
-    Raises:
-        GraphError: it is the user's, or another process writes it.
-    """
+    """One output that only this process may write, or a GraphError."""
 
     def __init__(self, record: "_Record", output: Path, *, force: bool) -> None:
         record.lock(output.name, output)
         self._record, self._output = record, output
         self._found = _state(output)
+        # the output is ours as we left it, or as the draft that a kill let through
         known = record.of(output.name)
         ours = self._found in (known.get("left"), known.get("next"))
         if self._found and not ours and not force:
@@ -127,36 +116,27 @@ class _Claim:
         self._next: State = None
 
     def announce(self, draft: Path) -> None:
-        """Note what is about to stand there, beside what we left there."""
+        """Record the draft that is about to take the output's place."""
         if self._next is not None and _state(self._output) == self._next:
             self._left = self._next
         self._next = _state(draft, self._output.name)
         self._record.note(self._output.name, left=self._left, next=self._next)
 
     def settle(self) -> None:
-        """Note what is there now; what was not written stays as it was known."""
+        """Record the output as it is now; an untouched one keeps its known state."""
         now = _state(self._output)
         left = self._left if now == self._found else now
         self._record.note(self._output.name, left=left)
 
 
 class _Record:
-    """The record of one folder, open and locked by parts.
-
-    Args:
-        path: of the file.
-        handle: of the open file.
-    """
+    """The record of one folder, kept open; outputs are locked by byte ranges of it."""
 
     def __init__(self, path: Path, handle: int) -> None:
         self.path, self.handle = path, handle
 
     def lock(self, name: str, output: Path) -> None:
-        """Take the lock of one output.
-
-        Raises:
-            GraphError: another process has it.
-        """
+        """Take the lock of one output; raise GraphError if another process has it."""
         place = 1 + zlib.crc32(name.encode("utf-8", "surrogateescape"))
         if not _try_lock(self.handle, 1, place):
             raise GraphError(
@@ -175,7 +155,7 @@ class _Record:
         return entry if isinstance(entry, dict) else {}
 
     def note(self, name: str, **states: State) -> None:
-        """Write what is known of one output; of a missing one, nothing."""
+        """Record the states of one output; a missing output is forgotten."""
         known = {key: state for key, state in states.items() if state}
         with drafts.naming(self.path), _locked(self.handle):
             entries = self._read()
@@ -184,7 +164,7 @@ class _Record:
             self._write(entries | {name: known} if known else entries)
 
     def _read(self) -> dict[str, object]:
-        """Return the last record that is whole: a kill may have cut one."""
+        """Return the last complete record: a kill may have cut one short."""
         text = os.pread(self.handle, 1 << 26, 0)
         for each in (text, *reversed(text.splitlines())):
             try:
@@ -196,10 +176,11 @@ class _Record:
         return {}
 
     def _write(self, entries: dict[str, object]) -> None:
-        """Write a record behind the earlier one, and then in its place.
+        """Append the new record, copy it to the front, then cut the file to it.
 
-        The file is never replaced, for the locks are on it; so that one whole record
-        is in it at any time, the copy behind begins after both.
+        The file is never replaced, because the locks are on it. The appended copy
+        begins behind both the old record and the new one's place at the front, so that
+        a complete record is in the file at any time.
         """
         line = json.dumps(entries, sort_keys=True).encode() + b"\n"
         size = os.fstat(self.handle).st_size
@@ -209,20 +190,20 @@ class _Record:
         os.ftruncate(self.handle, len(line))
 
     def close(self) -> None:
-        """Close it, and remove it if it says nothing and nobody else has a lock."""
+        """Close the record; remove it if it is empty and nobody else holds a lock."""
         if not self._read() and _try_lock(self.handle, 0, 0) and not self._read():
             self.path.unlink(missing_ok=True)
         os.close(self.handle)
 
 
 _OPEN: dict[Path, tuple[_Record, int]] = {}
-"""Records that this process has open, and how often: closing any handle of a file
-would drop all its locks."""
+"""Open records of this process with the number of their users. They are shared because
+closing any handle of a file would release all locks of the process on it.
+"""
 
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[_Record]:
-    """Open a record, or share the one that is open; what says nothing is removed."""
     path = path.parent.resolve() / path.name
     record, users = _OPEN.get(path) or (_Record(path, _handle(path)), 0)
     _OPEN[path] = record, users + 1
@@ -237,10 +218,9 @@ def _opened(path: Path) -> Iterator[_Record]:
 
 
 def _handle(path: Path) -> int:
-    """Open the file; again, if another process removed it meanwhile.
+    """Open the record's file; try again if another process removed it meanwhile.
 
-    Raises:
-        GraphError: it is a link, which might lead to a file of the user, or no file.
+    A link is refused, because it might lead to a file of the user.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     while True:
@@ -253,7 +233,6 @@ def _handle(path: Path) -> int:
 
 
 def _is_at(handle: int, path: Path) -> bool:
-    """Return whether an open file is still the one of that name."""
     try:
         return os.path.samestat(os.fstat(handle), path.lstat())
     except FileNotFoundError:
@@ -261,7 +240,7 @@ def _is_at(handle: int, path: Path) -> bool:
 
 
 def _try_lock(handle: int, length: int, place: int) -> bool:
-    """Take a lock without waiting; a file system without locks grants every one."""
+    """Take a lock without waiting; file systems without locks grant every one."""
     try:
         fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB, length, place)
     except OSError as error:
@@ -271,7 +250,6 @@ def _try_lock(handle: int, length: int, place: int) -> bool:
 
 @contextlib.contextmanager
 def _locked(handle: int) -> Iterator[None]:
-    """Hold the lock on what a record says."""
     try:
         fcntl.lockf(handle, fcntl.LOCK_EX, 1, 0)
     except OSError as error:
@@ -285,7 +263,6 @@ def _locked(handle: int) -> Iterator[None]:
 
 
 def _state(output: Path, name: str | None = None) -> State:
-    """Return name, size and time of a file, or of every file of a folder."""
     if not os.path.lexists(output):
         return None
     if not output.is_dir():

@@ -1,4 +1,4 @@
-"""How close one graph stays to another on the same frames."""
+"""Compare the outputs and plans of two graphs on the same frames."""
 
 import dataclasses
 from pathlib import Path
@@ -24,13 +24,8 @@ from me2e_compress.workflows.result import Result, Table, counted, table
 class CompareResult(Result):
     """How close a graph stays to another.
 
-    Attributes:
-        reference: the graph to be true to.
-        candidate: the graph that is judged.
-        fidelity: output by output, and of the plan.
-        open_loop: both plans against what was really driven; None where it was not
-            measured.
-        open_loop_reason: why not; empty where it was.
+    `open_loop` holds both plans against the recorded future; where that is None, not
+    measured, `open_loop_reason` says why.
     """
 
     reference: Path
@@ -54,7 +49,7 @@ class CompareResult(Result):
         return f"{said}; the same candidate on {found.same_choice:.1%} of them"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return signal to noise of every output, then sets, then plans as driven."""
+        """Return the SQNR of outputs, matched agents, and plans against the future."""
         found = self.fidelity
         rows = [
             *((o.name, f"{o.sqnr_db:.1f}", f"{o.error:.1e}") for o in found.outputs),
@@ -67,11 +62,11 @@ class CompareResult(Result):
         return (outputs, *agents, *driven)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row an output."""
+        """Return one row per output."""
         return [dataclasses.asdict(each) for each in self.fidelity.outputs]
 
     def to_json(self) -> object:
-        """Return outputs, missing outputs, plan, number of frames, plans as driven."""
+        """Return the fidelity, and both plans against the recorded future."""
         driven = None if self.open_loop is None else dataclasses.asdict(self.open_loop)
         return {
             **dataclasses.asdict(self.fidelity),
@@ -108,30 +103,24 @@ def compare(
 ) -> CompareResult:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres.
 
-    Where the frames tell what was really driven, also L2 and collisions of both plans.
-
-    Args:
-        reference: the graph to be true to: a file, the TOML of a stack of several, or
-            the name of one that ships.
-        candidate: the graph that is judged.
-        frames: folder of recorded frames.
-        listener: is called with progress and warnings.
-        as_it_stands: run the first graph without onnxruntime's optimizations, and the
-            second with all of them: a graph held against itself shows what they change.
-        provider: what runs both.
-        adapter: TOML file that says which output is the plan and which are fed back,
-            in both graphs; None leaves it to their metadata.
+    Each graph is an ONNX file, the TOML of a stack, or the name of a model that ships.
+    Where the frames tell what was really driven, L2 and collisions of both plans are
+    measured too. `as_it_stands` runs the first graph without onnxruntime's
+    optimizations and the second with all of them: comparing a graph with itself shows
+    what they change. The adapter's TOML says which output is the plan and which are fed
+    back, in both graphs; None leaves it to their metadata.
 
     Raises:
-        GraphError: no such model, onnxruntime cannot run it, or its plan has several
-            modes and nothing picks one.
-        FramesError: a frame fits one of the graphs not.
-        ProviderError: the provider is not there.
-        EvaluationError: no output in common, or one that is not finite.
+        GraphError: A model does not exist or run, or nothing picks one of a plan's
+            modes.
+        FramesError: A frame does not fit one of the graphs.
+        ProviderError: The provider is not available.
+        EvaluationError: The graphs share no output, or one is not finite.
     """
     paths = model_path(reference), model_path(candidate)
     recording = CalibrationSet(Path(frames))
     said = dict[Path, dict[str, str]]()
+    # each graph must take the frames, and open in another process first
     for path in dict.fromkeys(paths):
         model = load_interface(path)
         said[path] = adapted(model, adapter)
@@ -143,6 +132,7 @@ def compare(
         listener.on_progress("frames", frame.index, total, "")
         return frame
 
+    # the sessions get the adapter's metadata, which the files lack
     left = open_session(
         paths[0], optimize=not as_it_stands, release=True, provider=provider,
         said=said[paths[0]],
@@ -155,6 +145,7 @@ def compare(
         read, reason = common_adapter(left, right)
     except GraphError as error:
         raise GraphError(f"{paths[0]}: {error}") from error
+    # plans are judged against the recorded future where one is known
     tally = None if read is None else OpenLoopTally(read)
     watch = None if tally is None else tally.add
     fidelity = measure(left, right, map(reported, recording), watch)

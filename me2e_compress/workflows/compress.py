@@ -1,4 +1,4 @@
-"""One compression, from file to file."""
+"""Compress one graph, from file to file."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -55,29 +55,26 @@ class CompressOptions:
     Attributes:
         scheme: int8 after the recipe's passes: ``feature-ext``, ``prediction``,
             ``full``.
-        rules: of the int8 plan: ``safe``, ``paper``, or a set of yours.
+        rules: rules of the int8 plan: ``safe``, ``paper``, or a set of yours.
         target: runtime of the int8 graph: ``tensorrt`` or ``onnxruntime``.
         overrides: TOML file of exceptions to the int8 plan.
         weight_only_gemv: store the weights of matrix-vector products as int8.
         ranges: file of saved ranges, instead of frames.
         method: how ranges are read from frames, or were for ``ranges``.
         module_map: preset or TOML file; None finds the preset.
-        seed: of everything random.
+        seed: seed of everything random.
         verify_frames: frames that exact passes are checked on; 0 checks none, and the
             verdict says so.
-        unproven: write the graph although a recipe of exact passes could not be
-            checked, since the graph does not run here.
+        unproven: write a graph that does not run here, so that exact passes are
+            unchecked.
         measure_frames: most frames that are kept out of calibration, to measure lossy
             passes on; 0 measures nothing and calibrates on all.
-        floor: least SQNR of an output, in dB, without a warning.
+        floor: SQNR in dB below which an output is warned of.
         allow_empty: write the graph although nothing in it became int8.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         adapter: TOML file whose plan and state become metadata of the graph.
         provider: what runs graphs, to calibrate, check and measure.
         force: replace outputs that are not as we left them, too.
-
-    Raises:
-        RecipeError: a number below 0, or a floor that is not finite.
     """
 
     scheme: str | None = None
@@ -100,19 +97,18 @@ class CompressOptions:
     force: bool = False
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         check_count("--seed", self.seed)
         check_count("--verify-frames", self.verify_frames)
         check_count("--measure-frames", self.measure_frames)
         check_number("--floor", self.floor, zero=True)
 
     def passes(self, recipe: Recipe | None) -> tuple[Pass, ...]:
-        """Build the passes of a recipe, with what these options say about int8.
+        """Build the passes of a recipe, with these options' int8.
 
         Raises:
-            RecipeError: nothing to do, an unknown recipe, int8 twice, or options of
-                int8 without int8.
+            RecipeError: There is nothing to do, or the options and passes do not fit.
         """
+        # int8 alone comes after the exact recipe
         if isinstance(recipe, str | Path):
             passes = recipes.load(recipe)
         elif recipe is not None:
@@ -124,6 +120,7 @@ class CompressOptions:
                 f"say what to do: -r RECIPE ({', '.join(recipes.shipped())}), --passes"
                 " TEXT or --scheme"
             )
+        # a graph is quantized once
         quantizers = [each for each in passes if each.quantizes]
         if len(quantizers) + (self.scheme is not None) > 1:
             raise RecipeError(
@@ -142,6 +139,7 @@ class CompressOptions:
         given |= {name: Path(file) for name, file in files.items() if file is not None}
         if not given:
             return passes
+        # an option that no pass takes would be ignored without a word
         readers = [each for each in passes if each.quantizes] or [
             each for each in passes if each.reads_ranges
         ]
@@ -151,6 +149,7 @@ class CompressOptions:
                 f"--{unknown[0].replace('_', '-')} is for int8, and the pipeline has no"
                 f" {QuantizeInt8.name}: add --scheme"
             )
+        # each reader gets those options that it knows
         return tuple(
             each.with_options(
                 {n: v for n, v in given.items() if n in each.option_names()}
@@ -171,29 +170,25 @@ def compress(
 ) -> CompressResult:
     """Apply passes to a graph, check each, and write the smaller graph and a report.
 
-    Args:
-        model: the ONNX file, or the name of one that ships; it is not changed.
-        output: the smaller one.
-        recipe: a shipped recipe's name, a TOML file, or passes.
-        frames: folder of recorded frames; without them exact passes are checked on
-            seeded inputs, a model that ships on the frames that ship with it.
-        options: None takes the defaults.
-        listener: is called with progress and warnings.
+    The model is an ONNX file, which is not changed, or the name of one that ships.
+    Without frames exact passes are checked on seeded inputs; a model that ships has its
+    own frames.
 
     Raises:
-        GraphError: no such model, or the output would harm an input.
-        RecipeError: nothing to do, or options that do not fit the passes.
-        FramesError: frames that do not fit the model.
-        PreconditionError: nothing became int8 although a pass quantizes, or a recipe
-            of exact passes is not proven; nothing is written.
-        ProviderError: the provider is not there.
-        Me2eError: a pass refused the graph or broke.
+        GraphError: The model does not exist, or the output would harm an input.
+        RecipeError: There is nothing to do, or options do not fit the passes.
+        FramesError: The frames do not fit the model.
+        PreconditionError: Nothing became int8 although a pass quantizes, or exact
+            passes are not proven; nothing is written.
+        ProviderError: The provider is not available.
+        Me2eError: A pass refused the graph or failed.
     """
     options = options or CompressOptions()
     source, output = model_path(model), output_path(output)
     passes = options.passes(recipe)
     read = [file for each in passes for file in each.files()]
     named = recipe if isinstance(recipe, str | Path) else None
+    # claim the outputs first; Python's cycle collector would walk every node
     inputs = (source, named, frames, options.module_map, options.adapter, *read)
     with (
         writing(written_files(output), inputs, force=options.force),
@@ -215,26 +210,18 @@ def compress_graph(
     options: CompressOptions,
     listener: Listener,
 ) -> CompressResult:
-    """Try, apply, measure, and write one graph, whose outputs are claimed already.
+    """Try, compress, measure and write one graph, whose outputs are claimed already.
 
-    Args:
-        loaded: the graph.
-        files: that holds it, that is written, and the folder that a failing pass
-            leaves its reproducer in.
-        passes: of :meth:`CompressOptions.passes`.
-        modules: its module map.
-        frames_of: what it is calibrated, checked and measured on.
-        options: the rest.
-        listener: is called with progress and warnings.
-
-    Raises:
-        Me2eError: as :func:`compress`.
+    `files` are the source, the output and the folder for the reproducer of a failing
+    pass; `passes` come from :meth:`CompressOptions.passes`. Errors are those of
+    :func:`compress`.
     """
     start = process_time()
     source, output, reproducers = files
     seen = frames_of.calibration or frames_of.samples
     first = partial(try_first, listener=listener, provider=options.provider)
     first(loaded, source.name, file=source, frames=seen)
+    # apply the passes, and refuse a result that is unproven or not int8
     context = Context(modules, frames_of.calibration, options.seed, options.provider)
     manager = PassManager(
         passes, options.verify_frames, reproducers, frames_of.samples, first
@@ -243,6 +230,7 @@ def compress_graph(
     _refuse_unproven(report, options)
     int8 = Int8Outcome.of(report, context)
     _refuse_empty(int8, options, listener)
+    # measure what lossy passes cost, on the frames kept for it
     if report.lossy and frames_of.measured is not None:
         first(report.model, output.name)
     loss = measure_loss(report, context, frames_of, Floor(options.floor), listener)
@@ -271,10 +259,7 @@ def _split(
 
 
 def _refuse_unproven(report: Report, options: CompressOptions) -> None:
-    """Refuse to write what promises to be exact, and could not be run to prove it.
-
-    Who asked for no check gets none, and the verdict says so.
-    """
+    """Refuse exact passes that could not be run; who asked for no check gets none."""
     promised = all(step.exact for step in report.steps)
     if not promised or options.unproven or not options.verify_frames:
         return
@@ -288,7 +273,6 @@ def _refuse_unproven(report: Report, options: CompressOptions) -> None:
 def _refuse_empty(
     int8: Int8Outcome | None, options: CompressOptions, listener: Listener
 ) -> None:
-    """Refuse to write, or warn of, a graph in which nothing became int8."""
     if int8 is None or not int8.empty:
         return
     if not options.allow_empty:

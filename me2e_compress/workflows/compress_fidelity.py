@@ -1,4 +1,4 @@
-"""What lossy passes did to a model, on frames kept out of calibration."""
+"""Measure what lossy passes did to a model, on frames kept out of calibration."""
 
 import dataclasses
 from collections.abc import Collection, Mapping
@@ -35,13 +35,11 @@ NOT_ASKED = "--measure-frames 0"
 
 @dataclasses.dataclass(frozen=True)
 class SplitFrames:
-    """Which frames passes see, and which the result is measured on.
+    """Frames that passes see, and those that the result is measured on.
 
     Attributes:
-        calibration: for the passes; None where there are none.
-        measured: for the measurement; None where there are none.
-        kind: what the measured ones are, in words; where there are none, why not.
-        samples: that exact passes are checked on where the user gave none.
+        kind: what kind the measured frames are, or why there are none, in words.
+        samples: frames that exact passes are checked on where the user gave none.
     """
 
     calibration: Recording | None
@@ -58,14 +56,7 @@ class SplitFrames:
         *,
         saved: bool,
     ) -> "SplitFrames":
-        """Keep frames out of calibration.
-
-        Args:
-            recording: what the user gave.
-            samples: what ships with the model.
-            most: largest number to measure on; 0 keeps none.
-            saved: whether ranges come from a file, so that nothing is calibrated.
-        """
+        """Keep up to `most` frames out of calibration, unless ranges are `saved`."""
         if not most:
             return cls(recording, None, NOT_ASKED, samples)
         if recording is None:
@@ -82,16 +73,15 @@ class MeasuredLoss:
     """How true a compressed model stayed, and where it did not.
 
     Attributes:
-        fidelity: against the graph before the first lossy pass; None: not measured.
-        on: which frames, in words; where nothing was measured, why not.
-        incomparable: whether it was not measured because an output is not finite, or
-            of another shape than before.
-        floor: what it is held against.
-        unsteady: outputs that are not judged: the uncompressed model itself falls that
-            low, in dB or metres, when its largest input is rounded to int8.
-        shortfalls: what is below the floor, the worst first.
-        guilty: the passes that the shortfalls come from.
-        remedy: what would give the quality back; None: nothing was searched, since
+        fidelity: fidelity to the graph before the first lossy pass; None if not
+            measured.
+        on: which frames were used, or why nothing was measured, in words.
+        incomparable: whether an output is not finite, or of another shape than before.
+        unsteady: outputs that are not judged, with their dB or metres: the uncompressed
+            model itself falls that low when its largest input is rounded to int8.
+        shortfalls: outputs below the floor, the worst first.
+        guilty: the passes that cause the shortfalls.
+        remedy: what would restore the quality; None if nothing was searched, because
             another pass is guilty, or the one that quantizes takes no overrides.
         seconds: CPU time of measuring and searching.
     """
@@ -114,13 +104,10 @@ def measure_loss(
     floor: Floor,
     listener: Listener,
 ) -> MeasuredLoss | None:
-    """Compare the graph with what it was before the first lossy pass.
+    """Compare the graph with that before the first lossy pass; None if all are exact.
 
     Below the floor, the outputs that choose between near-equal candidates are set
-    aside, and the nodes of the int8 plan are searched for what makes the loss.
-
-    Returns:
-        What was found; None where every pass is exact.
+    aside, and the nodes of the int8 plan are searched for the cause of the loss.
     """
     if not report.lossy:
         return None
@@ -128,6 +115,7 @@ def measure_loss(
         return MeasuredLoss(None, frames.kind, floor)
     start = process_time()
     listener.on_progress("fidelity", 0, 1, "")
+    # a graph that does not run or compare is a finding, not a failure
     measurement = _Measurement(report, context, frames.measured, floor, listener)
     found = MeasuredLoss(None, frames.kind, floor)
     try:
@@ -141,8 +129,6 @@ def measure_loss(
 
 @dataclasses.dataclass(frozen=True)
 class _Measurement:
-    """One measurement, and the search that it may lead to."""
-
     report: Report
     context: Context
     frames: Frames
@@ -157,6 +143,7 @@ class _Measurement:
         low = [each.output for each in self.floor.shortfalls(fidelity)]
         if not low:
             return found
+        # outputs that choose between near-equal candidates are not judged
         choosing = unsteady_outputs(reference, self.floor)
         unsteady = {name: value for name, value in choosing.items() if name in low}
         below = self.floor.shortfalls(fidelity, unsteady)
@@ -167,6 +154,7 @@ class _Measurement:
         """Name the passes, and where int8 is to blame, the nodes."""
         lossy = self.report.lossy
         names = tuple(each.applied.name for each in lossy)
+        # without a quantizer all lossy passes share the blame
         quantizer = next((each for each in lossy if each.applied.quantizes), None)
         if quantizer is None:
             return dataclasses.replace(found, guilty=names)
@@ -177,6 +165,7 @@ class _Measurement:
                 others = tuple(each for each in names if each != quantizer.applied.name)
                 return dataclasses.replace(found, guilty=others)
         guilty = dataclasses.replace(found, guilty=(quantizer.applied.name,))
+        # only a plan with overrides can be varied node by node
         plan = plan_of(self.report.model)
         if plan is None or "overrides" not in quantizer.applied.option_names():
             return guilty
@@ -193,7 +182,6 @@ class _Measurement:
         reference: Reference,
         unsteady: Collection[str],
     ) -> Remedy:
-        """Try variants of the plan on as few frames as show the loss."""
         reference, start = self._fewer(reference, unsteady)
         with TemporaryDirectory(prefix="me2e-trial-") as folder:
             path = Path(folder) / "overrides.toml"
@@ -210,7 +198,7 @@ class _Measurement:
     def _fewer(
         self, reference: Reference, unsteady: Collection[str]
     ) -> tuple[Reference, Fidelity]:
-        """Take the first frame alone if it shows the loss."""
+        """Take the first frame alone if it shows the loss, so that trials cost less."""
         first = tuple(islice(reference.frames, 1))
         few = Reference(reference.session, first, reference.answers[:1])
         found = self._compare(few)

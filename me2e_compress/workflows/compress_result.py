@@ -1,4 +1,4 @@
-"""What a compression made: the graph, the report and their tables."""
+"""The result of a compression: the graph, the report and their tables."""
 
 import dataclasses
 import math
@@ -27,13 +27,10 @@ class CompressResult(Result):
     """A compressed graph, and how it came to be.
 
     Attributes:
-        source: the file that was compressed.
-        output: the file that was written; beside it ``STEM.report.json`` and, where
-            the graph was quantized, ``STEM.plan.json``.
-        report: pass by pass, with the graph.
+        output: the file that was written, with ``STEM.report.json`` beside it and,
+            where the graph was quantized, ``STEM.plan.json``.
         record: what ``STEM.report.json`` holds.
-        source_bytes: with the weights beside it.
-        output_bytes: with the weights beside it.
+        source_bytes: size with external weights, as `output_bytes` is.
         int8: what became int8 and what did not; None where no pass quantizes.
         loss: how true the graph stayed; None where every pass is exact.
         seconds: CPU time of everything but the writing.
@@ -51,27 +48,27 @@ class CompressResult(Result):
 
     @property
     def report_path(self) -> Path:
-        """Where the report lies."""
+        """The file of the report."""
         return beside(self.output, "report")
 
     @property
     def weights(self) -> str:
-        """The checkpoint that the graph was made of, in a line; empty: not known."""
+        """The checkpoint that the graph was made from; empty if not known."""
         return named_weights(self.report.model.metadata_props)
 
     @property
     def size(self) -> str:
-        """MB, and the share of what was compressed."""
+        """The size in MB, and its share of the source's."""
         share = self.output_bytes / self.source_bytes
         return f"{megabytes(self.output_bytes)} MB, {share:.1%} of {self.source.name}"
 
     @property
     def headline(self) -> str:
-        """File, size, report."""
+        """The file, its size and the report."""
         return f"{self.output}: {self.size}; report: {self.report_path}"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return pass by pass what changed, how it was checked, and how true it is."""
+        """Return each pass with its changes and its check, then the fidelity."""
         measured = None if self.loss is None else fidelity_table(self.loss)
         return (*self.report.tables(), *filter(None, [measured]))
 
@@ -81,12 +78,12 @@ class CompressResult(Result):
         return tuple(filter(None, [weights]))
 
     def lines(self) -> tuple[str, ...]:
-        """Return the verdict: size, int8, how far outputs and plan moved, time."""
+        """Return the verdict: int8, how far outputs and plan moved, time and size."""
         said = (*verdict(self.report, self.int8, self.loss), self._time, self.headline)
         return (*said, *filter(None, [self.weights]))
 
     def alerts(self) -> tuple[str, ...]:
-        """Return what must not be overlooked: no int8, or quality below the floor."""
+        """Return warnings: nothing became int8, or quality is below the floor."""
         return tuple(alerts(self.int8, self.loss))
 
     @property
@@ -97,7 +94,7 @@ class CompressResult(Result):
         return said
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a pass."""
+        """Return one row per pass."""
         return [
             {
                 "pass": step.name,
@@ -112,21 +109,21 @@ class CompressResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return what the report file holds; the verdict, with times, is `lines`."""
+        """Return the report file's content except the verdict, which `lines` has."""
         return {key: each for key, each in self.record.items() if key != "verdict"}
 
 
 def beside(output: Path, what: str) -> Path:
-    """Name the file that lies beside a compressed graph: ``plan`` or ``report``."""
+    """Return the path of the ``plan`` or ``report`` beside a compressed graph."""
     return output.with_name(f"{output.stem}.{what}.json")
 
 
 def loss_record(
     report: Report, int8: Int8Outcome | None, loss: MeasuredLoss | None
 ) -> dict[str, object]:
-    """Return what a report file says of int8 and fidelity; null: not finite, or none.
+    """Return the report's int8, fidelity and verdict, without times.
 
-    Times are left out: the same run writes the same.
+    The same run thus writes the same file; numbers that are not finite become null.
     """
     return {
         "int8": None if int8 is None else dataclasses.asdict(int8),
@@ -136,7 +133,7 @@ def loss_record(
 
 
 def fidelity_record(loss: MeasuredLoss) -> dict[str, object]:
-    """Return what a report file says of fidelity; null where it is not finite."""
+    """Return the report's fidelity; numbers that are not finite become null."""
     remedy = loss.remedy
     found = dataclasses.asdict(dataclasses.replace(loss, remedy=None))
     del found["seconds"]
@@ -146,7 +143,7 @@ def fidelity_record(loss: MeasuredLoss) -> dict[str, object]:
 
 
 def _finite(value: object) -> object:
-    """Replace what is not a finite number, at any depth, by None."""
+    """Replace numbers that are not finite, at any depth, by None."""
     if isinstance(value, Mapping):
         return {key: _finite(each) for key, each in value.items()}
     if isinstance(value, (list, tuple)):
@@ -157,7 +154,7 @@ def _finite(value: object) -> object:
 
 
 def written_files(output: Path) -> tuple[Path, ...]:
-    """Name every file that may be written beside a compressed graph, and that."""
+    """Return every file that may be written for a compressed graph."""
     return (
         output,
         *graph.data_names(output),
@@ -174,8 +171,8 @@ def write_result(
     loss: MeasuredLoss | None,
     seconds: float,
 ) -> CompressResult:
-    """Write the graph and its plan; the report last, it vouches for the others."""
-    plan = plan_of(report.model)  # first: what the file brought may be none
+    """Write the graph and its plan, then the report, which vouches for both."""
+    plan = plan_of(report.model)  # before writing: metadata may be malformed
     weights = {"weights": named_weights(report.model.metadata_props)}
     with drafts.all_or_none():
         graph.save(with_own_domains(report.model), output)

@@ -1,4 +1,4 @@
-"""One compression of a stack of several files: file by file, measured as one model."""
+"""Compress a stack of several files, file by file, and measure it as one model."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -62,25 +62,18 @@ def compress_stack(
     """Compress every file of a stack, and write a folder with the smaller stack.
 
     Each file is calibrated and checked on what it is fed while the float stack runs
-    over the frames; then the whole is measured against the whole.
-
-    Args:
-        stack: the TOML; its files are not changed.
-        output: the folder; it holds a TOML of the same name, the files, their plans
-            and reports, and ``report.json``.
-        recipe: for every file; None takes what the TOML says of each.
-        frames: folder of recorded frames of the stack.
-        options: None takes the defaults; ``ranges`` is a folder of
-            :func:`calibrate_stack`.
-        listener: is called with progress and warnings.
+    over the frames; then the whole is compared with the float stack. The folder holds a
+    TOML of the same name, the files, their plans and reports, and ``report.json``. A
+    recipe of None takes what the TOML says of each file; the option ``ranges`` is a
+    folder of :func:`calibrate_stack`.
 
     Raises:
-        GraphError: files that do not fit each other, before or after; or the folder
-            would harm an input.
-        RecipeError: nothing to do for a file, or options that do not fit the passes.
-        FramesError: frames that do not fit the stack.
-        PreconditionError: nothing became int8 in any file although passes quantize.
-        Me2eError: a pass refused a graph or broke.
+        GraphError: Files do not fit each other, or the folder would harm an input.
+        RecipeError: There is nothing to do for a file, or options do not fit the
+            passes.
+        FramesError: The frames do not fit the stack.
+        PreconditionError: Nothing became int8 in any file although passes quantize.
+        Me2eError: A pass refused a graph or failed.
     """
     options, output = options or CompressOptions(), Path(output)
     if output.suffix in (".onnx", ".toml"):
@@ -100,7 +93,7 @@ def compress_stack(
 
 @contextmanager
 def _drafted(output: Path) -> Iterator[Path]:
-    """Make a folder beside the output, which takes its place at the end."""
+    """Make a draft folder, which takes the output's place at the end."""
     output.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=output.parent, prefix=f".{output.name}.") as scratch:
         draft = Path(scratch) / output.name
@@ -124,6 +117,7 @@ def _compress(
     start = process_time()
     split = _split(whole, frames, pipelines, options)
     modules = map_of_stack(whole, options.module_map)
+    # every file is compressed on its own inputs within the running float stack
     found = {
         label: compress_graph(
             read_graph(each.path, listener),
@@ -137,11 +131,13 @@ def _compress(
         for label, each in whole.files.items()
     }
     _refuse_empty(found, options)
+    # the whole is measured as one model, because the files' losses do not add up
     small = SplitStack.load(_write_toml(whole, draft))
     loss = _measured(whole, small, split, found, options)
     record = stack_record(whole, small, found, loss)
     write_json(draft / REPORT, record, indent=2)
     seconds = process_time() - start
+    # results name the files where the draft will be put
     moved = {
         label: dataclasses.replace(each, output=output / each.output.name)
         for label, each in found.items()
@@ -153,7 +149,6 @@ def _compress(
 def _pipelines(
     whole: SplitStack, recipe: Recipe | None, options: CompressOptions
 ) -> Pipelines:
-    """Build the passes of every file, before anything is done."""
     entries = {each.name: each for each in whole.content.part}
     found = dict[str, tuple[Pass, ...]]()
     for label, file in whole.files.items():
@@ -175,7 +170,7 @@ def _named(entry: PartEntry, folder: Path) -> str | Path | None:
 
 
 def _options_of(label: str, options: CompressOptions) -> CompressOptions:
-    """Return the options of one file: its ranges; it may stay float, the whole not."""
+    """Return the options of one file: its own ranges, and leave to stay float."""
     ranges = None if options.ranges is None else Path(options.ranges) / f"{label}.json"
     return dataclasses.replace(options, ranges=ranges, allow_empty=True)
 
@@ -186,7 +181,6 @@ def _split(
     pipelines: Pipelines,
     options: CompressOptions,
 ) -> SplitFrames:
-    """Read and check the frames of the stack, and keep some for the measurement."""
     recording = None
     if folder is not None:
         recording = CalibrationSet(Path(folder))
@@ -201,7 +195,7 @@ def _split(
 def _of_part(
     whole: SplitStack, label: str, split: SplitFrames, options: CompressOptions
 ) -> SplitFrames:
-    """Return what one file is fed on the frames of the stack."""
+    """Return the frames that one file is fed while the stack runs."""
 
     def fed(frames: Recording) -> PartFrames:
         return PartFrames(whole, label, frames, options.provider)
@@ -217,7 +211,7 @@ def _of_part(
 
 
 def _told_of(label: str, listener: Listener) -> Listener:
-    """Say of which file progress and warnings are."""
+    """Put the file's label before progress and warnings."""
     return Listener(
         lambda stage, done, total, words: listener.on_progress(
             f"{label}: {stage}", done, total, words
@@ -229,7 +223,6 @@ def _told_of(label: str, listener: Listener) -> Listener:
 def _refuse_empty(
     found: Mapping[str, CompressResult], options: CompressOptions
 ) -> None:
-    """Refuse a stack in which nothing became int8; one of its files may have none."""
     outcomes = [each.int8 for each in found.values() if each.int8 is not None]
     if outcomes and not options.allow_empty and all(each.empty for each in outcomes):
         raise PreconditionError(
@@ -240,6 +233,7 @@ def _refuse_empty(
 
 def _write_toml(whole: SplitStack, draft: Path) -> Path:
     """Write the TOML of the smaller stack, and first values as files beside it."""
+    # parts lie beside the TOML under their own names; the recipes are done
     said = whole.content
     parts = tuple(
         each.model_copy(
@@ -253,6 +247,7 @@ def _write_toml(whole: SplitStack, draft: Path) -> Path:
         for each in said.part
     )
     state = dict(said.state)
+    # first values become files, because their sources may lie elsewhere
     for at, (name, entry) in enumerate(said.state.items()):
         value = whole.first_values.get(name.removeprefix(f"{name.split('.')[0]}."))
         value = whole.first_values.get(name, value)
@@ -273,7 +268,7 @@ def _measured(
     found: Mapping[str, CompressResult],
     options: CompressOptions,
 ) -> MeasuredLoss | None:
-    """Compare the whole with what it was, if a file was changed by a lossy pass."""
+    """Compare the whole with the float stack, if any file had a lossy pass."""
     if not any(each.report.lossy for each in found.values()):
         return None
     floor = Floor(options.floor)
@@ -283,6 +278,7 @@ def _measured(
         StackSession.open(each, release=True, provider=options.provider)
         for each in (whole, small)
     )
+    # outputs that are unsteady within a file are not judged in the whole either
     unsteady = {
         name: value
         for each in found.values()
@@ -293,6 +289,7 @@ def _measured(
         fidelity = compare(before, after, split.measured)
     except EvaluationError as error:
         return MeasuredLoss(None, str(error), floor, incomparable=True)
+    # every file with a lossy pass shares the blame
     below = floor.shortfalls(fidelity, unsteady)
     guilty = tuple(name for name, each in found.items() if each.report.lossy)
     unsteady = {name: unsteady[name] for name in unsteady if name in whole.outputs}

@@ -1,4 +1,4 @@
-"""What the compression of a stack made: files, report, tables."""
+"""The result of a stack's compression: files, report, tables."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -21,7 +21,6 @@ class StackCompressResult(Result):
     Attributes:
         source: the TOML of the stack that was compressed.
         output: the TOML that was written.
-        files: by label, what was made of each file.
         record: what ``report.json`` holds.
         loss: how true the whole stayed; None where every pass of every file is exact.
         seconds: CPU time of everything but the writing.
@@ -36,7 +35,7 @@ class StackCompressResult(Result):
 
     @property
     def headline(self) -> str:
-        """TOML, size, report."""
+        """The TOML, its size and the report."""
         before = sum(each.source_bytes for each in self.files.values())
         after = sum(each.output_bytes for each in self.files.values())
         return (
@@ -45,7 +44,7 @@ class StackCompressResult(Result):
         )
 
     def tables(self) -> tuple[Table, ...]:
-        """Return file by file what changed, and how true the whole is."""
+        """Return what changed in each file, and the fidelity of the whole."""
         rows = [
             (
                 name,
@@ -62,7 +61,7 @@ class StackCompressResult(Result):
         return (files, *filter(None, [measured]))
 
     def details(self) -> tuple[Table, ...]:
-        """Return pass by pass what changed in each file."""
+        """Return the tables of every file."""
         return tuple(each for file in self.files.values() for each in file.tables())
 
     def lines(self) -> tuple[str, ...]:
@@ -72,11 +71,11 @@ class StackCompressResult(Result):
         return (*said, *filter(None, weights))
 
     def alerts(self) -> tuple[str, ...]:
-        """Return what must not be overlooked in a file, or in the whole."""
+        """Return the warnings of the whole, and of each file."""
         return (*self._below(), *self._of_files())
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a pass and file."""
+        """Return one row per file and pass."""
         return [
             {"file": name, **record}
             for name, each in self.files.items()
@@ -84,7 +83,7 @@ class StackCompressResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return what the report file holds."""
+        """Return the content of the report file."""
         return self.record
 
     def _fidelity(self) -> Iterator[str]:
@@ -116,7 +115,7 @@ def stack_record(
     files: Mapping[str, CompressResult],
     loss: MeasuredLoss | None,
 ) -> dict[str, object]:
-    """Return what the report says: digests, every file's own report, the whole."""
+    """Return the stack's report: digests, every file's report, the whole's fidelity."""
     return {
         "source": {"file": whole.path.name, "sha256": whole.sha256()},
         "output": {"file": small.path.name, "sha256": small.sha256()},

@@ -10,16 +10,16 @@ from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.result import Table, counted, megabytes, table
 
 LEAST_SHOWN = 10_000
-"""Bytes of a rule that are worth a word."""
+"""Bytes of float weights from which on a rule is listed."""
 
 LISTED_WEIGHTS = 5
-"""Float weights that a table shows."""
+"""Number of float weights that a table shows."""
 
 
 def verdict(
     report: Report, int8: Int8Outcome | None, loss: MeasuredLoss | None
 ) -> Iterator[str]:
-    """Say in a line each what became int8, how far the outputs moved, and on what."""
+    """Yield lines on what became int8 and how far the outputs moved."""
     if int8 is not None:
         yield _int8_line(int8)
     yield from _proof(report)
@@ -39,7 +39,7 @@ def verdict(
 
 
 def alerts(int8: Int8Outcome | None, loss: MeasuredLoss | None) -> Iterator[str]:
-    """Say what must not be overlooked: nothing int8, or quality below the floor."""
+    """Yield warnings: nothing became int8, or quality is below the floor."""
     if int8 is not None and int8.empty:
         yield int8.empty
     if loss is not None and loss.incomparable:
@@ -55,10 +55,10 @@ def alerts(int8: Int8Outcome | None, loss: MeasuredLoss | None) -> Iterator[str]
 
 
 def _cure(loss: MeasuredLoss) -> Iterator[str]:
-    """Name the nodes, and what the outputs are with them in float."""
     assert loss.remedy is not None
     remedy, worst = loss.remedy, loss.shortfalls[0].output
     runs = f"{counted(remedy.trials, 'variant')} run on {_frames(remedy.fidelity)}"
+    # name the nodes to blame, or say that none can be
     found = [
         *map(str, remedy.nodes),
         *(f"many nodes of module {name}" for name in remedy.modules),
@@ -67,6 +67,7 @@ def _cure(loss: MeasuredLoss) -> Iterator[str]:
         yield f"no single node or module is to blame ({runs})"
         return
     yield f"lost at {'; '.join(found)}"
+    # show the overrides with what they achieve
     after = ", ".join(map(str, remedy.shortfalls)) or _figure(remedy.fidelity, worst)
     left = "" if remedy.cures else ", still below the floor"
     yield f"with --overrides of these lines: {after}{left} ({runs})"
@@ -90,18 +91,20 @@ def _int8_line(int8: Int8Outcome) -> str:
 
 
 def _proof(report: Report) -> Iterator[str]:
-    """Say how far exact passes moved the outputs, and what of it is not proven."""
+    """Say how far exact passes moved the outputs, and what is not proven."""
     judged = [
         (check.errors[name], check.fed)
         for check in report.verifications
         for name in check.judged
     ]
+    # with lossy passes in the pipeline, sameness is not the claim
     if judged and not report.lossy:
         worst, inputs = max(judged)
         near = f" to within {worst:.1e} of its largest value" if worst else ""
         yield f"every output is the same{near} ({inputs})"
     if not any(step.changes for step in report.steps):
         yield "every output is the same: no pass changed anything"
+    # what could not be proven is said too
     for check in report.verifications:
         if check.unproven is not None:
             yield f"not proven: {', '.join(check.passes)}: {check.unproven}"
@@ -111,7 +114,7 @@ def _proof(report: Report) -> Iterator[str]:
 
 
 def fidelity_line(found: Fidelity, loss: MeasuredLoss) -> str:
-    """Say how far the plan moved, and which output is the noisiest."""
+    """Return how far the plan moved, and which output is the noisiest."""
     where = f"on {_frames(found)} {loss.on}"
     said = []
     if found.plan is not None:
@@ -150,7 +153,7 @@ def _frames(found: Fidelity) -> str:
 
 
 def fidelity_table(loss: MeasuredLoss) -> Table | None:
-    """Show signal to noise and largest error of every output; None if not measured."""
+    """Return the SQNR and largest error of every output; None if not measured."""
     found = loss.fidelity
     if found is None:
         return None
@@ -174,7 +177,7 @@ def _judged(name: str, discrete: bool, loss: MeasuredLoss) -> str:
 
 
 def weights_table(int8: Int8Outcome) -> Table | None:
-    """Show the largest weights that stayed float, and why; None if there are none."""
+    """Return the largest weights that stayed float, and why; None if there are none."""
     if not int8.weights:
         return None
     return table(

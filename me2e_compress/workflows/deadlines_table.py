@@ -1,4 +1,4 @@
-"""A table of deadlines: of a trace, or of the decisions of an evaluation."""
+"""A table of deadlines, of a latency trace or of an evaluation's decisions."""
 
 from collections.abc import Iterator
 
@@ -9,7 +9,7 @@ from me2e_compress.workflows.result import Table, counted, not_measured, number,
 
 
 def deadlines_table(title: str, found: Deadlines) -> Table:
-    """Show percentiles and how many decisions took longer than the budget."""
+    """Return percentiles, and how many decisions took longer than the budget."""
     rows = [(name, *_cells(measure)) for name, measure in _each(found)]
     why = {name: each.reason for name, each in _each(found) if each.value is None}
     return table(
@@ -21,11 +21,7 @@ def deadlines_table(title: str, found: Deadlines) -> Table:
 
 
 def check_budget(budget_ms: float) -> None:
-    """Check the budget of a decision.
-
-    Raises:
-        EvaluationError: It is not a positive number.
-    """
+    """Raise EvaluationError unless the budget of a decision is a positive number."""
     if not 0.0 < budget_ms < float("inf"):
         raise EvaluationError(f"--budget-ms {budget_ms:g}: must be a positive number")
 

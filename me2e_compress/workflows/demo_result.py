@@ -1,4 +1,4 @@
-"""What a whole demo found, step by step, as one document."""
+"""The result of a whole demo, step by step, as one document."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -8,17 +8,15 @@ from me2e_compress.workflows.result import Result, Table
 
 
 def figure(found: Result) -> str:
-    """Return what a step found, short enough for a line of a terminal."""
+    """Return a step's result, short enough for a line of a terminal."""
     return found.size if isinstance(found, CompressResult) else found.headline
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class DemoResult(Result):
-    """What every step of a demo found.
+    """The results of ``compress``, ``weigh``, ``compare``, and ``drive`` or ``time``.
 
-    Attributes:
-        steps: by name, in order: ``compress``, ``weigh``, ``compare``, and ``drive`` or
-            ``time``.
+    They are named so, and in that order.
     """
 
     steps: Mapping[str, Result]
@@ -29,7 +27,7 @@ class DemoResult(Result):
 
     @property
     def headline(self) -> str:
-        """What the last step found, in one line."""
+        """The headline of the last step."""
         return self._last.headline
 
     def lines(self) -> tuple[str, ...]:
@@ -37,15 +35,15 @@ class DemoResult(Result):
         return self._last.lines()
 
     def alerts(self) -> tuple[str, ...]:
-        """Return what must not be overlooked in any step."""
+        """Return the warnings of all steps."""
         return tuple(line for each in self.steps.values() for line in each.alerts())
 
     def tables(self) -> tuple[Table, ...]:
-        """Return what the last step compares: before and after."""
+        """Return the tables of the last step, which compares before and after."""
         return self._last.tables()
 
     def details(self) -> tuple[Table, ...]:
-        """Return the tables of the steps before, and what more the last one tells."""
+        """Return the tables of the other steps, and the last one's details."""
         *others, last = self.steps.values()
         return (*(each for step in others for each in step.tables()), *last.details())
 
@@ -54,5 +52,5 @@ class DemoResult(Result):
         return self._last.records()
 
     def to_json(self) -> object:
-        """Return what each step found."""
+        """Return the result of each step."""
         return {name: each.to_json() for name, each in self.steps.items()}

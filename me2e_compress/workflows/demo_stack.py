@@ -1,4 +1,4 @@
-"""The demo with a stack of published size: nothing drives."""
+"""The demo with a stack of published size, which does not drive."""
 
 import dataclasses
 from collections.abc import Callable
@@ -30,12 +30,9 @@ class FilesResult(Result):
     """Size and latency of files, measured in turn on one frame.
 
     Attributes:
-        times: by file, the others are compared with the first.
-        threads: of onnxruntime.
-        rounds: how often each was run.
+        times: times by file; the first file is what the others are compared with.
         ending: what the user has now, in words.
-        plan: how far it moved, in words.
-        provider: what ran them.
+        plan: how far the plan moved, in words.
     """
 
     times: dict[Path, RunTimes]
@@ -51,7 +48,7 @@ class FilesResult(Result):
         return self.ending
 
     def lines(self) -> tuple[str, ...]:
-        """Return the verdict: size and time of the last file, the plan; the files."""
+        """Return the last file's size and time, the plan, and what is not measured."""
         (source, before), *_, (path, after) = self.times.items()
         sizes = graph.file_bytes(path), graph.file_bytes(source)
         ratio = after.median_wall_s / before.median_wall_s
@@ -65,8 +62,9 @@ class FilesResult(Result):
         )
 
     def tables(self) -> tuple[Table, ...]:
-        """Return a row a file."""
+        """Return one row per file."""
         first = next(iter(self.times.values()))
+        # ratios are of medians, which resist disturbances better than means
         rows = [
             (
                 path.name,
@@ -78,6 +76,7 @@ class FilesResult(Result):
             )
             for path, each in self.times.items()
         ]
+        # int8 placed for TensorRT is slow on this CPU, which a reader must know
         how = f"{self.threads} threads, {self.rounds} rounds in turn"
         on = "this CPU" if self.provider == CPU else PROVIDERS.text(self.provider)
         slower = "; onnxruntime's CPU runs such graphs slower"
@@ -92,7 +91,7 @@ class FilesResult(Result):
         )
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a file."""
+        """Return one row per file."""
         return [
             {
                 "file": path.name,
@@ -105,27 +104,13 @@ class FilesResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return a row a file."""
+        """Return one row per file."""
         return {"files": self.records()}
 
 
 @dataclasses.dataclass(frozen=True)
 class StackDemo:
-    """A stack of the zoo, exported, made small, and what that did to it.
-
-    Attributes:
-        stack: ``vad-tiny``.
-        out: the folder.
-        recipe_name: a shipped recipe.
-        rounds: of the latency.
-        threads: of onnxruntime.
-        provider: what runs the graphs.
-        force: replace files that are not as we left them, too.
-
-    Raises:
-        RecipeError: no such recipe, or more threads than can be.
-        GraphError: the folder is a file.
-    """
+    """A stack of the zoo, ``vad-tiny``, to export, compress, compare and time."""
 
     stack: str
     out: Path
@@ -137,14 +122,13 @@ class StackDemo:
     _compared: list[CompareResult] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
-        """Check recipe, threads and folder."""
         recipe.load(self.recipe_name)
         check_count("--threads", self.threads, most=MOST_THREADS)
         check_folder(self.out, ())
 
     @property
     def steps(self) -> dict[str, Callable[[Listener], Result]]:
-        """What is done, by name, in order."""
+        """The steps by name, in order."""
         return {
             "compress": self.compress,
             "weigh": self.weigh,
@@ -153,7 +137,8 @@ class StackDemo:
         }
 
     def compress(self, listener: Listener) -> CompressResult:
-        """Export the stack, write its frames, make it small."""
+        """Export the stack, write its frames and compress it."""
+        # calibration and comparison get frames of different seeds
         export_stack(self.stack, self._source, ExportOptions(force=self.force))
         for folder, count, seed in (
             (self._frames, CALIBRATION_FRAMES, CALIBRATION_SEED),
@@ -179,7 +164,7 @@ class StackDemo:
         return compare_modules(self._source, self._small)
 
     def compare(self, listener: Listener) -> Result:
-        """Compare the small graph with the stack on other frames."""
+        """Compare the small graph with the stack on the held-out frames."""
         found = compare(
             self._source,
             self._small,
@@ -192,12 +177,14 @@ class StackDemo:
 
     def time(self, listener: Listener) -> FilesResult:
         """Time the stack, its exact form and the small graph in turn."""
+        # the exact form shows how much of the gain is not int8's
         exact = self.out / f"{self.stack}.exact.onnx"
         unchecked = CompressOptions(
             verify_frames=0, provider=self.provider, force=self.force
         )
         compress(self._source, exact, "exact", options=unchecked, listener=listener)
         paths = {path.name: path for path in (self._source, exact, self._small)}
+        # all files run in turn on one frame, so that noise meets each alike
         sessions = {
             name: Session(
                 path, threads=self.threads, release=True, provider=self.provider

@@ -1,4 +1,4 @@
-"""What this machine can do, and what to install for the rest."""
+"""Report what this machine can do, and what to install for the rest."""
 
 import contextlib
 import dataclasses
@@ -32,18 +32,12 @@ _OPENCV = (
     "opencv-contrib-python-headless",
     "opencv-contrib-python",
 )
-"""Packages that bring cv2, each alone."""
+"""Packages that each provide cv2."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkup:
-    """One thing a machine can or cannot do.
-
-    Attributes:
-        what: the ability.
-        found: what is there, or None.
-        advice: what to do to have it; empty where it is there.
-    """
+    """One thing a machine can do, or, where `found` is None, how to make it do so."""
 
     what: str
     found: str | None
@@ -52,22 +46,18 @@ class Checkup:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class DoctorResult(Result):
-    """Everything that was looked for.
-
-    Attributes:
-        checkups: one a thing.
-    """
+    """Everything that was looked for."""
 
     checkups: tuple[Checkup, ...]
 
     @property
     def headline(self) -> str:
-        """Count what is there."""
+        """The number of things found."""
         found = sum(each.found is not None for each in self.checkups)
         return f"{found} of {len(self.checkups)} things found"
 
     def lines(self) -> tuple[str, ...]:
-        """Return none: the table says it."""
+        """Return no line: the table says everything."""
         return ()
 
     def tables(self) -> tuple[Table, ...]:
@@ -76,11 +66,11 @@ class DoctorResult(Result):
         return (table("This machine", ("what", "found", "to have it"), rows, words=3),)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a thing."""
+        """Return one row per thing."""
         return [dataclasses.asdict(each) for each in self.checkups]
 
     def to_json(self) -> object:
-        """Return what was found."""
+        """Return all checkups."""
         return {"checkups": self.records()}
 
 
@@ -112,7 +102,6 @@ def _packages() -> list[Checkup]:
 
 
 def _version(module: str) -> str:
-    """Return the version of the package that brings a module."""
     for package in _OPENCV if module == "cv2" else (module.replace("_", "-"),):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             return importlib.metadata.version(package)
@@ -120,7 +109,6 @@ def _version(module: str) -> str:
 
 
 def _kernels() -> Checkup:
-    """Say which compiled kernels sessions run in the place of fused operators."""
     what = "compiled kernels"
     if reason := why_not():
         return Checkup(what, None, f"fused operators run as their bodies: {reason}")
@@ -128,7 +116,6 @@ def _kernels() -> Checkup:
 
 
 def _energy() -> Checkup:
-    """Say which counter of energy answers here."""
     found = open_counter()
     if isinstance(found, Absent):
         advice = f"joules are not measured here: {found.reason}; docs/energy.md"
@@ -141,6 +128,7 @@ def _energy() -> Checkup:
 
 
 def _gpu() -> Checkup:
+    # a driver without a GPU fails later than a missing driver
     try:
         pynvml.nvmlInit()
     except pynvml.NVMLError as error:

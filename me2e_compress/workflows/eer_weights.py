@@ -1,4 +1,4 @@
-"""Weights and scales of EER_AV on file, for later calls to score alike."""
+"""Weights and scales of EER_AV in a file, for later calls to score alike."""
 
 import dataclasses
 from pathlib import Path
@@ -12,7 +12,7 @@ from me2e_compress.metrics.eer import MEASURES, EerScale, Normalization
 from me2e_compress.runtime.atomic import write_json
 
 Kind = Literal["measured", "modelled"]
-"""Of joules: what a counter counted, or what follows from MACs and bytes."""
+"""Joules counted by a counter, or modelled from MACs and bytes."""
 
 _STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
 _Four = Annotated[dict[str, float], Field(min_length=4, max_length=4)]
@@ -21,7 +21,7 @@ _Four = Annotated[dict[str, float], Field(min_length=4, max_length=4)]
 @with_config(_STRICT)
 @dataclasses.dataclass(frozen=True)
 class SavedWeights:
-    """A scale by the names of the measures, and which joules it is for."""
+    """A scale by the names of the measures, and the kind of joules it is for."""
 
     energy: Kind
     normalization: Normalization
@@ -31,20 +31,17 @@ class SavedWeights:
 
     @classmethod
     def of(cls, scale: EerScale, energy: Kind) -> "SavedWeights":
-        """Build it of a scale."""
+        """Build the saved form of a scale."""
         columns = (scale.weights, scale.offset, scale.span)
         named = [dict(zip(MEASURES, each, strict=True)) for each in columns]
         return cls(energy, scale.normalization, *named)
 
     @classmethod
     def load(cls, path: Path) -> "SavedWeights":
-        """Read what `save` wrote.
-
-        Raises:
-            EvaluationError: no such file, or not of this form.
-        """
+        """Read a file that `save` wrote."""
         with documents.reading(path, EvaluationError, "no file of weights"):
             found = _FILE.validate_python(documents.from_json(documents.content(path)))
+        # the form alone does not say which names there must be, or their signs
         for column in (found.weights, found.offset, found.span):
             if set(column) != set(MEASURES):
                 names = ", ".join(MEASURES)
@@ -54,7 +51,7 @@ class SavedWeights:
         return found
 
     def scale(self) -> EerScale:
-        """Return it as `metrics.eer` takes it."""
+        """Return the scale as `metrics.eer` takes it."""
         weights, offset, span = (
             (each[MEASURES[0]], each[MEASURES[1]], each[MEASURES[2]], each[MEASURES[3]])
             for each in (self.weights, self.offset, self.span)
@@ -62,11 +59,7 @@ class SavedWeights:
         return EerScale(self.normalization, weights, offset, span)
 
     def save(self, path: Path) -> None:
-        """Write it.
-
-        Raises:
-            EvaluationError: the file cannot be written.
-        """
+        """Write the weights; raise EvaluationError if that fails."""
         try:
             write_json(path, self.to_json(), indent=1)
         except OSError as error:
@@ -74,7 +67,7 @@ class SavedWeights:
             raise EvaluationError(said) from error
 
     def to_json(self) -> dict[str, Any]:
-        """Return every attribute under its name."""
+        """Return every attribute by name."""
         return dataclasses.asdict(self)
 
 

@@ -1,4 +1,4 @@
-"""A policy driven over routes of highway-env, and scored."""
+"""Drive a policy over routes of highway-env, and score it."""
 
 import dataclasses
 from pathlib import Path
@@ -37,38 +37,35 @@ from me2e_compress.workflows.result import number
 from me2e_compress.zoo.shipped import SHIPPED
 
 _FLAGS = {"frame_limit_s": "frame-limit"}
-"""Options of the command that are called otherwise in Python."""
+"""Command-line names of options that differ from their Python names."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateOptions:
-    """What is driven, under what.
+    """Which routes are driven, and under which conditions.
 
     Attributes:
         routes: ``all``, a number, ``ID,ID`` or a file of routes.
-        latency: what a decision costs: ``none``, ``fps:F``, ``trace:FILE`` or
+        latency: what a decision costs: ``none``, ``fps:F``, ``trace:FILE``,
             ``measured``.
-        latency_scale: of a trace or a measurement.
-        latency_model: ``drop`` (the decisions due meanwhile) or ``fifo`` (delays every
-            control).
+        latency_scale: factor on a trace or a measurement.
+        latency_model: ``drop`` the decisions due meanwhile, or ``fifo``: delay every
+            control.
         in_order: replay a trace in its order.
-        seed: of the draws from a trace.
+        seed: seed of the draws from a trace.
         workers: routes at a time.
-        dt_ms: step of the world.
+        dt_ms: time step of the simulation, in milliseconds.
         adapter: TOML file that adapts the model to the policy contract.
         host_stage: changes the model's plan on the host: ``collision-optimizer``.
         weather: ``fog_m=80,night=0.5,dropped=BACK+FRONT``; empty is a clear day.
-        frame_limit_s: until a decision counts as hung.
+        frame_limit_s: seconds until a decision counts as hung.
         engine: ``local`` or ``ray``.
-        address: of a Ray cluster.
+        address: address of a Ray cluster.
         render: draw these routes as GIF and PNG; chosen as ``routes`` is.
-        provider: what runs the model; one of other policies is not asked.
+        provider: what runs the model; policies other than graphs ignore it.
         force: replace outputs that are not as we left them, too.
         evaluator: ``highway``, whose options are those above; or another by name,
             ``name{option=value}``, which gets the policy as its option ``policy``.
-
-    Raises:
-        RecipeError: a number that is not positive and finite.
     """
 
     routes: str = "all"
@@ -91,16 +88,11 @@ class EvaluateOptions:
     evaluator: str = HIGHWAY
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         check_number("--dt-ms", self.dt_ms)
         check_number("--frame-limit", self.frame_limit_s)
 
     def check_for_others(self) -> None:
-        """Refuse what highway alone understands.
-
-        Raises:
-            EvaluationError: an option is not at its default.
-        """
+        """Raise EvaluationError if an option of highway alone is not at its default."""
         for field in dataclasses.fields(self):
             known = field.name in ("evaluator", "force")
             if not known and getattr(self, field.name) != field.default:
@@ -119,22 +111,16 @@ def evaluate(
 ) -> EvaluateResult:
     """Drive a policy over routes of highway-env; run again, it goes on.
 
-    Another evaluator is asked for all of its episodes, which are then kept.
-
-    Args:
-        policy: an ONNX file, the name of a model that ships, ``expert``, ``blind`` or
-            ``blind:MPS``; None for an evaluator that drives none.
-        output: the folder of results.
-        options: None takes the defaults.
-        listener: is called with progress and warnings.
+    The policy is an ONNX file, the name of a model that ships, ``expert``, ``blind`` or
+    ``blind:MPS``; None for an evaluator that drives none. Another evaluator than
+    highway is asked for all of its episodes, which are then kept in the same form.
 
     Raises:
-        EvaluationError: no such policy, evaluator, route, latency, weather or engine;
-            an option that the evaluator has not; the policy cannot drive; the folder
-            is of another evaluation.
-        GraphError: the folder is a file or an input.
-        ProviderError: the provider is not there.
-        MissingExtraError: driving in highway-env needs the extra ``highway``.
+        EvaluationError: A policy, evaluator or option does not exist or fit, the policy
+            cannot drive, or the folder belongs to another evaluation.
+        GraphError: The folder is a file or an input.
+        ProviderError: The provider is not available.
+        MissingExtraError: Driving in highway-env needs the extra ``highway``.
     """
     options, output = options or EvaluateOptions(), Path(output)
     named = None if policy is None else str(policy)
@@ -143,6 +129,7 @@ def evaluate(
     if named is None:
         raise EvaluationError("highway drives a policy: name one, M.onnx or highway")
     policy = named
+    # a trace that is no file is harmless here
     trace = options.latency.removeprefix("trace:")
     check_folder(output, (policy, options.routes, trace, options.adapter), (MANIFEST,))
     logs = [log_beside(output)]
@@ -172,6 +159,7 @@ def _evaluated(
     need_extra("highway", "driving")
     picked, _ = routes_named(options.routes)
     shown = () if options.render is None else pick_routes(picked, options.render)
+    # find the driver, and open its graph in a process of its own first
     driver = driver_of(policy, options.adapter, options.provider)
     if options.host_stage:
         driver = with_stage(driver, options.host_stage)
@@ -183,6 +171,7 @@ def _evaluated(
         running += f" SR {number(now.success_rate, '.1f')} %"
         listener.on_progress("evaluate", now.done, now.total, running)
 
+    # drive, or go on where an earlier run stopped
     asked = HighwayEvaluation(
         policy,
         output,
@@ -201,6 +190,7 @@ def _evaluated(
     )
     evaluator = asked.evaluator(on_progress, listener.on_warning, driver)
     episodes = tuple(evaluator.episodes())
+    # score over the whole set, though only a part of it was asked for
     scores = score_episodes(episodes, evaluator.set_size)
     pictures = _pictures(evaluator.job, shown, output)
     measured = evaluator.job.conditions.latency.measured
@@ -209,12 +199,7 @@ def _evaluated(
 
 
 def with_stage(driver: Driver, host_stage: str) -> Driver:
-    """Return a driver whose plan a host stage changes.
-
-    Raises:
-        EvaluationError: No such stage, an option that it refuses, or a driver without
-            a network.
-    """
+    """Return a driver whose plan a host stage changes; it must have a network."""
     HOST_STAGES.parse(host_stage)
     if not isinstance(driver, OnnxDriver):
         raise EvaluationError(
@@ -234,15 +219,9 @@ def _pictures(job: Job, routes: tuple[Route, ...], folder: Path) -> tuple[Path, 
 def driver_of(
     text: str, adapter: str | Path | None = None, provider: Provider = CPU
 ) -> Driver:
-    """Find the driver that a word means, and its model.
+    """Return the driver of a policy name, a path or a shipped model's name.
 
-    Args:
-        text: a policy by name, a path, or a shipped model's name.
-        adapter: TOML file that adapts the model to the policy contract.
-        provider: what runs the model; one of other policies is not asked.
-
-    Raises:
-        EvaluationError: none of them.
+    Policies other than graphs ignore the provider.
     """
     if text in SHIPPED:  # by its path, which a file of that name may be instead
         text = str(model_path(text))

@@ -1,4 +1,4 @@
-"""How a policy drives, as it is shown."""
+"""The result of an evaluation, as it is shown."""
 
 import dataclasses
 from pathlib import Path
@@ -15,11 +15,8 @@ class EvaluateResult(Result):
     """How a policy drives.
 
     Attributes:
-        policy: as it was named; the evaluator, where that drives none.
-        output: the folder of results.
-        scores: over the routes.
-        pictures: that were drawn.
-        late: what decisions were charged, held against a frame; None where nothing.
+        policy: the policy as named, or the evaluator where that drives none.
+        late: latencies charged to decisions, against the frame time; None if none were.
     """
 
     policy: str
@@ -30,24 +27,28 @@ class EvaluateResult(Result):
 
     @property
     def headline(self) -> str:
-        """Policy, driving score, routes."""
+        """The policy, its driving score and the routes."""
         return f"{self.policy}: {driving_score(self.scores)}"
 
     def lines(self) -> tuple[str, ...]:
-        """Return none: the table says it."""
+        """Return no line: the table says everything."""
         return ()
 
+    def alerts(self) -> tuple[str, ...]:
+        """Return the routes that ended by a failure."""
+        return tuple(filter(None, [self.scores.failed]))
+
     def tables(self) -> tuple[Table, ...]:
-        """Return every score with its interval, and what decisions were charged."""
+        """Return every score with its interval, and the latencies charged."""
         late = None if self.late is None else deadlines_table(self.policy, self.late)
         scores = scores_table(self.policy, self.scores)
         return (scores,) if late is None else (scores, late)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a score."""
+        """Return one row per score."""
         return score_records(self.scores)
 
     def to_json(self) -> object:
-        """Return the scores, and what decisions were charged."""
+        """Return the scores, and the latencies charged to decisions."""
         late = None if self.late is None else self.late.to_json()
         return {**self.scores.to_json(), "deadlines": late}

@@ -1,4 +1,4 @@
-"""A reference stack as ONNX."""
+"""Write a reference stack as ONNX."""
 
 import dataclasses
 import tempfile
@@ -29,27 +29,24 @@ from me2e_compress.zoo.published_weights import PublishedWeights, published_weig
 from me2e_compress.zoo.weights_record import WeightsRecord
 
 OPSET = 17
-"""Of the shipped models, and of the others unless asked otherwise."""
+"""Opset of the shipped models, and the default of the others."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportOptions:
-    """How a stack is written; a trained model leaves nothing to choose.
+    """How a stack is written; a trained model has no options.
 
     Attributes:
         opset: ONNX opset of the file.
         heads: which last layers: ``nuscenes`` or ``bench2drive`` of vad-tiny,
             ``bench2drive`` or ``beta`` of tcp; None is the first.
-        seed: of the initial weights; None is 0.
+        seed: seed of the initial weights; None is 0.
         force: replace outputs that are not as we left them, too.
         operators: ``plugin`` writes deformable attention as one node.
-        dialect: of which library that node is; None is the toolkit's own form.
+        dialect: plugin library whose form that node has; None is the toolkit's own
+            form.
         weights: checkpoint of the stack's original; None draws weights from the seed.
         ema: take the checkpoint's moving averages (``ema_...``), not its parameters.
-
-    Raises:
-        RecipeError: a seed below 0 or beside weights, averages of no weights, a dialect
-            that has no deformable attention, or one where operators are standard.
     """
 
     opset: int = OPSET
@@ -62,7 +59,6 @@ class ExportOptions:
     ema: bool = False
 
     def __post_init__(self) -> None:
-        """Check seed, weights and dialect."""
         check_count("--seed", self.seed or 0)
         if self.weights is not None and self.seed is not None:
             raise RecipeError("--seed draws weights, --weights brings them: give one")
@@ -83,19 +79,12 @@ _IMAGES = (
     " its VAD-tiny with BGR, mean (103.53, 116.28, 123.675), std 1: for such weights"
     " give those by an adapter (docs/weights.md)"
 )
-"""What would be silently wrong with a checkpoint of VAD-tiny."""
+"""A warning about images, which a checkpoint of VAD-tiny may expect in another form."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ExportResult(Result):
-    """A stack that was written.
-
-    Attributes:
-        stack: its name.
-        output: the file.
-        opset: of the file.
-        weights: where they are from; None: drawn from a seed, or our driver's.
-    """
+    """A stack that was written; `weights` is None unless a checkpoint was read."""
 
     stack: str
     output: Path
@@ -104,18 +93,18 @@ class ExportResult(Result):
 
     @property
     def headline(self) -> str:
-        """File, stack, opset, size."""
+        """The file, its stack, opset and size."""
         size = megabytes(file_bytes(self.output))
         return f"{self.output}: {self.stack}, opset {self.opset}, {size} MB"
 
     def lines(self) -> tuple[str, ...]:
-        """Return the headline, the checkpoint, and what became of the rest of it."""
+        """Return the headline, the checkpoint, and which of its weights are unused."""
         said = () if self.weights is None else self.weights.lines()
         images = (_IMAGES,) if said and self.stack == "vad-tiny" else ()
         return (self.headline, *said, *images)
 
     def tables(self) -> tuple[Table, ...]:
-        """Return none: the lines say it."""
+        """Return no table: the lines say everything."""
         return ()
 
     def records(self) -> list[dict[str, object]]:
@@ -130,7 +119,7 @@ class ExportResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return the file: stack, path, opset, bytes, weights."""
+        """Return the file with its stack, opset, bytes and weights."""
         said = None if self.weights is None else dataclasses.asdict(self.weights)
         return {**self.records()[0], "weights": said}
 
@@ -140,24 +129,18 @@ def export_stack(
 ) -> ExportResult:
     """Write a reference stack: random weights, a checkpoint's, or our driver.
 
-    Args:
-        stack: ``vad-tiny``, ``uniad-tiny``, ``uniad-trt``, ``tcp`` or ``highway``.
-        output: the file; its folder is made.
-        options: None takes the defaults.
-
-    Returns:
-        The file, and what of the checkpoint went into it.
+    The stack is ``vad-tiny``, ``uniad-tiny``, ``uniad-trt``, ``tcp`` or ``highway``;
+    the folder of the output is made if needed.
 
     Raises:
-        GraphError: no such stack, heads or opset, options for a trained model, a
-            checkpoint that cannot be read or of another model, or an output that cannot
-            be written.
-        MissingExtraError: exporting needs the extra ``zoo``.
+        GraphError: The stack, an option or the output is not usable.
+        MissingExtraError: Exporting needs the extra ``zoo``.
     """
     options, output = options or ExportOptions(), Path(output)
     files = [output] if output.parent.is_dir() else []  # else it is made
     given = [] if options.weights is None else [options.weights]
     with writing(files, given, force=options.force):
+        # a trained model is copied as it is
         if stack in shipped.SHIPPED:
             _refuse(stack, options)
             shipped.copy(stack, output)
@@ -167,6 +150,7 @@ def export_stack(
 
 def _exported(stack: str, output: Path, options: ExportOptions) -> ExportResult:
     weights = _read(stack, options)
+    # torch writes our own operator, which is translated to the dialect afterwards
     if options.operators == "plugin":
         with tempfile.TemporaryDirectory(prefix="me2e-export-") as folder:
             own = _written(stack, Path(folder, "own.onnx"), options, weights)
@@ -202,15 +186,12 @@ def _written(
 
 
 def in_dialect(model: ir.Model, dialect: str) -> ir.Model:
-    """Write the fused nodes of a graph in a dialect, with the shapes of what they give.
+    """Write the fused nodes of a graph in a dialect, with the shapes of their outputs.
 
-    Returns:
-        The graph, whose plugins stand in the domain that the dialect gives them.
-
-    Raises:
-        PreconditionError: the dialect cannot say one of them.
+    A dialect that cannot express one of them raises PreconditionError.
     """
     _record_shapes(model)
+    # plugins tell no shapes, so that these were recorded above
     for fused in fused_nodes(model):
         to = dialect_of(fused.operator, dialect)
         if to is not None and to != fused.dialect:
@@ -223,6 +204,7 @@ def in_dialect(model: ir.Model, dialect: str) -> ir.Model:
 
 def _record_shapes(model: ir.Model) -> None:
     """Record the shapes that shape arithmetic gives; the nodes stay as they are."""
+    # fold and infer in a copy until no more shapes become known
     copy = model.clone()
     rewrite.lift_constants(copy)
     left, before = _unshaped(copy), -1
@@ -234,6 +216,7 @@ def _record_shapes(model: ir.Model) -> None:
         )
         sweep.run(copy.graph)
         left = _unshaped(copy)
+    # write the shapes back, by name
     known = {value.name: value for node in copy.graph for value in node.outputs}
     for node in model.graph:
         for value in node.outputs:
@@ -248,7 +231,7 @@ def _unshaped(model: ir.Model) -> int:
 
 
 def _refuse(stack: str, options: ExportOptions) -> None:
-    """Refuse options: a trained model is one file."""
+    """Refuse options that a trained model, one file, does not have."""
     chosen = {
         "--seed": options.seed is not None,
         "--heads": options.heads is not None,

@@ -1,4 +1,4 @@
-"""A graph that was never opened here is opened in a process of its own first."""
+"""Open a graph that is new to this machine in a process of its own first."""
 
 from functools import partial
 from pathlib import Path
@@ -25,21 +25,15 @@ def try_first(
     frames: Frames | None = None,
     provider: Provider = CPU,
 ) -> None:
-    """Open a graph apart, if this machine has not seen it; run its first frame there.
+    """Open a graph in another process, if it is new here, and run its first frame.
 
-    Not for another provider than the CPU with its own operators: what they do to a
-    graph is not known from there.
-
-    Args:
-        model: the graph.
-        name: what messages call it.
-        listener: is told how long it took: no other time counts it.
-        file: that holds this very graph.
-        frames: a recording that fits it; without one, the graph is not run.
-        provider: what runs it.
+    `file` holds the same graph as `model`; without `frames` the graph is only opened.
+    The listener is told how long this took, since no other time includes it. Providers
+    other than the plain CPU are not tried: what they do to a graph does not follow from
+    it.
 
     Raises:
-        GraphError: onnxruntime dies of the graph.
+        GraphError: onnxruntime crashes on the graph.
     """
     if provider != CPU:
         return
@@ -54,11 +48,7 @@ def try_first(
 
 
 def load_interface(file: Path) -> ir.Model:
-    """Read an ONNX file; of a stack of several its inputs and outputs, without nodes.
-
-    Raises:
-        GraphError: not a graph, or files that do not fit each other.
-    """
+    """Read an ONNX file; of a stack its inputs and outputs, without nodes."""
     return SplitStack.load(file).interface() if is_stack(file) else graph.load(file)
 
 
@@ -69,17 +59,9 @@ def try_model(
     listener: Listener,
     provider: Provider = CPU,
 ) -> None:
-    """Open a file apart, or each of a stack, if this machine has not seen it.
+    """Open a file, or each of a stack, in another process; see :func:`try_first`.
 
-    Args:
-        model: of :func:`load_interface`.
-        file: the ONNX file, or the TOML of a stack.
-        frames: a recording that fits it; a graph is run on the first.
-        listener: is told how long it took.
-        provider: what runs it.
-
-    Raises:
-        GraphError: onnxruntime dies of it.
+    `model` comes from :func:`load_interface`.
     """
     if is_stack(file):
         try_file(file, listener, provider)
@@ -88,18 +70,13 @@ def try_model(
 
 
 def try_file(file: Path, listener: Listener, provider: Provider = CPU) -> None:
-    """Open the graph of a file apart, if this machine has not seen it.
+    """Open the graph of a file, or each of a stack, in another process.
 
-    Args:
-        file: that holds the graph, or the TOML of a stack: then each of its files.
-        listener: is told how long it took.
-        provider: what runs it; another than the CPU is not tried.
-
-    Raises:
-        GraphError: onnxruntime dies of the graph, or the files of a stack do not fit.
+    The graphs are not run.
     """
     if provider != CPU:
         return
+    # a stack's files are tried one by one
     if is_stack(file):
         for each in SplitStack.load(file).files.values():
             try_file(each.path, listener, provider)

@@ -1,4 +1,4 @@
-"""Calibration frames, coherent in time, seen by six cameras."""
+"""Make calibration frames that are coherent in time."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -38,8 +38,8 @@ class FramesOptions:
     """Which frames are made.
 
     Attributes:
-        count: how many.
-        seed: of everything.
+        count: number of frames.
+        seed: seed of everything random.
         scene_length: frames a scene; None is `SCENE_LENGTH` of a synthetic world,
             `DRIVEN_SCENE_LENGTH` of a driven route, all that a log has.
         force: replace outputs that are not as we left them, too.
@@ -47,9 +47,6 @@ class FramesOptions:
         log: recorded driving that they are made from; None makes them up.
         adapter: TOML file that adapts an ONNX file to the policy contract, or the name
             of one that ships: the frames are in the model's own form.
-
-    Raises:
-        RecipeError: a seed below 0.
     """
 
     count: int = 256
@@ -61,19 +58,12 @@ class FramesOptions:
     adapter: Path | None = None
 
     def __post_init__(self) -> None:
-        """Check the seed."""
         check_count("--seed", self.seed)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class FramesResult(Result):
-    """A recording that was written.
-
-    Attributes:
-        stack: or model, whose frames they are.
-        output: the folder.
-        options: which frames.
-    """
+    """A recording that was written for a stack or model."""
 
     stack: str
     output: Path
@@ -81,18 +71,18 @@ class FramesResult(Result):
 
     @property
     def count(self) -> int:
-        """Frames that there are: a log may have fewer than were asked for."""
+        """The number of frames written: a log may have fewer than were asked for."""
         return sum(1 for _ in self.output.glob("*.npz"))
 
     @property
     def headline(self) -> str:
-        """Folder, frames, stack, and seed or log."""
+        """The folder, its frames, the stack, and the seed or log."""
         log, seed = self.options.log, self.options.seed
         said = f"{self.output}: {counted(self.count, 'frame')} of {self.stack}"
         return f"{said}, {f'seed {seed}' if log is None else f'from {LOGS.text(log)}'}"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return none: the line says it."""
+        """Return no table: the headline says everything."""
         return ()
 
     def records(self) -> list[dict[str, object]]:
@@ -121,30 +111,19 @@ def record_frames(
 ) -> Path:
     """Make frames of a stack or a driver and write them, all or nothing.
 
-    A run that was killed goes on after its last whole scene.
-
-    Of the other stacks a synthetic world is drawn; for ``highway``, or any
-    ONNX file that keeps the policy contract, the expert drives fresh routes of
-    highway-env. With a log, recorded driving is laid out as either takes it.
-
-    Args:
-        source: a stack of the zoo, or an ONNX file that keeps the policy contract.
-        folder: is written.
-        options: None takes the defaults.
-        listener: is called with progress and warnings.
-
-    Returns:
-        The folder.
+    For stacks of the zoo a synthetic world is drawn. For ``highway``, or any ONNX file
+    that keeps the policy contract, the expert drives fresh routes of highway-env. With
+    a log, recorded driving is laid out as either takes it. A run that was killed goes
+    on after its last whole scene. The folder is returned.
 
     Raises:
-        GraphError: no such stack and no such file, or altered weights; or the folder
-            is the input.
-        FramesError: a count below 1, the folder holds something else, or the log
-            lacks something or cannot feed the model.
-        EvaluationError: the file does not keep the policy contract, or the adapter
+        GraphError: The stack or file is missing or altered, or the folder is the input.
+        FramesError: The count is below 1, the folder holds something else, or the log
+            cannot feed the model.
+        EvaluationError: The file does not keep the policy contract, or the adapter
             adapts nothing.
-        ProviderError: the provider is not there.
-        MissingExtraError: driving needs the extra ``highway``, a log ``logs``.
+        ProviderError: The provider is not available.
+        MissingExtraError: Driving needs the extra ``highway``, a log ``logs``.
     """
     options, folder = options or FramesOptions(), Path(folder)
     check_folder(folder, (source, options.adapter))
@@ -157,6 +136,7 @@ def _recorded(
 ) -> Path:
     pixels = dict[str, PixelInput]()
     about: dict[str, str | int] = {"stack": str(source), "seed": options.seed}
+    # frames come from a log, from the expert's driving, or from a synthetic world
     if options.log is not None:
         make, of, pixels = _logged(source, options.log, options)
         about = {"stack": str(source), "log": LOGS.text(options.log)}
@@ -166,6 +146,7 @@ def _recorded(
         make, of = _driven(model, options), digest_of_files(model)
     else:
         make, of = _synthetic(str(source), options), str(source)
+    # a recording is continued only if the sources and the adapter are the same
     if options.adapter is not None:
         of += f" {Adapter.digest(adapter_file(options.adapter))}"
 
@@ -186,6 +167,7 @@ def _logged(
     from me2e_compress.calibration.logs.log_frames import log_frames
 
     model: LoggedInputs | AdaptedInputs
+    # the model's inputs follow from its adapter, its metadata or the zoo
     if options.adapter is not None and _drives(source, options):
         path = model_path(source)
         model, of = AdaptedInputs(_policy(path, options)), digest_of_files(path)
@@ -209,11 +191,7 @@ def _logged(
 
 
 def _drives(source: str | Path, options: FramesOptions) -> bool:
-    """Return whether a file keeps the contract; a stack that is drawn does not.
-
-    Raises:
-        EvaluationError: An adapter for one that is drawn.
-    """
+    """Return whether the expert drives for a source; a drawn stack takes no adapter."""
     if Path(source).is_file() or find(str(source)).trained:
         return True
     if options.adapter is not None:

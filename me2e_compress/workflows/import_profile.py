@@ -1,4 +1,4 @@
-"""Latencies that were measured elsewhere, by another tool, as a trace of a model."""
+"""Import latencies that another tool measured, as a trace of a model."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,26 +25,22 @@ def import_profile(
 ) -> ProfileResult:
     """Read what other tools measured; nothing is run.
 
-    Args:
-        model: that was measured: the trace is of this file.
-        files: times and profile of trtexec, the log of tegrastats, or a trace; or
-            folders of them.
-        output: write the latencies as a trace, which ``evaluate`` can charge.
-        budget_ms: what a decision may take.
-        force: replace an output that is not as we left it, too.
+    `files` are times and profile of trtexec, the log of tegrastats, traces, or folders
+    of them. `output` is a trace of this very model file, which ``evaluate`` can charge.
 
     Raises:
-        GraphError: no such model, or the output would harm an input.
-        EvaluationError: a file is missing, broken or of another kind, or there is no
-            latency in any.
+        GraphError: The model does not exist, or the output would harm an input.
+        EvaluationError: A file is missing or malformed, or none has a latency.
     """
     check_budget(budget_ms)
     if not files:
         raise EvaluationError("--import: there is no file")
+    # a folder stands for all of its files
     source, written = model_path(model), None if output is None else Path(output)
     read = [file for path in files for file in _files(Path(path))]
     with writing([written], (source, *read), force=force):
         found = read_imports(read)
+        # the trace belongs to the very file that was measured
         machine = found.machine or " and ".join(found.sources)
         trace = LatencyTrace(graph.sha256_of(source), machine, found.samples_us)
         if written is not None:
@@ -60,7 +56,6 @@ def import_profile(
 
 
 def _files(path: Path) -> list[Path]:
-    """Return the files of a folder, or the one file."""
     if not path.is_dir():
         return [path]
     found = [each for each in sorted(path.iterdir()) if each.is_file()]
@@ -70,11 +65,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def refuse_both(frames: Path | None, options: ProfileOptions) -> None:
-    """Refuse to measure where latencies are imported.
-
-    Raises:
-        EvaluationError: Something that is asked for would have to be run.
-    """
+    """Refuse options that measure where latencies are imported."""
     asked = {
         "FRAMES": frames,
         "--samples": options.samples,

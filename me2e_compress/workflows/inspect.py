@@ -1,4 +1,4 @@
-"""What a graph holds: interface; nodes, parameters, MACs, energy, time by module."""
+"""Inspect a graph: interface; nodes, parameters, MACs, energy and time by module."""
 
 import dataclasses
 from collections import Counter
@@ -50,30 +50,25 @@ def inspect(
 ) -> InspectResult:
     """Read a graph and weigh its modules.
 
-    Args:
-        model: an ONNX file, or the name of one that ships.
-        module_map: preset or TOML file; None finds the preset.
-        dims: sizes that open dimensions of the inputs are given first.
-        process: model the energy of a frame by the figures of this silicon process,
-            ``45nm`` or ``7nm``; None does not.
-        trace: latencies of this model by module, as ``profile`` writes them.
-        frames: folder of recorded frames: measure the latencies on them instead.
-        listener: is called with progress and warnings.
-        adapter: TOML file that says which outputs are fed back.
+    `dims` are sizes that open dimensions of the inputs are given first. `process`,
+    ``45nm`` or ``7nm``, is the silicon process whose figures model the energy of a
+    frame. The time by module comes from a trace that ``profile`` wrote, or is measured
+    on recorded frames. The adapter's TOML says which outputs are fed back.
 
     Raises:
-        EnergyError: no such process.
-        GraphError: no such model.
-        PreconditionError: no input has such a dimension.
-        ModuleMapError: no such map.
-        EvaluationError: the trace is of another model or not by module.
-        RecipeError: a trace and frames.
-        FramesError: a frame does not fit.
+        EnergyError: The process is unknown.
+        GraphError: The model does not exist.
+        PreconditionError: No input has such a dimension.
+        ModuleMapError: The map does not exist.
+        EvaluationError: The trace is of another model, or not by module.
+        RecipeError: Both a trace and frames are given.
+        FramesError: A frame does not fit.
     """
     if process is not None:
         costs_of(process)
     if trace is not None and frames is not None:
         raise RecipeError("--trace and --frames: the time is read, or measured")
+    # the time by module is read from a trace, or measured here
     path = model_path(model)
     taken = None if trace is None else trace_of(trace, path)
     if frames is not None:
@@ -91,27 +86,21 @@ def inspected(
     process: str | None = None,
     taken: LatencyTrace | None = None,
 ) -> InspectResult:
-    """Weigh the modules of a graph; the arguments are those of :func:`inspect`.
-
-    Args:
-        path: the file of the graph.
-        loaded: the graph.
-        modules: its map.
-        dims: sizes of open dimensions.
-        process: that energy is modelled for.
-        taken: latencies by module.
-    """
+    """Weigh the modules of a graph; the arguments are those of :func:`inspect`."""
     if dims:
         loaded = FixShapes(dims).run(loaded, Context(modules)).model
+    # count what stands in the file, module by module
     placed = assign(loaded, modules)
     inputs, outputs = graph.interface(loaded)
     items = itemise(loaded, modules, placed.module_of)
+    # MACs, activations and energy need shapes, and folded shape arithmetic
     folded = _folded(loaded, modules)
     costs = {item.module: item for item in _costs(folded, modules)}
     items = tuple(_with_cost(item, costs.get(item.module)) for item in items)
     items = with_activations(items, folded)
     if taken is not None:
         items = with_latency(items, taken)
+    # say what is unknown, and why
     fed_back, wrong = _fed_back(loaded)
     total = sum(item.macs or 0 for item in costs.values())
     unknown = sum(item.unknown_macs_nodes or 0 for item in costs.values())
@@ -147,7 +136,7 @@ def _timed(
     listener: Listener,
     adapter: str | Path | None,
 ) -> LatencyTrace:
-    """Measure module by module, one inference a frame."""
+    """Measure module by module, one inference per frame."""
     from me2e_compress.workflows.profile import (  # opens sessions
         ProfileOptions,
         profile,
@@ -162,18 +151,7 @@ def model_energy(
     process: str = DEFAULT_PROCESS,
     module_map: str | Path | None = None,
 ) -> ModelledEnergy:
-    """Model the energy of a frame of a file; see :func:`modelled_energy` for a graph.
-
-    Args:
-        model: an ONNX file, or the name of one that ships.
-        process: whose figures: ``45nm`` or ``7nm``.
-        module_map: preset or TOML file; None finds the preset.
-
-    Raises:
-        EnergyError: no such process.
-        GraphError: no such model.
-        ModuleMapError: no such map.
-    """
+    """Model the energy of a frame of a file, by the figures of ``45nm`` or ``7nm``."""
     costs_of(process)
     loaded = graph.load(model_path(model))
     folded = _folded(loaded, load_map(module_map, loaded))
@@ -181,7 +159,7 @@ def model_energy(
 
 
 def _fed_back(model: ir.Model) -> tuple[dict[str, str], str]:
-    """Pair inputs with the outputs that are fed back; say why that cannot be done."""
+    """Pair inputs with the outputs that are fed back, or say why that fails."""
     try:
         return recurrent_inputs(model), ""
     except GraphError as error:
@@ -189,7 +167,7 @@ def _fed_back(model: ir.Model) -> tuple[dict[str, str], str]:
 
 
 def _with_cost(item: Item, cost: Item | None) -> Item:
-    """Return what a module holds as it stands in the file, with its MACs."""
+    """Return a module's item as it stands in the file, with its MACs."""
     if cost is None:
         return item
     return dataclasses.replace(
@@ -198,12 +176,12 @@ def _with_cost(item: Item, cost: Item | None) -> Item:
 
 
 def weigh(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
-    """Weigh the modules once the shape arithmetic is done, which MACs need to know."""
+    """Weigh the modules after shape arithmetic is folded, which MACs depend on."""
     return _costs(_folded(model, modules), modules)
 
 
 def _folded(model: ir.Model, modules: ModuleMap) -> ir.Model:
-    """Return a graph imported, its shape arithmetic done, its shapes inferred."""
+    """Return a graph imported, its shape arithmetic folded, its shapes inferred."""
     if provenance.missing(model):
         manager = PassManager(recipe.parse(_SHAPES), verify_frames=0)
         model = manager.run(model, Context(modules)).model
@@ -216,7 +194,6 @@ def _costs(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
 
 
 def _uncounted(model: ir.Model) -> dict[str, int]:
-    """Count the nodes of unknown MACs by the reason, most first."""
     count = graph.macs_counter(model)
     unknown = [node for node in model.graph.all_nodes() if count(node) is None]
     return dict(Counter(map(why_uncounted, unknown)).most_common())

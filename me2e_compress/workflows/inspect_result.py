@@ -1,4 +1,4 @@
-"""What inspection found, as it is shown."""
+"""The result of an inspection, as it is shown."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ from me2e_compress.workflows.result import (
 )
 
 _SHOWN = 8
-"""Operators of unknown MACs that are named."""
+"""Number of reasons for unknown MACs that are named."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -23,26 +23,19 @@ class InspectResult(Result):
     """What a file holds.
 
     Attributes:
-        file: its name.
-        file_bytes: with the weights beside it.
-        opset: of the default domain.
-        lowered: what was changed so that onnxruntime reads it; empty if nothing was.
-        hint: what the graph lacks, of which more could be known; empty if nothing.
-        domains: further operator domains.
+        file_bytes: size with the external weights.
+        opset: opset of the default domain; `domains` names the others.
         map: the module map that was used.
-        inputs: what it takes.
-        outputs: what it answers.
-        modules: module by module.
         rules: how many nodes each rule of the map placed.
-        macs: multiply-accumulates of the nodes whose count is known, all modules
-            together; None if none is.
-        unknown_macs_nodes: how many nodes are not in ``macs``.
-        uncounted: why, with the number of nodes.
-        open_dimensions: of the inputs, by name: MACs wait for their sizes.
+        macs: multiply-accumulates of all nodes whose count is known; None if none is.
+        uncounted: number of nodes whose count is not known, by reason.
+        open_dimensions: names of the inputs' open dimensions, which MACs depend on.
+        lowered: what was changed so that onnxruntime reads the file, else empty.
+        hint: what the graph lacks for more to be known, else empty.
         recurrent: inputs that are fed back from frame to frame, with the output.
-        modelled_energy: what its MACs and bytes would take; None: not asked for.
-        weights: the checkpoint that its metadata names, in a line; empty: none.
-        latency_of: which inferences the shares of time are of; empty: not measured.
+        modelled_energy: energy of its MACs and bytes; None if not asked for.
+        weights: the checkpoint that its metadata names, else empty.
+        latency_of: which inferences the shares of time are of; empty if not measured.
     """
 
     file: str
@@ -67,18 +60,18 @@ class InspectResult(Result):
 
     @property
     def headline(self) -> str:
-        """File, size, opset."""
+        """The file, its size and opset."""
         more = f" and {', '.join(self.domains)}" if self.domains else ""
         read = f" ({self.lowered})" if self.lowered else ""
         size = f"{megabytes(self.file_bytes)} MB"
         return f"{self.file}: {size}, opset {self.opset}{more}{read}"
 
     def lines(self) -> tuple[str, ...]:
-        """Return the headline, what the graph lacks, and what it was made of."""
+        """Return the headline, what the graph lacks, and its checkpoint."""
         return tuple(filter(None, (self.hint, self.headline, self.weights)))
 
     def tables(self) -> tuple[Table, ...]:
-        """Return the interface, and the modules."""
+        """Return the interface, the modules, and modelled energy if asked for."""
         ports = [
             (kind, port.name, port.type, port.shape)
             for kind, side in (("in", self.inputs), ("out", self.outputs))
@@ -96,6 +89,7 @@ class InspectResult(Result):
             )
             for item in self.modules
         ]
+        # notes below the tables: placement, total MACs, time, recurrence
         rules = ", ".join(f"{count} by {rule}" for rule, count in self.rules.items())
         note = f"nodes placed: {rules}\nGMACs in all: {self._total_macs()}"
         if self.latency_of:
@@ -104,6 +98,7 @@ class InspectResult(Result):
         back = f"fed back: {', '.join(pairs)}" if pairs else ""
         time = ("time",) if self.latency_of else ()
         counts = ("nodes", "parameters", "MB", "GMACs", "activations MB")
+        # the column of time is only there if it was measured
         columns = ("module", *counts, *time)
         modelled = self.modelled_energy
         return (
@@ -119,7 +114,6 @@ class InspectResult(Result):
         return ("-" if share is None else f"{share:.1%}",)
 
     def _total_macs(self) -> str:
-        """Write the MACs of the graph, and of how many nodes they are not known."""
         total = giga(self.macs, 0, ".3f")
         if not self.unknown_macs_nodes:
             return total
@@ -135,7 +129,7 @@ class InspectResult(Result):
         )
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a module."""
+        """Return one row per module."""
         return [dataclasses.asdict(item) for item in self.modules]
 
     def to_json(self) -> object:
@@ -144,7 +138,6 @@ class InspectResult(Result):
 
 
 def _activations(item: Item) -> str:
-    """Write megabytes; of how many nodes they are not known."""
     if item.activation_bytes is None:
         return "-"
     least = "at least " if item.unknown_activation_nodes else ""

@@ -1,4 +1,4 @@
-"""What a stack of several files holds: how they are joined, and each of them."""
+"""Inspect a stack of several files: how they are joined, and each of them."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,10 +23,8 @@ class FedInput:
     """One input of one file, and what feeds it.
 
     Attributes:
-        file: label of the file.
-        input: its name there.
-        source: an output (``backbone.feats``); ``frames``; or the state:
-            ``state: next_bev``.
+        source: an output (``backbone.feats``), ``frames``, or state (``state:
+            next_bev``).
         form: type and shape.
     """
 
@@ -38,15 +36,12 @@ class FedInput:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class StackInspectResult(Result):
-    """What a stack of several files holds.
+    """What a stack of several files holds, by label of the file.
 
     Attributes:
-        file: name of the TOML.
-        files: by label, what each file holds.
         fed: every input of every file, in the order in which the files run.
-        outputs: of the stack.
         recurrent: inputs that are fed back from frame to frame, with the output.
-        first_values: of those that do not begin at zeros, in words.
+        first_values: recurrent inputs that do not begin at zeros, in words.
     """
 
     file: str
@@ -58,12 +53,12 @@ class StackInspectResult(Result):
 
     @property
     def headline(self) -> str:
-        """TOML, files, size."""
+        """The TOML, its number of files and their size."""
         size = sum(each.file_bytes for each in self.files.values())
         return f"{self.file}: {counted(len(self.files), 'file')}, {megabytes(size)} MB"
 
     def lines(self) -> tuple[str, ...]:
-        """Return what each file says, and the headline."""
+        """Return the lines of each file, and the headline."""
         said = (line for each in self.files.values() for line in each.lines())
         return (*said, self.headline)
 
@@ -81,7 +76,7 @@ class StackInspectResult(Result):
         return (table("What feeds what", columns, rows, note, words=4), *modules)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a module and file."""
+        """Return one row per file and module."""
         return [
             {"file": name, **record}
             for name, each in self.files.items()
@@ -103,22 +98,17 @@ def inspect_stack(
     listener: Listener = SILENT,
     adapter: str | Path | None = None,
 ) -> StackInspectResult:
-    """Read a stack, and weigh the modules of each of its files.
+    """Read a stack's TOML, and weigh the modules of each of its files.
 
-    Args:
-        stack: the TOML.
-        module_map: preset or TOML file, for all files; None finds the preset.
-        dims: sizes that open dimensions of the inputs are given first.
-        process: as in :func:`inspect`.
-        trace: not for a stack: nodes are timed in one graph at a time.
-        frames: likewise.
-        listener: is not called.
-        adapter: not for a stack, whose TOML says state and plan.
+    The arguments are those of :func:`inspect`, but a trace, frames or an adapter are
+    refused: nodes are timed in one graph, and the TOML says state and plan. The map is
+    one for all files.
 
     Raises:
-        GraphError: a file is missing, or they do not fit each other.
-        RecipeError: a trace, frames or an adapter.
-        ModuleMapError: no such map, or a pattern matches nothing in any file.
+        GraphError: A file is missing, or files do not fit each other.
+        RecipeError: A trace, frames or an adapter is given.
+        ModuleMapError: The map does not exist, or a pattern matches nothing in any
+            file.
     """
     if adapter is not None:
         raise RecipeError(f"--adapter is for one file: {stack} says state and plan")
@@ -126,8 +116,10 @@ def inspect_stack(
         raise RecipeError(
             "--trace and --frames time the nodes of one graph: inspect one of the files"
         )
+    # check names before files are read
     if process is not None:
         costs_of(process)
+    # one map for all files: a pattern may match in any of them
     whole = SplitStack.load(model_path(stack))
     modules = map_of_stack(whole, module_map)
     files = {

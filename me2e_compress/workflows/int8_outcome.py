@@ -14,7 +14,7 @@ from me2e_compress.quantization.float_weights import FloatWeight, float_weights
 from me2e_compress.quantization.plan import QuantPlan, plan_of, savable_bytes
 
 LISTED = 10
-"""Float weights that a report lists."""
+"""Number of float weights that a report lists."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,15 +22,15 @@ class Int8Outcome:
     """What the pass that quantizes achieved.
 
     Attributes:
-        by: its name.
-        nodes: how many it made int8.
-        layers: how many there are, convolutions and matrix products, in any module;
-            None where the pass leaves no plan.
-        kept: how many of those each rule keeps float, the most first, with its reason.
-        weights: the largest that stayed float, at most `LISTED`.
-        float_bytes: of all weights that stayed float, by rule, the most first.
-        weight_only_bytes: that ``weight_only_gemv`` would save; 0 where it does, or
-            where that is little.
+        by: name of the pass.
+        nodes: number of nodes that it made int8.
+        layers: number of convolutions and matrix products in all modules; None where
+            the pass leaves no plan.
+        kept: how many of those each rule keeps float, with its reason, most first.
+        weights: the largest weights that stayed float, at most `LISTED`.
+        float_bytes: bytes of all weights that stayed float, by rule, most first.
+        weight_only_bytes: bytes that ``weight_only_gemv`` would save; 0 where it is on,
+            or where they are few.
     """
 
     by: str
@@ -43,14 +43,16 @@ class Int8Outcome:
 
     @classmethod
     def of(cls, report: Report, context: Context) -> Self | None:
-        """Read it off a run of the manager; None where no pass quantizes."""
+        """Read the outcome from a run of the manager; None where no pass quantizes."""
         quantizer = next((e for e in report.lossy if e.applied.quantizes), None)
         if quantizer is None:
             return None
         name, changes = quantizer.applied.name, quantizer.changes
+        # without a plan only the number of changes is known
         plan = _plan(report, quantizer, context)
         if plan is None:
             return cls(name, changes)
+        # a layer is left if it is neither int8 nor has int8 weights
         layers = [each for each in plan.decisions if each.op in WEIGHTED]
         placed = {each.output for each in (*plan.placed, *plan.weight_only)}
         left = [each for each in layers if each.output not in placed]
@@ -70,6 +72,7 @@ class Int8Outcome:
         """Why nothing became int8, in one line; empty if something did."""
         if self.nodes:
             return ""
+        # say what the layers are kept float by, the commonest rules first
         found = [f"{self.by} made nothing int8"]
         if self.layers is not None:
             found.append(f"{self.layers} convolutions and matrix products in the graph")
@@ -87,7 +90,6 @@ class Int8Outcome:
 
 
 def _by_rule(weights: Iterable[FloatWeight]) -> dict[str, int]:
-    """Add up the bytes, the rule with the most first."""
     found = Counter[str]()
     for each in weights:
         found[each.rule] += each.bytes
@@ -95,7 +97,7 @@ def _by_rule(weights: Iterable[FloatWeight]) -> dict[str, int]:
 
 
 def _plan(report: Report, quantizer: LossyPass, context: Context) -> QuantPlan | None:
-    """Return the plan that was carried out; where it was empty, what it was."""
+    """Return the plan that was carried out; if nothing changed, make it again."""
     found = plan_of(report.model) if quantizer.changes else None
     if found is None and isinstance(quantizer.applied, QuantizeInt8):
         found = quantizer.applied.plan(quantizer.before, context)

@@ -1,4 +1,4 @@
-"""What ``sensitivity`` and ``search`` have in common: a model, calibrated once."""
+"""A model that is calibrated once, for the trials of ``sensitivity`` and ``search``."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -37,20 +37,17 @@ class TrialOptions:
 
     Attributes:
         scheme: modules that may be int8: ``feature-ext``, ``prediction``, ``full``.
-        rules: of the int8 plans.
-        target: runtime of the int8 graph; None is chosen by the workflow.
+        rules: rules of the int8 plans.
+        target: runtime of the int8 graph; None leaves it to the workflow.
         ranges: file of saved ranges, instead of calibrating.
         module_map: preset or TOML file; None finds the preset.
-        count: frames to judge on.
-        threads: of onnxruntime; 0 takes all.
+        count: number of frames to judge on.
+        threads: threads of onnxruntime; 0 takes all.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         adapter: TOML file that says which output is the plan, which are fed back, and
             how the model drives.
         provider: what runs the graphs.
         force: replace outputs that are not as we left them, too.
-
-    Raises:
-        RecipeError: threads below 0.
     """
 
     scheme: str = "full"
@@ -66,7 +63,6 @@ class TrialOptions:
     force: bool = False
 
     def __post_init__(self) -> None:
-        """Check the number of threads."""
         check_count("--threads", self.threads, most=MOST_THREADS)
 
     def exact(self) -> tuple[Pass, ...]:
@@ -76,13 +72,7 @@ class TrialOptions:
 
 @dataclasses.dataclass(frozen=True)
 class TrialFiles:
-    """Where trials read and write.
-
-    Attributes:
-        model: the float ONNX file.
-        frames: folder of recorded frames.
-        output: the recipe.
-    """
+    """Where trials read and write: float model, folder of frames, and the recipe."""
 
     model: Path
     frames: Path
@@ -91,11 +81,7 @@ class TrialFiles:
     def claimed(
         self, options: TrialOptions, *inputs: Given
     ) -> AbstractContextManager[None]:
-        """Claim the recipe and its overrides while they are made.
-
-        Raises:
-            GraphError: one of them is not to be written; names it.
-        """
+        """Claim the recipe and its overrides while they are made."""
         output = output_path(self.output)
         named = (options.ranges, options.module_map, options.adapter)
         read = (self.model, self.frames, *named, *inputs)
@@ -109,19 +95,15 @@ class TrialFiles:
         listener: Listener,
         drive: Drive | None = None,
     ) -> tuple[Trials, tuple[str, ...]]:
-        """Prepare the graph, calibrate once, and name the modules to try.
-
-        Raises:
-            RecipeError: no such scheme, rule set or target.
-            FramesError: frames or saved ranges that do not fit.
-            PreconditionError: the graph is quantized already, or nothing can be int8.
-        """
+        """Prepare the graph, calibrate once, and name the modules to try."""
+        # check names and frames before anything is run
         rules, place = RULE_SETS.parse(options.rules), TARGETS.parse(target)
         recording = CalibrationSet(self.frames)
         loaded = graph.load(self.model)
         adapted(loaded, options.adapter)
         recording.check(loaded)
         scheme = QuantScheme.named(options.scheme, load_map(options.module_map, loaded))
+        # the graph is opened and prepared once; every trial starts from there
         name = self.model.name
         try_first(
             loaded,
@@ -165,7 +147,6 @@ def _ranges(
     options: TrialOptions,
     listener: Listener,
 ) -> Ranges:
-    """Load the ranges of every tensor, or measure them on the frames."""
     tensors = ready.tensors()
     if options.ranges is not None:
         ranges = Ranges.load(Path(options.ranges))

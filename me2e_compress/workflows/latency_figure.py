@@ -33,24 +33,16 @@ _STYLE = {
 }
 _INK, _MUTED = "#1d2127", "#6b7480"
 _MOST_COLOURS = 10
-"""Of the map ``tab10``: modules beyond these are drawn as one."""
+"""Colours of the map ``tab10``: further modules are drawn as one."""
 
 
 def draw_modules(trace: LatencyTrace, name: str, path: Path) -> None:
-    """Draw what modules took: stacked inference by inference, and how they spread.
+    """Draw a trace by module as PNG, SVG or PDF.
 
-    Left, a bar an inference, a colour a module, the largest at the bottom. Right, which
-    share of the inferences takes longer than so many milliseconds, on a logarithmic
-    axis: a long tail reaches far to the right. Both are of the inferences under the
-    profiler, which is said above them beside the median without it.
-
-    Args:
-        trace: by module.
-        name: of the model.
-        path: PNG, SVG or PDF.
-
-    Raises:
-        EvaluationError: the file cannot be written.
+    Left, one bar per inference stacks the modules, the largest at the bottom. Right,
+    the share of inferences that take longer than a time, on a logarithmic axis: a long
+    tail reaches far to the right. Both show inferences under the profiler, which is
+    said above them beside the mean without it.
     """
     with context(_STYLE, after_reset=True):
         figure, drawn = modules_figure(trace, name), io.BytesIO()
@@ -64,7 +56,7 @@ def draw_modules(trace: LatencyTrace, name: str, path: Path) -> None:
 
 
 def modules_figure(trace: LatencyTrace, name: str) -> Figure:
-    """Return what :func:`draw_modules` writes."""
+    """Return the figure that :func:`draw_modules` writes."""
     figure = Figure(figsize=(9.6, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(2.3, 1))
     shown = _gathered(trace.modules_us)
@@ -77,7 +69,7 @@ def modules_figure(trace: LatencyTrace, name: str) -> Figure:
 
 
 def _slower(trace: LatencyTrace, total: Totals) -> str:
-    """Say who timed the modules, and what that costs an inference."""
+    """Say what the profiler, which timed the modules, costs an inference."""
     taken_us = total, trace.samples_us
     under, without = (f"{np.mean(each) / 1e3:.3g}" for each in taken_us)
     return (
@@ -87,7 +79,7 @@ def _slower(trace: LatencyTrace, total: Totals) -> str:
 
 
 def _gathered(parts: Microseconds) -> Microseconds:
-    """Return the largest parts, in their order, the others as one."""
+    """Return the largest parts in their order, and the others as one."""
     if len(parts) <= _MOST_COLOURS:
         return parts
     names = list(parts)
@@ -98,10 +90,10 @@ def _gathered(parts: Microseconds) -> Microseconds:
 
 
 def _stack(axes: Axes, parts: Microseconds, total: Totals) -> None:
-    """Draw a bar an inference."""
     colours = colormaps["tab10"].colors  # type: ignore[attr-defined]
     at = np.arange(1, len(total) + 1)
     floor = np.zeros(len(total))
+    # each module's bars stand on those before
     for (name, samples), colour in zip(parts.items(), colours, strict=False):
         height = np.array(samples) / 1e3
         share = sum(samples) / max(1, int(total.sum()))
@@ -117,11 +109,12 @@ def _stack(axes: Axes, parts: Microseconds, total: Totals) -> None:
 
 
 def _tail(axes: Axes, total: Totals) -> None:
-    """Draw which share of the inferences takes longer."""
+    # of n inferences, n - k take as long as the k-th (from 0) or longer
     slower = 1 - np.arange(len(total)) / len(total)
     axes.step(np.sort(total) / 1e3, slower, where="pre", color=_INK, linewidth=1.4)
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+    # mark those percentiles that the samples suffice for
     samples = total.tolist()
     for percent, drawn in _MARKED.items():
         if not too_few(percent, len(samples)):

@@ -1,4 +1,4 @@
-"""Whether the program that is to run a graph would take it."""
+"""Check whether the runtime that is to run a graph would accept it."""
 
 import dataclasses
 from collections import Counter
@@ -22,7 +22,7 @@ from me2e_compress.workflows.result import Result, Status, Table, counted, table
 
 @dataclasses.dataclass(frozen=True)
 class LintOptions:
-    """What is asked.
+    """The runtime that is asked, and how.
 
     Attributes:
         target: ``tensorrt`` or ``onnxruntime``.
@@ -32,8 +32,7 @@ class LintOptions:
         provider: what opens a graph for onnxruntime.
 
     Raises:
-        RecipeError: TensorRT-RTX is asked about a graph for another target, or a
-            provider is named for a target that opens nothing.
+        RecipeError: TensorRT-RTX or a provider is given for a target it does not serve.
     """
 
     target: str = "tensorrt"
@@ -43,7 +42,6 @@ class LintOptions:
     provider: Provider = CPU
 
     def __post_init__(self) -> None:
-        """Check that TensorRT-RTX and providers are asked about their own."""
         if self.trt_check and self.target != "tensorrt":
             raise RecipeError(f"--trt-check is for tensorrt, not for {self.target}")
         if self.provider != CPU and not TARGETS.parse(self.target).opens:
@@ -55,14 +53,7 @@ class LintOptions:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class LintResult(Result):
-    """What was found.
-
-    Attributes:
-        model: the file.
-        options: what was asked.
-        findings: by our own rules and operator tables.
-        build: what TensorRT-RTX said; None if it was not asked.
-    """
+    """The findings of our rules, and TensorRT-RTX's answer; None if not asked."""
 
     model: Path
     options: LintOptions
@@ -86,23 +77,19 @@ class LintResult(Result):
 
     @property
     def status(self) -> Status:
-        """Whether the target would take the graph."""
+        """``refused`` if the target would not accept the graph."""
         if self.refusal is not None:
             return "refused"
         return "warning" if self.findings else "ok"
 
     def check(self) -> None:
-        """Go on if the target takes the graph.
-
-        Raises:
-            PreconditionError: it would not.
-        """
+        """Raise PreconditionError unless the target accepts the graph."""
         if self.refusal is not None:
             raise PreconditionError(self.refusal)
 
     @property
     def headline(self) -> str:
-        """Count errors and warnings."""
+        """The number of errors and warnings."""
         counts = Counter(each.severity for each in self.findings)
         return (
             f"{self.model.name} for {self.options.target}:"
@@ -112,18 +99,15 @@ class LintResult(Result):
         )
 
     def lines(self) -> tuple[str, ...]:
-        """Return the headline, and what TensorRT-RTX said."""
+        """Return the headline, and TensorRT-RTX's answer."""
         said = () if self.build is None else _said(self.build, self.options.sm)
         return (self.headline, *said)
 
     def tables(self, *, shown: int = 3) -> tuple[Table, ...]:
-        """Return the findings.
-
-        Args:
-            shown: nodes of each rule; below the table stands how many more there are.
-        """
+        """Return the findings, `shown` nodes of each rule; a note counts the others."""
         if not self.findings:
             return ()
+        # a rule that fails everywhere would bury the others
         rows = list[tuple[str, ...]]()
         seen: Counter[tuple[str, str]] = Counter()
         for each in self.findings:
@@ -140,7 +124,7 @@ class LintResult(Result):
         return (table("Findings", columns, rows, "\n".join(more), words=4),)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a finding."""
+        """Return one row per finding."""
         return [dataclasses.asdict(each) for each in self.findings]
 
     def to_json(self) -> object:
@@ -153,21 +137,17 @@ def lint(
     options: LintOptions | None = None,
     listener: Listener = SILENT,
 ) -> LintResult:
-    """Check a graph for the program that will run it.
+    """Check a graph for the runtime that will run it.
 
-    For onnxruntime it is opened too, if no rule says that it would be refused.
-
-    Args:
-        model: an ONNX file, or the name of one that ships.
-        options: None takes the defaults.
-        listener: is called with progress.
+    The model is an ONNX file or the name of one that ships. For onnxruntime it is
+    opened too, if no rule says that it would be refused.
 
     Raises:
-        GraphError: no such model, or onnxruntime dies of it.
-        ProviderError: the provider is not there.
-        RecipeError: no such target.
-        PreconditionError: no input has such an open dimension.
-        MissingExtraError: TensorRT-RTX is not installed and was asked.
+        GraphError: The model does not exist, or onnxruntime crashes on it.
+        ProviderError: The provider is not available.
+        RecipeError: The target does not exist.
+        PreconditionError: No input has such an open dimension.
+        MissingExtraError: TensorRT-RTX is asked for and not installed.
     """
     options, path = options or LintOptions(), model_path(model)
     loaded = graph.load(path)
@@ -182,16 +162,14 @@ def lint(
 def _found(
     model: ir.Model, name: str, options: LintOptions, listener: Listener
 ) -> tuple[LintFinding, ...]:
-    """List what rules find and, where they find no error, what opening the graph does.
-
-    A node of which a rule has said already that it runs in float is named once.
-    """
+    """Return the rules' findings and, if none is an error, those of opening it."""
     judge, provider = TARGETS.parse(options.target), options.provider
     found = judge.lint(model)
     if any(each.severity == "error" for each in found):
         return found
     if judge.opens:
         try_first(model, name, listener, provider=provider)
+    # a node that a rule has named already is not named again
     known = {each.node for each in found if each.rule == "float-answer"}
     opened = [
         each for each in judge.read_back(model, provider) if each.node not in known
@@ -200,7 +178,6 @@ def _found(
 
 
 def _said(verdict: BuildResult, sm: int) -> tuple[str, ...]:
-    """Describe what TensorRT-RTX made of a graph."""
     int8 = Counter(each.kind for each in verdict.kernels if each.is_int8)
     every = Counter(each.kind for each in verdict.kernels)
     kernels = ", ".join(f"{int8[kind]} of {every[kind]} {kind}s" for kind in every)

@@ -9,11 +9,11 @@ Warn = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Listener:
-    """Functions that are called while a workflow runs; neither changes it.
+    """Functions that are called while a workflow runs; neither changes its result.
 
-    Args:
-        on_progress: Called with the stage, things done and to do, and words.
-        on_warning: Called with one line a surprise.
+    Attributes:
+        on_progress: gets the stage, things done, things in all, and words.
+        on_warning: gets one line per surprise.
     """
 
     on_progress: Progress = field(default_factory=lambda: _no_progress, repr=False)

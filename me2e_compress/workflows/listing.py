@@ -1,4 +1,4 @@
-"""Everything that can be named: ours, and what other packages add by entry point."""
+"""List everything that can be named, with what other packages add by entry point."""
 
 import dataclasses
 import re
@@ -36,27 +36,22 @@ _SENTENCE = re.compile(r"(.+?\.)(?:\s|$)")
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ListResult(Result):
-    """Names by kind, with what they are.
-
-    Attributes:
-        kinds: entries, by the name of their kind.
-        closely: whether tables tell what each option means.
-    """
+    """Names by kind, with descriptions; `closely` shows what each option means."""
 
     kinds: Mapping[str, tuple[Entry, ...]]
     closely: bool = False
 
     @property
     def headline(self) -> str:
-        """Count the names by kind."""
+        """The number of names of each kind."""
         return ", ".join(f"{len(found)} {kind}" for kind, found in self.kinds.items())
 
     def lines(self) -> tuple[str, ...]:
-        """Return none: the tables say it."""
+        """Return no line: the tables say everything."""
         return ()
 
     def tables(self) -> tuple[Table, ...]:
-        """Return a table a kind: its names, what they are, their options."""
+        """Return one table per kind: names, descriptions and options."""
         return tuple(
             table(
                 kind,
@@ -69,7 +64,7 @@ class ListResult(Result):
         )
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a name."""
+        """Return one row per name."""
         return [
             {"kind": kind, "name": each.name, "source": each.source, "doc": each.doc}
             for kind, found in self.kinds.items()
@@ -77,7 +72,7 @@ class ListResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return the entries, by kind."""
+        """Return the entries by kind."""
         return self.kinds
 
 
@@ -101,7 +96,6 @@ def _adapters() -> tuple[Entry, ...]:
 
 
 def _module_maps() -> tuple[Entry, ...]:
-    """Describe the presets: a map by its modules."""
     maps = [modules.ModuleMap.load(name) for name in (*modules.presets(), "whole")]
     return tuple(Entry(each.name, _OURS, ", ".join(each.names())) for each in maps)
 
@@ -139,7 +133,7 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
     "providers": PROVIDERS,
     "operators": OPERATORS,
 }
-"""To which other packages add."""
+"""Registries to which other packages add."""
 KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
     **{kind: partial(_registered, kind) for kind in REGISTRIES},
     "recipes": _recipes,
@@ -148,20 +142,18 @@ KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
     "module-maps": _module_maps,
     "stacks": _stacks,
 }
-"""What finds the entries of a kind."""
+"""The functions that find the entries of a kind."""
 
 
 def list_entries(kind: str | None = None) -> ListResult:
-    """List what can be named, of one kind or of all.
-
-    Args:
-        kind: one of `KINDS`; its tables tell what every option means. None lists all.
+    """List what can be named, of one kind (with every option's meaning) or of all.
 
     Raises:
-        RecipeError: no such kind.
+        RecipeError: There is no such kind.
     """
     if kind is not None and kind not in KINDS:
         raise RecipeError(f"no kind {kind!r}; there are {', '.join(KINDS)}")
+    # options are only explained for a single kind, since all would be long
     chosen = KINDS if kind is None else {kind: KINDS[kind]}
     return ListResult({name: find() for name, find in chosen.items()}, kind is not None)
 
@@ -176,7 +168,7 @@ def _added_to(kind: str) -> str:
 
 
 def _rows(entry: Entry, closely: bool) -> Iterator[tuple[str, str]]:
-    """Write the name with what it is, then the options on rows of their own."""
+    """Yield the name with its description, then the options on rows of their own."""
     theirs = "" if entry.source == _OURS else f" ({entry.source})"
     yield entry.name, entry.error or _words(entry.doc + theirs)
     if closely:
@@ -190,7 +182,6 @@ def _words(text: str) -> str:
 
 
 def _assignment(option: Option) -> str:
-    """Write an option as in text; one that must be given without a value."""
     return option.name if option.default is None else f"{option.name}={option.default}"
 
 

@@ -17,7 +17,7 @@ from me2e_compress.zoo.stacks import STACKS, Stack
 STACK = "me2e.stack"
 """Metadata key: the stack of the zoo that a file was exported from."""
 PICTURE_COLUMNS = 1600
-"""Of nuScenes and Bench2Drive, which the scale of a stack is of."""
+"""Width of pictures of nuScenes and Bench2Drive, to which a stack's scale applies."""
 
 
 def inputs_of_stack(stack: Stack) -> LoggedInputs:
@@ -41,17 +41,12 @@ def inputs_of_stack(stack: Stack) -> LoggedInputs:
 def inputs_of_model(path: Path, size: tuple[int, int] | None) -> LoggedInputs:
     """Return how an ONNX file, or a stack of several, is fed from a log.
 
-    What was exported from UniAD or VAD sees the ground as nuScenes' lidar does, every
-    other file as the policy contract.
-
-    Args:
-        path: of the file.
-        size: rows and columns of the images, where the file leaves them open.
+    Files exported from UniAD or VAD see the ground in the axes of nuScenes' lidar, all
+    others in those of the policy contract. `size` is rows and columns of the images,
+    where the file leaves them open.
 
     Raises:
-        GraphError: it cannot be read.
-        FramesError: its image input is not normalised as its metadata says, or its
-            size is open and not given.
+        FramesError: The image's metadata are malformed, or its size is open.
     """
     model = load_interface(path)
     fed_back = recurrent_inputs(model)
@@ -60,6 +55,7 @@ def inputs_of_model(path: Path, size: tuple[int, int] | None) -> LoggedInputs:
         for each in model.graph.inputs
         if each.name not in fed_back
     }
+    # the stack that a file was exported from decides the axes
     stack = STACKS.get(model.metadata_props.get(STACK, ""))
     forward_left = stack is None or stack.trained
     if "img" not in forms:
@@ -68,6 +64,7 @@ def inputs_of_model(path: Path, size: tuple[int, int] | None) -> LoggedInputs:
         found = ImageNormalization.of(model.metadata_props)
     except EvaluationError as error:
         raise FramesError(f"{path}: {error}") from error
+    # rows and columns of the file win over those given
     own = forms["img"].shape[-2:]
     rows, columns = (a or b for a, b in zip(own, size or (None, None), strict=True))
     if rows is None or columns is None:

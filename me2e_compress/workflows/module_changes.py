@@ -1,4 +1,4 @@
-"""What the modules of a graph held before a compression, and hold after it."""
+"""Compare the modules of a graph before and after a compression."""
 
 import dataclasses
 from pathlib import Path
@@ -20,19 +20,14 @@ from me2e_compress.workflows.result import (
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ModuleChanges(Result):
-    """What the modules of a graph held before and hold now.
-
-    Attributes:
-        before: module by module.
-        after: the same; a module that is gone is not there.
-    """
+    """The modules before and after; a module that is gone is missing in the latter."""
 
     before: tuple[Item, ...]
     after: tuple[Item, ...]
 
     @property
     def headline(self) -> str:
-        """Weights in all, and the modules that are left."""
+        """The size of all weights, and the number of modules left."""
         before, after = (
             megabytes(sum(item.weight_bytes for item in side))
             for side in (self.before, self.after)
@@ -41,11 +36,11 @@ class ModuleChanges(Result):
         return f"{before} MB of weights, now {after} in {left}"
 
     def lines(self) -> tuple[str, ...]:
-        """Return none: the table says it."""
+        """Return no line: the table says everything."""
         return ()
 
     def tables(self) -> tuple[Table, ...]:
-        """Return module by module what there was and is."""
+        """Return each module before and after."""
         rows = []
         for item, now in self._pairs():
             nodes, size = (now.nodes, now.weight_bytes) if now else (0, 0)
@@ -65,7 +60,7 @@ class ModuleChanges(Result):
         return (table("Module by module", columns, rows, note),)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a module."""
+        """Return one row per module."""
         return [
             {
                 "module": item.module,
@@ -91,10 +86,6 @@ def _gmacs(item: Item | None) -> str:
 
 
 def compare_modules(before: Path, after: Path) -> ModuleChanges:
-    """Weigh the modules of two files, each by the preset that fits it.
-
-    Raises:
-        GraphError: not a graph.
-    """
+    """Weigh the modules of two files, each by the preset that fits it."""
     loaded = [graph.load(path) for path in (before, after)]
     return ModuleChanges(*(weigh(each, load_map(None, each)) for each in loaded))

@@ -1,4 +1,4 @@
-"""What a module costs a frame beside its MACs: activations, its share of the time."""
+"""Costs of modules per frame besides MACs: activations and share of the time."""
 
 import dataclasses
 from collections import Counter
@@ -16,17 +16,16 @@ from me2e_compress.runtime.latency_trace import LatencyTrace, shares
 
 
 def with_activations(items: Iterable[Item], folded: ir.Model) -> tuple[Item, ...]:
-    """Return items with the bytes that the nodes of each module write in a frame.
+    """Return items with the bytes that each module's nodes write in a frame.
 
-    Args:
-        items: module by module.
-        folded: the graph imported, shapes inferred.
+    The graph `folded` is imported, with shapes inferred.
     """
     known, unknown = Counter[str](), Counter[str]()
     for node in folded.graph:
         size, module = activation_bytes(node), provenance.module_of(node)
         known[module] += size or 0
         unknown[module] += size is None
+    # bytes are None where no node of a module tells them
     return tuple(
         dataclasses.replace(
             item,
@@ -42,10 +41,8 @@ def with_activations(items: Iterable[Item], folded: ir.Model) -> tuple[Item, ...
 def with_latency(items: Iterable[Item], trace: LatencyTrace) -> tuple[Item, ...]:
     """Return items with the share of a frame's time that each module took.
 
-    Args:
-        items: module by module.
-        trace: by module. What it has no module for, or takes between nodes, is no
-            module's: the shares need not add up to 1.
+    Time between nodes, or of nodes without a module, counts for no module: the shares
+    need not add up to 1.
     """
     found = {each.name: each.share for each in shares(trace.modules_us)}
     return tuple(
@@ -55,11 +52,7 @@ def with_latency(items: Iterable[Item], trace: LatencyTrace) -> tuple[Item, ...]
 
 
 def trace_of(path: str | Path, model: Path) -> LatencyTrace:
-    """Read a trace of this very model, by module.
-
-    Raises:
-        EvaluationError: It cannot be read, is of another model or not by module.
-    """
+    """Read a trace; it must be by module, and of this very model."""
     trace = LatencyTrace.load(Path(path))
     if trace.model_sha256 != graph.sha256_of(model):
         raise EvaluationError(f"{path}: a trace of another model than {model.name}")

@@ -14,15 +14,11 @@ from me2e_compress.version import __version__
 
 HIGHWAY = "highway"
 POLICY = "policy"
-"""The option by which an evaluator that drives a policy gets it."""
+"""The option by which an evaluator receives the policy that it drives."""
 
 
 def is_highway(text: str) -> bool:
-    """Return whether a text names the evaluator that commands have options for.
-
-    Raises:
-        EvaluationError: It gives that evaluator options, which the command has itself.
-    """
+    """Return whether a text names highway, which takes no options here."""
     if name_in(text) != HIGHWAY:
         return False
     if text.strip() != HIGHWAY:
@@ -35,13 +31,8 @@ def is_highway(text: str) -> bool:
 def evaluator_named(text: str, policy: str | None = None) -> Evaluator:
     """Build an evaluator from ``name`` or ``name{option=value}``.
 
-    Args:
-        text: Of the evaluator.
-        policy: Who drives; it becomes the option ``policy``.
-
-    Raises:
-        EvaluationError: No such evaluator or option, or a policy for one that drives
-            none, or given twice.
+    The policy, if any, becomes its option ``policy``; an evaluator without that option
+    raises EvaluationError.
     """
     more: Mapping[str, object] = {} if policy is None else {POLICY: policy}
     name = name_in(text)
@@ -53,7 +44,7 @@ def evaluator_named(text: str, policy: str | None = None) -> Evaluator:
 
 
 def files_of(evaluator: Evaluator) -> list[Path]:
-    """List the files and folders that an evaluator's options name."""
+    """Return the files and folders that an evaluator's options name."""
     values = [getattr(evaluator, each.name) for each in options_of(type(evaluator))]
     return [value for value in values if isinstance(value, Path)]
 
@@ -66,11 +57,9 @@ def expected_of(evaluator: Evaluator, episodes: tuple[Episode, ...]) -> int:
 
 
 def driven_episodes(evaluator: Evaluator) -> tuple[Episode, ...]:
-    """Return all episodes of an evaluator, each of which can be kept.
+    """Return all episodes of an evaluator, after checking that each can be kept.
 
-    Raises:
-        EvaluationError: It yields none, a route twice, or one whose name cannot be that
-            of a file; or it cannot evaluate.
+    At least one is needed, routes must differ, and their names must fit files.
     """
     episodes = tuple(evaluator.episodes())
     if not episodes:
@@ -91,18 +80,7 @@ def driven_episodes(evaluator: Evaluator) -> tuple[Episode, ...]:
 def keep(
     evaluator: Evaluator, episodes: tuple[Episode, ...], folder: Path, driver: str = ""
 ) -> None:
-    """Write episodes as a folder of results, which ``score`` reads.
-
-    Args:
-        evaluator: That yielded them.
-        episodes: One a route.
-        folder: Where they go.
-        driver: What identifies the policy.
-
-    Raises:
-        EvaluationError: The folder holds the results of another evaluation, or cannot
-            be written.
-    """
+    """Write episodes as a folder of results, which ``score`` reads."""
     made_by = {
         "version": __version__,
         "evaluator": EVALUATORS.text(evaluator),
@@ -116,17 +94,12 @@ def keep(
 
 
 def kept(evaluator: Evaluator, folder: Path, driver: str) -> tuple[Episode, ...] | None:
-    """Return the episodes that were kept of the same evaluator and driver.
-
-    Args:
-        evaluator: That would yield them.
-        folder: Where they went.
-        driver: What identifies the policy.
-    """
+    """Return the complete episodes kept by the same evaluator and driver, else None."""
     try:
         results = ResultsFolder.open(folder)
     except EvaluationError:
         return None
+    # episodes of another version or evaluator are not reused, nor parts of a set
     wanted = {
         "version": __version__,
         "evaluator": EVALUATORS.text(evaluator),

@@ -1,4 +1,4 @@
-"""The same routes of several folders of results, for scores that compare them."""
+"""Find the routes that several folders of results share, to compare their scores."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,25 +6,16 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.episode import Episode
 
 UNPAIRED = "a drive in each"
-"""Beside the measures that may be missing: why a route is left out."""
+"""Why a route is left out, listed beside the measures that may be missing."""
 
 
 def paired_drives(
     folders: Mapping[str, Sequence[Episode]],
 ) -> tuple[dict[str, list[Episode]], int]:
-    """Return what all folders drove, in the order of the first, and how much not all.
+    """Return the episodes on shared routes by folder, and the number of other routes.
 
-    A real run may lack routes on which CARLA crashed; other results lack none.
-
-    Args:
-        folders: Episodes by the name of the folder.
-
-    Returns:
-        The episodes of the routes that all folders hold, and the number of the others.
-
-    Raises:
-        EvaluationError: Folders hold different routes, and are not all of real runs
-            with a route in common.
+    The routes are in the first folder's order. Only real runs may lack routes, on which
+    CARLA crashed; other folders must hold the same, or EvaluationError is raised.
     """
     by_route = {
         name: {each.route: each for each in episodes}
@@ -32,6 +23,7 @@ def paired_drives(
     }
     first = next(iter(by_route.values()), {})
     shared = [each for each in first if all(each in own for own in by_route.values())]
+    # differing routes are an error unless every folder is a real run
     real = all(each.given for episodes in folders.values() for each in episodes)
     for name, own in by_route.items():
         unpaired = sorted({*own} ^ {*first})
@@ -40,6 +32,7 @@ def paired_drives(
                 f"{name}: route {unpaired[0]} is in one of the folders only: EER_AV "
                 "compares the same routes"
             )
+    # count the routes that not all folders hold
     every = {route for own in by_route.values() for route in own}
     paired = {name: [own[each] for each in shared] for name, own in by_route.items()}
     return paired, len(every) - len(shared)

@@ -1,4 +1,4 @@
-"""Which nodes become int8, which stay float, by which rule, and why."""
+"""Plan which nodes become int8 and which stay float, by which rule, and why."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ from me2e_compress.workflows.result import Result, Table, table
 
 @dataclasses.dataclass(frozen=True)
 class PlanOptions:
-    """What is planned; of no meaning for a plan that is made already.
+    """How a graph is planned; a plan that is made already takes no options.
 
     Attributes:
         scheme: ``feature-ext``, ``prediction``; None is ``full``.
@@ -56,10 +56,9 @@ class PlanResult(Result):
     """A plan, and how it differs from another.
 
     Attributes:
-        plan: decisions for every node.
-        changes: nodes that another plan decides differently; None where none was
-            given to compare with.
-        hint: what the graph lacks, of which more could be known; empty if nothing.
+        plan: the decision for every node.
+        changes: nodes that another plan decides differently; None without another plan.
+        hint: what the graph lacks for more to be known, else empty.
     """
 
     plan: QuantPlan
@@ -68,7 +67,7 @@ class PlanResult(Result):
 
     @property
     def headline(self) -> str:
-        """Count int8, by rule; or the differences."""
+        """The number of int8 nodes by rule, or of differences."""
         if self.changes is not None:
             return f"{len(self.changes)} differences"
         return self.plan.headline
@@ -83,10 +82,9 @@ class PlanResult(Result):
         return () if self.changes is not None else self.plan.tables()
 
     def details(self, *, every: bool = False) -> tuple[Table, ...]:
-        """Return a row a node, and what was decided together.
+        """Return one row per node that could be int8, or per node if `every` is set.
 
-        Args:
-            every: every node, not only what could be int8.
+        A second table shows what was decided together.
         """
         if self.changes is not None:
             return ()
@@ -109,7 +107,7 @@ class PlanResult(Result):
         return (table("Decided together", columns, rows, words=4),)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a node."""
+        """Return one row per node."""
         return [
             {
                 "module": each.module,
@@ -124,7 +122,7 @@ class PlanResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return the plan; the differences, where another was given."""
+        """Return the plan, or the differences from another."""
         if self.changes is None:
             return record(self.plan)
         return {"differences": self.changes}
@@ -138,19 +136,16 @@ def plan(
 ) -> PlanResult:
     """Decide for every node whether it becomes int8, as ``compress`` will.
 
-    Args:
-        model: an ONNX file, the name of one that ships, or a saved plan; a file that
-            carries its plan is taken at its word.
-        output: write the plan as JSON.
-        against: another model or plan to compare with; of a float model it is the
-            plan without overrides.
-        options: None takes the defaults.
+    The model is an ONNX file, the name of one that ships, or a saved plan; a file that
+    carries its plan is not planned again. The plan is written as JSON if `output` is
+    given, and compared with another model or plan, `against`, without overrides for a
+    float model.
 
     Raises:
-        GraphError: no such model, or the output would harm an input.
-        RecipeError: not a plan, an unknown scheme or rule set, or options for a plan
-            that is made already.
-        PreconditionError: the graph is quantized and carries no plan.
+        GraphError: The model does not exist, or the output would harm an input.
+        RecipeError: A plan, scheme or rule set is not usable, or options are given for
+            a plan that is made already.
+        PreconditionError: The graph is quantized and carries no plan.
     """
     options = options or PlanOptions()
     files = [model_path(model), *([] if against is None else [model_path(against)])]
@@ -163,8 +158,10 @@ def plan(
 def _planned(
     files: Sequence[Path], written: Path | None, options: PlanOptions
 ) -> PlanResult:
+    # a file is a plan, carries one, or is a float graph to plan
     read = [_read(path) for path in files]
     _check_options(options, files, read)
+    # overrides apply to the first plan only: the other shows what they change
     plain = QuantizeInt8(
         scheme=options.scheme or "full",
         rules=options.rules or DEFAULT_RULES,
@@ -183,7 +180,6 @@ def _planned(
 
 
 def _what(decision: Decision) -> str:
-    """Say in words what a node is, and what becomes of it."""
     where = f" of {decision.module}" if decision.module else ""
     close = f" ({decision.borderline})" if decision.borderline else ""
     said = f"{decision.dtype} by {decision.rule}, {decision.reason}{close}"
@@ -191,7 +187,7 @@ def _what(decision: Decision) -> str:
 
 
 def _read(path: Path) -> QuantPlan | ir.Model:
-    """Read the plan that a file is or carries, else the graph to make one of."""
+    """Read the plan that a file is or carries, else its graph."""
     if path.suffix == ".json":
         return load_plan(path)
     model = graph.load(path)
@@ -203,11 +199,7 @@ def _check_options(
     files: Sequence[Path],
     read: Sequence[QuantPlan | ir.Model],
 ) -> None:
-    """Refuse options of a plan that would change none, for all are made.
-
-    Raises:
-        RecipeError: names the first option and the file.
-    """
+    """Refuse options that would change nothing, because all plans are made already."""
     names = ("scheme", "rules", "weight_only_gemv", "overrides")
     given = [name for name in names if getattr(options, name)]
     only = read[:1] if "overrides" in given else read

@@ -1,8 +1,8 @@
 """L2 and collisions of two plans on recorded driving, with intervals.
 
-At 1, 2 and 3 s, and by both conventions of the field: *at* the horizon (UniAD) and as
-the mean over the half seconds *up to* it (ST-P3, VAD), which is the smaller number.
-Driving is another matter: a plan that repeats the recorded one may still drive badly.
+They are given at 1, 2 and 3 s, and by both conventions of the field: *at* the horizon
+(UniAD), and as the mean over the half seconds *up to* it (ST-P3, VAD), which is the
+smaller number. A plan that repeats the recorded one may still drive badly.
 """
 
 import dataclasses
@@ -31,17 +31,14 @@ class PlanQuality:
 
     Attributes:
         measure: distance to where the ego went, or share of plans that collide.
-        unit: m or %; the difference of shares is in points.
-        convention: of what a horizon means, see above.
-        horizon_s: seconds.
-        reference: of the first model.
-        candidate: of the second.
+        unit: m or %; a difference of shares is in percentage points.
+        convention: what a horizon means, see the module.
+        reference: the number of the first model's plan.
+        candidate: the number of the second model's plan.
         difference: the second minus the first, frame by frame.
-        low: of its 95 % interval over other moments of these scenes; None where they
-            are too few.
-        high: the same.
-        anew_low: of its 95 % interval over scenes drawn anew, which is wider.
-        anew_high: the same.
+        low: lower end of the difference's 95 % interval over other moments of these
+            scenes; None, like `high`, where they are too few.
+        anew_low: lower end of the wider interval over scenes drawn anew.
     """
 
     measure: Kind
@@ -58,7 +55,7 @@ class PlanQuality:
 
     @property
     def title(self) -> str:
-        """What it is, in a few words."""
+        """The measure, convention, horizon and unit."""
         what = "L2" if self.measure == "l2" else "collisions"
         when = "at" if self.convention == "at" else "to"
         return f"{what} {when} {self.horizon_s} s, {self.unit}"
@@ -66,14 +63,14 @@ class PlanQuality:
 
 @dataclasses.dataclass(frozen=True)
 class OpenLoop:
-    """Both plans against what was really driven.
+    """Both plans against the recorded future.
 
     Attributes:
-        frames: whose next three seconds are known: these count.
-        scenes: that they are of.
-        left_out: the other frames.
-        qualities: L2, then collisions, for which only frames count that know the
-            others; horizons that a plan does not reach are left out.
+        frames: number of frames whose next three seconds are known.
+        scenes: number of scenes that these are from.
+        left_out: number of other frames.
+        qualities: L2, then collisions, which only count frames that know the other road
+            users; horizons that a plan does not reach are left out.
     """
 
     frames: int
@@ -94,7 +91,8 @@ class OpenLoop:
         )
 
     def table(self) -> Table:
-        """Return a row a number."""
+        """Return one row per number."""
+        # each row shows both plans, then their difference with two intervals
         rows = [
             (
                 each.title,
@@ -135,12 +133,15 @@ def _quality(
     horizon_s: int,
     values: Sequence[tuple[int, npt.NDArray[np.float64]]],
 ) -> PlanQuality:
+    # up to a horizon the half seconds are averaged, at it only the last counts
     last = round(horizon_s / STEP_S)
     span = slice(last - 1 if convention == "at" else 0, last)
+    # collisions become percent; each row is a frame, its columns the two plans
     unit: Literal["m", "%"] = "m" if measure == "l2" else "%"
     each = np.array([of[:, span].mean(axis=1) for _, of in values])
     each *= 1.0 if measure == "l2" else 100.0
     reference, candidate = each.mean(axis=0).tolist()
+    # the interval is that of the difference, with scenes as clusters
     estimate = mean_estimate(
         (each[:, 1] - each[:, 0]).tolist(),
         [str(scene) for scene, _ in values],

@@ -1,4 +1,4 @@
-"""The graph that int8 is put on: what comes before is done, shapes are inferred."""
+"""Prepare the graph for int8: run the passes before it, infer shapes."""
 
 import dataclasses
 import itertools
@@ -20,18 +20,14 @@ from me2e_compress.targets.quantized import describe_quantized
 from me2e_compress.workflows.checks import load_map
 
 _MOST = "paper{without=[fused-operator]}"
-"""The rules that ask for the ranges that any others do: an override may lift those."""
+"""The rules that need all ranges that others do: an override may lift those."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PreparedGraph:
-    """A graph as the pass finds it that reads ranges.
+    """A graph in the state in which the pass that reads ranges finds it.
 
-    Attributes:
-        file: what it was read from.
-        model: after the passes before that one, shapes inferred.
-        modules: its module map.
-        reader: the pass that reads ranges; None where the recipe has none.
+    `reader` is that pass; None where the recipe has none.
     """
 
     file: Path
@@ -49,21 +45,14 @@ class PreparedGraph:
     ) -> Self:
         """Run the passes before the first that reads ranges, unverified.
 
-        Args:
-            file: what the graph was read from.
-            loaded: the graph.
-            module_map: preset or TOML file, or the map; None finds the preset.
-            passes: None stands for the recipe ``exact``.
-
-        Raises:
-            PreconditionError: the graph is quantized already, and int8 is what the
-                passes lead to.
-            ModuleMapError: no such map.
-            Me2eError: a pass refused the graph or broke.
+        A module map of None finds the preset; passes of None stand for the recipe
+        ``exact``. A graph that is quantized already, and is to become int8, raises
+        PreconditionError.
         """
         chosen = tuple(recipe.load("exact") if passes is None else passes)
         at = next((at for at, each in enumerate(chosen) if each.reads_ranges), None)
         reader = None if at is None else chosen[at]
+        # a quantized graph may only be rewritten, not quantized again
         quantized = describe_quantized(loaded)
         if quantized and (reader is None or reader.quantizes):
             raise PreconditionError(
@@ -72,6 +61,7 @@ class PreparedGraph:
             )
         if not isinstance(module_map, ModuleMap):
             module_map = load_map(module_map, loaded)
+        # exact passes are verified when the graph is compressed
         manager = PassManager(chosen[:at], verify_frames=0)
         model = manager.run(loaded, Context(module_map)).model
         graph.infer_shapes(model)
@@ -79,12 +69,10 @@ class PreparedGraph:
         return cls(file, model, module_map, reader)
 
     def tensors(self) -> tuple[str, ...]:
-        """Name every tensor that any scheme, rule set or target needs a range of.
+        """Return every tensor that any scheme, rule set or target needs a range of.
 
-        Of a quantized graph that is to be rewritten: those that it tells no range of.
-
-        Raises:
-            PreconditionError: there is none.
+        For a quantized graph to be rewritten, these are the tensors without a range in
+        it. If there is none, PreconditionError is raised.
         """
         if self.reader is None or self.reader.quantizes:
             return self._of_all() or self._refuse("no node can become int8")
@@ -110,9 +98,9 @@ class PreparedGraph:
 
 
 def _leave_the_message(model: ir.Model) -> None:
-    """Copy the weights that lie in the message that the file was read into.
+    """Copy weights out of the protobuf message that the file was read into.
 
-    One that the passes left there keeps the whole message in memory.
+    A single weight left there would keep the whole message in memory.
     """
     for value in (v for g in model.graphs() for v in g.initializers.values()):
         tensor = value.const_value

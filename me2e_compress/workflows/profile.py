@@ -1,4 +1,4 @@
-"""Latency of a model alone and warm, as a trace; and its energy, if asked."""
+"""Measure the latency of a model alone and warm, and its energy, if asked."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -40,9 +40,9 @@ from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.profile_result import ProfileResult
 
 MOST_SAMPLES = 10**9
-"""Inferences that can be asked for: at a millisecond each, a fortnight."""
+"""Most inferences that can be asked for: at a millisecond each, a fortnight."""
 KINDS = (".png", ".svg", ".pdf")
-"""Endings of a figure."""
+"""File name endings of a figure."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,24 +50,19 @@ class ProfileOptions:
     """How latencies are measured.
 
     Attributes:
-        samples: how many; None is one a frame.
+        samples: number of samples; None is one per frame.
         warm_up: inferences before the first that counts.
-        threads: of onnxruntime; 0 takes all.
+        threads: threads of onnxruntime; 0 takes all.
         provider: what runs the graph.
-        by_module: then measure modules and operators, in inferences of their own.
+        by_module: also measure modules and operators, in inferences of their own.
         module_map: preset or TOML file; None finds the preset.
         figure: draw modules over inferences as PNG, SVG or PDF; measures them.
         force: replace outputs that are not as we left them, too.
-        energy: then measure joules by ``auto`` or a counter; None does not.
-        energy_output: file of these; None is beside the trace, ``.energy.json``.
+        energy: also measure joules by ``auto`` or a named counter; None does not.
+        energy_output: file of the joules; None is beside the trace, ``.energy.json``.
         schedule: how long energy is measured, and how often; None takes the defaults.
-        budget_ms: what a decision may take: latencies are held against it.
+        budget_ms: milliseconds that a decision may take.
         adapter: TOML file that says which outputs are fed back.
-
-    Raises:
-        RecipeError: a number below 0, or beyond all measure; or a file of joules
-            that nobody measures.
-        EvaluationError: a budget that is not positive.
     """
 
     samples: int | None = None
@@ -85,7 +80,6 @@ class ProfileOptions:
     adapter: str | Path | None = None
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if self.energy is None and self.energy_output is not None:
             raise RecipeError("--energy-out: there is no --energy to write")
         check_budget(self.budget_ms)
@@ -103,26 +97,23 @@ def profile(
 ) -> ProfileResult:
     """Measure a model alone and warm; by module and operator, and joules, if asked.
 
-    Args:
-        model: the graph, or the name of one that ships.
-        frames: folder of recorded frames; repeated as often as it takes.
-        output: write the latencies as a trace, which ``evaluate`` can charge.
-        options: None takes the defaults.
-        listener: is called with progress and warnings.
+    The model is an ONNX file or the name of one that ships; frames are repeated as
+    often as needed. `output` is a trace, which ``evaluate`` can charge.
 
     Raises:
-        GraphError: no such model, it cannot be run, or the output would harm an input.
-        EvaluationError: there is nothing to measure, or no such kind of picture.
-        EnergyError: no such counter, or it goes back, stands still or cannot be read;
-            that there is none is a result.
-        FramesError: a frame does not fit.
-        ModuleMapError: no such map.
-        ProviderError: the provider is not there.
+        GraphError: The model does not exist or run, or the output would harm an input.
+        EvaluationError: There is nothing to measure, or a figure of another kind.
+        EnergyError: The named counter does not exist or work; if there is none at all,
+            that is a result.
+        FramesError: A frame does not fit.
+        ModuleMapError: The map does not exist.
+        ProviderError: The provider is not available.
     """
     options = options or ProfileOptions()
     source, written = model_path(model), None if output is None else Path(output)
     figure = None if options.figure is None else figure_path(options.figure)
     joules = _energy_path(options, written)
+    # refuse what cannot be measured before anything is
     if is_stack(source) and (options.by_module or figure is not None):
         raise EvaluationError(
             f"{source}: nodes are timed in one graph at a time: profile one of its"
@@ -132,6 +123,7 @@ def profile(
         check_counter(options.energy)
     inputs = (source, frames, options.module_map, options.adapter)
     with writing([written, figure, joules], inputs, force=options.force):
+        # each measurement has inferences of its own: the profiler takes time itself
         loaded, recording = load_interface(source), CalibrationSet(Path(frames))
         said = adapted(loaded, options.adapter)
         trace = _measured(source, loaded, said, recording, options, listener)
@@ -141,6 +133,7 @@ def profile(
             trace = dataclasses.replace(trace, modules_us=found.modules_us)
             operators = found.operators_us
         energy = _energy(source, said, recording, options, listener)
+        # files are written all or none
         with drafts.all_or_none():
             if figure is not None:
                 draw(trace, source.stem, figure)
@@ -157,7 +150,6 @@ def profile(
 
 
 def _energy_path(options: ProfileOptions, trace: Path | None) -> Path | None:
-    """Return the file of the joules: as named, or beside the trace."""
     if options.energy_output is not None:
         return Path(options.energy_output)
     if options.energy is None or trace is None:
@@ -190,12 +182,7 @@ def _energy(
 
 
 def figure_path(named: str | Path) -> Path:
-    """Return the file of a figure, if it can be drawn.
-
-    Raises:
-        EvaluationError: its name does not end as one of :data:`KINDS` of pictures.
-        MissingExtraError: matplotlib is not installed.
-    """
+    """Return the file of a figure, if its kind is known and matplotlib is installed."""
     path = Path(named)
     if path.suffix not in KINDS:
         raise EvaluationError(f"{path}: a figure ends in {', '.join(KINDS)}")
@@ -217,7 +204,6 @@ def _broken_down(
     options: ProfileOptions,
     listener: Listener,
 ) -> Breakdown:
-    """Measure modules and operators in as many inferences, under the profiler."""
     placed = assign(loaded, load_map(options.module_map, loaded))
     return break_down(
         loaded,

@@ -15,10 +15,11 @@ from me2e_compress.workflows.deadlines_table import deadlines_table
 from me2e_compress.workflows.result import Result, Table
 
 _SHOWN = 12
-"""Operators in a table."""
+"""Number of operators in a table."""
 BEYOND_P99 = 5
 """Samples beyond the 99th percentile from which on it is steady: with fewer, one
-disturbance more or less moves it."""
+disturbance more or less moves it.
+"""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -26,15 +27,9 @@ class ProfileResult(Result):
     """Latencies of one model.
 
     Attributes:
-        model: the file.
-        trace: the samples.
-        output: the trace that was written; None if none was.
-        operators_us: what each operator took, in inferences under a profiler.
-        figure: the picture that was drawn; None if none was.
-        energy: joules, or why there are none; None: not asked for.
-        energy_output: the file they were written to; None if they were not.
-        budget_ms: what a decision may take.
-        told: what else was read, in words: the power of a device.
+        operators_us: microseconds of each operator, in inferences under a profiler.
+        energy: joules, or why there are none; None if not asked for.
+        told: other readings, in words, such as the power of a device.
     """
 
     model: Path
@@ -54,7 +49,7 @@ class ProfileResult(Result):
 
     @property
     def headline(self) -> str:
-        """File, number of inferences, machine."""
+        """The file, the number of inferences and the machine."""
         return f"{self.output or self.model.name}: {self.trace.headline}"
 
     def lines(self) -> tuple[str, ...]:
@@ -71,7 +66,6 @@ class ProfileResult(Result):
         )
 
     def _remedy(self, needed: int) -> str:
-        """Say how there would be more samples, where they were measured here."""
         return "" if self.trace.others is None else f" (--samples {needed})"
 
     def alerts(self) -> tuple[str, ...]:
@@ -81,7 +75,7 @@ class ProfileResult(Result):
         return (*energy, str(load)) if load is not None and load.busy else energy
 
     def tables(self) -> tuple[Table, ...]:
-        """Return the percentiles in milliseconds, by module and operator too."""
+        """Return percentiles in milliseconds, then modules, energy and operators."""
         whole, *modules = self.trace.tables()
         energy = () if self.energy is None else self.energy.tables()
         late = deadlines_table("Against the budget", self.deadlines)
@@ -89,6 +83,7 @@ class ProfileResult(Result):
         found = (whole, late, *modules, *energy)
         if not self.operators_us:
             return found
+        # of many operators the first are shown, with a note on the others
         rest = len(self.operators_us) - _SHOWN
         shown = shares_table("By operator, as it runs", "operator", self.operators_us)
         more = f"{rest} more operators: --json" if rest > 0 else ""
@@ -96,11 +91,11 @@ class ProfileResult(Result):
         return *found, dataclasses.replace(shown, rows=shown.rows[:_SHOWN], note=note)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row an inference, in their order."""
+        """Return one row per inference, in their order."""
         return [{"latency_us": sample} for sample in self.trace.samples_us]
 
     def to_json(self) -> object:
-        """Return what the trace holds, shares, joules, how busy the machine was."""
+        """Return the trace, deadlines, shares, joules, and how busy the machine was."""
         load = self.trace.others
         return {
             **self.trace.to_json(),

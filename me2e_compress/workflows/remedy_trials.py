@@ -1,4 +1,4 @@
-"""Variants of one quantization, for the search of what makes its loss."""
+"""Variants of one quantization, for the search of its loss's cause."""
 
 import math
 from collections.abc import Sequence
@@ -19,15 +19,10 @@ from me2e_compress.sensitivity.trials import keep_float
 class RemedyTrials:
     """The pass that quantized, run again with more nodes in float.
 
-    While a group is narrowed down, everything before it is float and answers as it
-    did: where that saves more than it costs, by MACs, only what is behind the group is
-    run again.
-
-    Args:
-        quantizer: the pass and its graph.
-        context: as it was run; what it measured is not measured again.
-        reference: answers of the graph.
-        overrides: a file to write.
+    While a group is narrowed down, everything before it is float and answers as it did:
+    where that saves more MACs than it costs, only what is behind the group is run
+    again. `context` is that of the first run, so that nothing is measured twice;
+    `overrides` is a file to write.
     """
 
     def __init__(
@@ -49,11 +44,10 @@ class RemedyTrials:
     ) -> Fidelity:
         """Build a variant and compare it; what the user decided still holds.
 
-        Args:
-            floats: what is to be float.
-            group: holds every node that is int8 then; empty for any.
+        `floats` become float; `group` holds every node that is int8 then, or is empty.
         """
         made = self._build(floats)
+        # run only what is behind the group, if that can be cut out of the variant
         found = self._narrowed(group)
         if found is not None:
             suffix, reference = found
@@ -66,6 +60,7 @@ class RemedyTrials:
         return Session(model, release=True, provider=self._context.provider)
 
     def _build(self, floats: Sequence[Int8Node]) -> ir.Model:
+        # the user's overrides stay, and the trial's are added behind
         asked = getattr(self._quantizer.applied, "overrides", None)
         text = "" if asked is None else Path(asked).read_text(encoding="utf-8")
         more = overrides_text(keep_float(each.name, "") for each in floats)
@@ -74,7 +69,7 @@ class RemedyTrials:
         return again.run(self._quantizer.before.clone(), self._context).model
 
     def _narrowed(self, group: Sequence[Int8Node]) -> tuple[Suffix, Reference] | None:
-        """Return what is behind a group, if running that alone is worth its capture."""
+        """Return what is behind a group, if running only that is worth its capture."""
         if not group or len(self._reference.answers) > 1:
             return None  # of several frames the state would be another
         names = frozenset(each.name for each in group)

@@ -49,11 +49,11 @@ Status = Literal["ok", "warning", "refused"]
 
 
 class Result(Displayed):
-    """What a workflow found."""
+    """The result of a workflow."""
 
     @abc.abstractmethod
     def records(self) -> list[dict[str, object]]:
-        """Return what there is to compute with: flat rows of one kind."""
+        """Return flat rows of one kind, to compute with."""
 
     @abc.abstractmethod
     def to_json(self) -> object:
@@ -65,10 +65,10 @@ class Result(Displayed):
         return "warning" if self.alerts() else "ok"
 
     def document(self) -> dict[str, object]:
-        """Return what ``--json`` prints: version, status, the lines said, everything.
+        """Return the ``--json`` document: version, status, the lines said, everything.
 
         Values may be dataclasses, paths and numbers that are not finite, which JSON
-        knows as objects, strings and null.
+        writes as objects, strings and null.
         """
         found = self.to_json()
         if dataclasses.is_dataclass(found) and not isinstance(found, type):
@@ -79,11 +79,7 @@ class Result(Displayed):
         return {"schema": SCHEMA, "status": self.status, "verdict": said, **found}
 
     def to_pandas(self) -> Any:
-        """Build a ``pandas.DataFrame`` of the records.
-
-        Raises:
-            MissingPackageError: pandas is not installed.
-        """
+        """Build a ``pandas.DataFrame`` of the records; pandas must be installed."""
         try:
             import pandas as pd
         except ImportError as error:
@@ -91,7 +87,7 @@ class Result(Displayed):
         return pd.DataFrame(self.records())
 
     def _repr_html_(self) -> str:
-        """Show the tables in a notebook; the records, where there are none."""
+        """Show the tables in a notebook, or the records where there are none."""
         records = () if self.tables() else _table_of(self.records())
         return "".join(each.html() for each in records) + super()._repr_html_()
 

@@ -1,4 +1,4 @@
-"""Sets of routes: made and admitted, or examined again."""
+"""Make a set of admitted routes, or examine one again."""
 
 from __future__ import annotations
 
@@ -26,14 +26,10 @@ class RoutesOptions:
 
     Attributes:
         seed: decides every route.
-        variants: of each scenario type.
+        variants: number of variants of each scenario type.
         scenarios: ``all``, or ``NAME,NAME``.
         workers: scenario types at a time.
         force: replace outputs that are not as we left them, too.
-
-    Raises:
-        RecipeError: a seed below 0.
-        EvaluationError: no such scenario.
     """
 
     seed: int = 0
@@ -43,7 +39,6 @@ class RoutesOptions:
     force: bool = False
 
     def __post_init__(self) -> None:
-        """Check seed and scenarios."""
         check_count("--seed", self.seed)
         for name in self.names:
             if name not in SCENARIO_ABILITIES:
@@ -52,7 +47,7 @@ class RoutesOptions:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the scenario types."""
+        """The names of the scenario types."""
         if self.scenarios == "all":
             return tuple(SCENARIO_ABILITIES)
         return tuple(name.strip() for name in self.scenarios.split(","))
@@ -60,29 +55,24 @@ class RoutesOptions:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class RoutesResult(Result):
-    """A set of routes that was made.
-
-    Attributes:
-        output: its file.
-        harvests: what every scenario type gave.
-    """
+    """A set of routes that was made."""
 
     output: Path
     harvests: tuple[ScenarioRoutes, ...]
 
     @property
     def admitted(self) -> int:
-        """How many routes the set has."""
+        """The number of routes in the set."""
         return sum(len(one.routes) for one in self.harvests)
 
     @property
     def tried(self) -> int:
-        """How many were proposed."""
+        """The number of routes proposed."""
         return sum(one.tried for one in self.harvests)
 
     @property
     def headline(self) -> str:
-        """Routes, tries, file."""
+        """The number of routes, of tries, and the file."""
         share = self.admitted / self.tried
         return (
             f"{self.admitted} of {counted(self.tried, 'route')} tried ({share:.0%}) ->"
@@ -90,7 +80,7 @@ class RoutesResult(Result):
         )
 
     def tables(self) -> tuple[Table, ...]:
-        """Return scenario by scenario what was admitted, and why others were not."""
+        """Return the routes admitted by scenario, and why others were not."""
         rows = [
             (
                 one.scenario,
@@ -104,7 +94,7 @@ class RoutesResult(Result):
         return (table("Routes", columns, rows, words=4),)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a scenario."""
+        """Return one row per scenario."""
         return [
             {
                 "scenario": one.scenario,
@@ -126,17 +116,7 @@ def make_routes(
     options: RoutesOptions | None = None,
     listener: Listener = SILENT,
 ) -> RoutesResult:
-    """Make a fresh set of routes, each admitted by the expert and the blind driver.
-
-    Args:
-        output: the manifest to write.
-        options: None takes the defaults.
-        listener: is called with progress and warnings.
-
-    Raises:
-        GraphError: the output cannot be written.
-        MissingExtraError: the extra ``highway`` is not installed.
-    """
+    """Make a fresh set of routes, each admitted by the expert and the blind driver."""
     need_extra("highway", "making routes")
     options, output = options or RoutesOptions(), Path(output)
     with writing([output], force=options.force):
@@ -146,6 +126,7 @@ def make_routes(
 def _made(output: Path, options: RoutesOptions, listener: Listener) -> RoutesResult:
     from me2e_compress.evaluators.highway.generate import generate
 
+    # report each scenario type as soon as its routes are admitted
     names = options.names
     harvests: list[ScenarioRoutes] = []
     made = generate(options.seed, names, options.variants, options.workers)
@@ -159,24 +140,19 @@ def _made(output: Path, options: RoutesOptions, listener: Listener) -> RoutesRes
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ExaminationResult(Result):
-    """Which routes of a set are admitted.
-
-    Attributes:
-        manifest: the set.
-        verdicts: one a route.
-    """
+    """Which routes of a set are admitted, one verdict per route."""
 
     manifest: Path
     verdicts: tuple[Admission, ...]
 
     @property
     def refused(self) -> tuple[Admission, ...]:
-        """Routes that are not admitted."""
+        """The routes that are not admitted."""
         return tuple(one for one in self.verdicts if not one.admitted)
 
     @property
     def headline(self) -> str:
-        """Count those admitted."""
+        """The number of routes admitted."""
         admitted = len(self.verdicts) - len(self.refused)
         return f"{admitted} of {counted(len(self.verdicts), 'route')} admitted"
 
@@ -187,7 +163,7 @@ class ExaminationResult(Result):
         return (table("Refused", columns, rows, words=2),) if rows else ()
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a route."""
+        """Return one row per route."""
         return [
             {"route": one.route.id, "admitted": one.admitted, "refusal": one.refusal}
             for one in self.verdicts
@@ -200,15 +176,11 @@ class ExaminationResult(Result):
 
     @property
     def status(self) -> Status:
-        """Whether all are admitted."""
+        """``ok`` if all are admitted, else ``refused``."""
         return "refused" if self.refused else "ok"
 
     def check(self) -> None:
-        """Go on if all are admitted.
-
-        Raises:
-            EvaluationError: one is not; names the first.
-        """
+        """Raise EvaluationError unless all are admitted; it names the first."""
         if self.refused:
             first = self.refused[0]
             raise EvaluationError(
@@ -220,17 +192,7 @@ class ExaminationResult(Result):
 def examine_routes(
     manifest: str | Path, pick: str = "all", listener: Listener = SILENT
 ) -> ExaminationResult:
-    """Examine a set of routes again, as if it were to be admitted.
-
-    Args:
-        manifest: the set.
-        pick: ``all``, a number or ``ID,ID``.
-        listener: is called with progress and warnings.
-
-    Raises:
-        EvaluationError: no such route, or no file of routes.
-        MissingExtraError: the extra ``highway`` is not installed.
-    """
+    """Examine a set of routes again; `pick` is ``all``, a number or ``ID,ID``."""
     need_extra("highway", "examining routes")
     from me2e_compress.evaluators.highway.admission import examine
 

@@ -1,4 +1,4 @@
-"""Scores of results that are there: of one folder or of several."""
+"""Score existing results, of one folder or of several."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,14 +34,13 @@ from me2e_compress.workflows.score_eer import EerOptions, EerScores, score_eer
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ScoreResult(Result):
-    """Scores by the name of their folder.
+    """Scores by folder.
 
     Attributes:
         scores: in the order in which the folders were named.
-        real: more of those that hold the results of real runs.
+        real: details of the folders that hold real runs.
         eer: EER_AV of all of them together; None where it was not asked for.
-        late: what decisions took, held against a budget; without folders whose
-            decisions cost nothing.
+        late: decision times against a budget, of folders whose decisions cost time.
     """
 
     scores: Mapping[str, Scores]
@@ -57,11 +56,11 @@ class ScoreResult(Result):
         )
 
     def lines(self) -> tuple[str, ...]:
-        """Return whether the order by EER_AV hangs on how it is normalized."""
+        """Return whether the order by EER_AV depends on how it is normalized."""
         return () if self.eer is None else self.eer.lines()
 
     def tables(self) -> tuple[Table, ...]:
-        """Return a table a folder; of a real run also what its records say."""
+        """Return one table per folder, the records of real runs, and EER_AV."""
         found = [
             each
             for name, scores in self.scores.items()
@@ -70,13 +69,17 @@ class ScoreResult(Result):
         return (*found, *(() if self.eer is None else self.eer.tables()))
 
     def alerts(self) -> tuple[str, ...]:
-        """Return what is wrong with the records of real runs."""
-        return tuple(
-            line for name, each in self.real.items() for line in each.alerts(name)
-        )
+        """Return failures that ended routes, and wrong records of real runs."""
+        failed = [
+            f"{name}: {each.failed}"
+            for name, each in self.scores.items()
+            if each.failed
+        ]
+        real = [line for name, each in self.real.items() for line in each.alerts(name)]
+        return (*failed, *real)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a score of a folder."""
+        """Return one row per folder and score."""
         return [
             {"results": name, **record}
             for name, scores in self.scores.items()
@@ -119,23 +122,20 @@ def score(
     eer: EerOptions | None = None,
     budget_ms: float = BUDGET_MS,
 ) -> ScoreResult:
-    """Score the episodes in folders of results.
+    """Score the episodes in folders that ``evaluate`` or real Bench2Drive runs left.
 
-    Args:
-        results: folders that ``evaluate`` wrote, or that real runs of Bench2Drive left.
-        listener: is called with the files that are damaged and left out.
-        real: how results of real runs are read; None takes the defaults.
-        eer: joules of the folders, for EER_AV of all of them together.
-        budget_ms: what a decision may take.
+    The listener is told of damaged files, which are left out; `eer` holds the folders'
+    joules, for EER_AV of all of them together.
 
     Raises:
-        EvaluationError: not a folder of results, EER_AV cannot compare them, or a
-            budget that is not positive.
-        EnergyError: a file of joules is not usable.
+        EvaluationError: A folder holds no results, EER_AV cannot compare the folders,
+            or the budget is not positive.
+        EnergyError: A file of joules is not usable.
     """
     check_budget(budget_ms)
     scores, runs = dict[str, Scores](), dict[str, RealRun]()
     driven, measured = dict[str, Sequence[Episode]](), dict[str, int | None]()
+    # our own results have a manifest; anything else must be a real run
     for path in map(Path, results):
         if (path / MANIFEST).exists():
             folder = ResultsFolder.open(path)
@@ -153,11 +153,13 @@ def score(
         run = score_real_run(path, real or Bench2DriveOptions())
         scores[str(path)], runs[str(path)] = run.scores, run
         driven[str(path)] = run.collected.episodes
+    # options of real runs would be ignored without a word
     if real is not None and not runs:
         raise EvaluationError(
             f"{', '.join(scores)}: no results of a real run, which --metrics, "
             "--junctions, --abilities and --penalties are about"
         )
+    # folders whose decisions cost nothing have no deadlines
     late = {
         name: found
         for name, episodes in driven.items()
@@ -167,7 +169,7 @@ def score(
 
 
 def _episodes(folder: ResultsFolder, listener: Listener) -> tuple[Episode, ...]:
-    """Return what a folder holds; say what of it is damaged."""
+    """Return a folder's episodes; warn of damaged files and of an ego that stood."""
     episodes = tuple(folder.episodes().values())
     for file, reason in folder.corrupt.items():
         listener.on_warning(f"{file}: {reason}: left out")
@@ -177,7 +179,7 @@ def _episodes(folder: ResultsFolder, listener: Listener) -> tuple[Episode, ...]:
 
 
 def driving_score(scores: Scores) -> str:
-    """Write the driving score with its interval, and the number of routes."""
+    """Return the driving score with its interval, and the number of routes."""
     found = scores.driving_score
     routes = f"{scores.routes} of {scores.expected} routes"
     if found.value is None:
@@ -187,7 +189,7 @@ def driving_score(scores: Scores) -> str:
 
 
 def scores_table(name: str, scores: Scores) -> Table:
-    """Show every score with its unit, its interval and its number of routes."""
+    """Return every score with its unit, its interval and its number of routes."""
     routes = f"{scores.routes} of {scores.expected} routes"
     partial = ", PARTIAL: no comparison with a whole set" if scores.partial else ""
     rows = [(label, *_cells(estimate)) for label, estimate in _each(scores)]
@@ -197,7 +199,7 @@ def scores_table(name: str, scores: Scores) -> Table:
 
 
 def score_records(scores: Scores) -> list[dict[str, object]]:
-    """Return a row a score: value, interval, routes, unit, reason."""
+    """Return one row per score: value, interval, routes, unit, reason."""
     return [
         {"score": label.strip(), **estimate.to_json()}
         for label, estimate in _each(scores)

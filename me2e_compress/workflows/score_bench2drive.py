@@ -1,4 +1,4 @@
-"""Scores of the results of real Bench2Drive runs, and what was found beside them."""
+"""Score the results of real Bench2Drive runs, with what was found beside them."""
 
 import dataclasses
 import math
@@ -40,12 +40,9 @@ class Bench2DriveOptions:
             lie below that of the results.
         junctions: JSON file of the share of each route, by its number, at which its
             first junction is passed: (c + 8) / n, as Traffic_Signs asks for it.
-        rules: of the abilities: ``0.0.3`` or ``0.0.4``; None takes those that came
-            with the routes.
-        penalties: of infractions: ``b2d``, ``1.0``, ``2.0`` or ``2.1``.
-
-    Raises:
-        EvaluationError: no such rules or penalties.
+        rules: rules of the abilities: ``0.0.3`` or ``0.0.4``; None takes those that
+            came with the routes.
+        penalties: penalties of infractions: ``b2d``, ``1.0``, ``2.0`` or ``2.1``.
     """
 
     metrics: str | Path | None = None
@@ -54,7 +51,6 @@ class Bench2DriveOptions:
     penalties: Version = "b2d"
 
     def __post_init__(self) -> None:
-        """Check the choices."""
         if self.rules is not None and self.rules not in RULES:
             raise EvaluationError(
                 f"no rules {self.rules!r} of abilities; there are {', '.join(RULES)}"
@@ -70,10 +66,8 @@ class RealRun:
     """A real run, scored.
 
     Attributes:
-        collected: the episodes, and what was found beside.
-        scores: as of any other run, with Bench2Drive's rules of abilities.
-        leaderboard: as the leaderboard and Bench2Drive's tools compute them.
-        rules: of the abilities.
+        scores: scores as of any other run, with Bench2Drive's rules of abilities.
+        leaderboard: scores as the leaderboard and Bench2Drive's tools compute them.
         stood: routes on which the ego stood most of its time.
     """
 
@@ -84,14 +78,15 @@ class RealRun:
     stood: tuple[str, ...]
 
     def tables(self, name: str) -> tuple[Table, ...]:
-        """Return what was found, and both quotients of what was given and computed."""
+        """Return the records found, and the scores as given and as computed."""
         return (self._counts(name), self._quotients())
 
     def alerts(self, name: str) -> Iterator[str]:
-        """Say what must not be overlooked, one line each."""
+        """Yield warnings, one line each."""
         found = self.collected
         if found.route_set is None:
             yield f"{name}: its routes are of no set of Bench2Drive that is known"
+        # routes that do not count as they should
         for what, routes in (
             (f"of another set than {found.route_set}", found.foreign),
             (
@@ -103,6 +98,7 @@ class RealRun:
         ):
             if routes:
                 yield f"{name}: {what}: {some_of(routes)}"
+        # damaged files, then statements that contradict the records
         for where, reason in list(found.broken.items())[:_NAMED]:
             yield f"{where}: {reason}: left out"
         if len(found.broken) > _NAMED:
@@ -151,7 +147,7 @@ class RealRun:
         }
 
     def _stated(self) -> Iterator[str]:
-        """Compare what merged files say of themselves with their own records."""
+        """Yield where merged files contradict their own records."""
         for path, file in self.collected.stated.items():
             episodes = [each.episode for each in file.records]
             again = leaderboard_scores(episodes)
@@ -186,6 +182,7 @@ class RealRun:
         of = self.leaderboard
         none = Measure(None, "", "not so")
         nothing = Quotients(none, none)
+        # not every figure is both given by the simulator and computed here
         lines = [
             ("driving score", of.given_score, of.score, "%"),
             ("success rate", nothing, of.success_rate, "%"),
@@ -195,6 +192,7 @@ class RealRun:
         if of.score != of.score_without_low_speed:
             without = of.score_without_low_speed
             lines.insert(1, ("  without low speed", nothing, without, "%"))
+        # each figure is shown over the whole set, and over what was driven
         rows = [
             (label, over, _shown(given, over), _shown(computed, over), str(n), unit)
             for label, given, computed, unit in lines
@@ -207,17 +205,15 @@ class RealRun:
 
 
 def score_real_run(path: Path, options: Bench2DriveOptions) -> RealRun:
-    """Read and score the results of a real run.
-
-    Raises:
-        EvaluationError: no such folder, no record below it, or a bad file of junctions.
-    """
+    """Read and score the results of a real run."""
     metric_folder = None if options.metrics is None else Path(options.metrics)
+    # collect the records, and find the rules that came with the routes
     collected = Bench2DriveResults(path, metric_folder).collect()
     episodes = collected.episodes
     set_size = metrics.FULL_SET * collected.repetitions
     rules = options.rules or collected.route_set or RULES[0]
     junctions = _junctions(options.junctions, [each.route for each in episodes])
+    # Bench2Drive's rates of abilities replace our own
     rates = ability_rates(episodes, rules, junctions)
     scores = dataclasses.replace(
         metrics.score(episodes, set_size),
@@ -234,7 +230,7 @@ def score_real_run(path: Path, options: Bench2DriveOptions) -> RealRun:
 
 
 def _junctions(path: str | Path | None, routes: Sequence[str]) -> dict[str, float]:
-    """Read the places of junctions, by route; they stand there by route or number."""
+    """Read the places of junctions by route; the file names the route or its number."""
     if path is None:
         return {}
     try:
@@ -258,6 +254,6 @@ def _shown(quotients: Quotients, over: str) -> str:
 
 
 def some_of(names: Sequence[str]) -> str:
-    """Name the first of many."""
+    """Return the first few of many names."""
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return ", ".join(names[:_NAMED]) + more

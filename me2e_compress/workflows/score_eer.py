@@ -34,7 +34,7 @@ Joules = Mapping[str, str | Path | float]
 
 @dataclasses.dataclass(frozen=True)
 class EerOptions:
-    """What EER_AV is made of besides the episodes.
+    """The inputs of EER_AV besides the episodes.
 
     Attributes:
         energy: measured joules of one inference, by folder: a number, or a file that
@@ -59,22 +59,17 @@ class EerOptions:
 
 @dataclasses.dataclass(frozen=True)
 class EerScores:
-    """EER_AV with measured joules, and apart from it with modelled ones.
-
-    Attributes:
-        found: by ``measured`` and ``modelled``, those that were asked for.
-        rankings: the variants, best first, by normalization, of each.
-    """
+    """EER_AV by kind of joules, with each kind's rankings by normalization."""
 
     found: Mapping[Kind, EerResult]
     rankings: Mapping[Kind, Mapping[str, tuple[str, ...]]]
 
     def tables(self) -> tuple[Table, ...]:
-        """Return the scores, their weights, and how the order hangs on them."""
+        """Return the scores and their weights."""
         return (self._scores(), *(self._weights(kind) for kind in self._weighed()))
 
     def lines(self) -> tuple[str, ...]:
-        """Say whether the order hangs on the normalization."""
+        """Return whether the order depends on the normalization."""
         return tuple(self._order(kind) for kind in self._weighed())
 
     def to_json(self) -> dict[str, Any]:
@@ -113,6 +108,7 @@ class EerScores:
         scale = found.scale
         if scale is None:
             return table("Weights", (), ())
+        # a measure is scaled so that its offset is 0 and offset plus span is 1
         rows = [
             (measure, f"{weight:.3f}", significant(low), significant(low + span), unit)
             for measure, weight, low, span, unit in zip(
@@ -142,16 +138,12 @@ class EerScores:
 def score_eer(
     folders: Mapping[str, Sequence[Episode]], options: EerOptions
 ) -> EerScores | None:
-    """Return EER_AV of folders that hold the same routes; None where none is asked.
-
-    Args:
-        folders: episodes by the name of the folder.
-        options: joules and weights.
+    """Return EER_AV of folders that hold the same routes; None if not asked for.
 
     Raises:
-        EvaluationError: the folders hold different routes, joules are of no folder or
-            no number, or the weights are not usable.
-        EnergyError: a file of joules is not usable.
+        EvaluationError: Routes differ, joules are of no folder, or weights are not
+            usable.
+        EnergyError: A file of joules is not usable.
     """
     if not options.asked:
         return None
@@ -162,10 +154,12 @@ def score_eer(
     asked: dict[Kind, Joules] = {kind: each for kind, each in given.items() if each}
     if not asked:
         asked["measured"] = {}
+    # saved weights are for one kind of joules
     scales = _scales(options.weights, asked)
     paired, others = paired_drives(folders)
     types, found = _types(paired), dict[Kind, EerResult]()
     orders = dict[Kind, dict[str, tuple[str, ...]]]()
+    # measured and modelled joules make scores of their own
     for kind, joules in asked.items():
         variants = _variants(paired, kind, joules)
         result = eer(variants, scales.get(kind), types=types)
@@ -192,11 +186,7 @@ def _scales(
 
 
 def joules_named(words: Sequence[str]) -> dict[str, str | float]:
-    """Read ``NAME=JOULES`` or ``NAME=FILE``, as the command takes them.
-
-    Raises:
-        EvaluationError: there is no name, or one twice.
-    """
+    """Parse ``NAME=JOULES`` or ``NAME=FILE``, as the command takes them."""
     found = dict[str, str | float]()
     for word in words:
         name, equals, value = word.rpartition("=")
@@ -214,7 +204,6 @@ def joules_named(words: Sequence[str]) -> dict[str, str | float]:
 def _variants(
     folders: Mapping[str, Sequence[Episode]], kind: Kind, joules: Joules
 ) -> dict[str, RouteMeasures]:
-    """Return the measures of every folder."""
     named = {
         _folder(name, folders): _joules(name, kind, each)
         for name, each in joules.items()
@@ -246,7 +235,7 @@ def _joules(name: str, kind: Kind, given: str | Path | float) -> float | None:
 
 
 def _modelled(path: Path) -> float | None:
-    """Read the joules of the document that `inspect` prints."""
+    """Read the joules of the document that ``inspect --json`` prints."""
     try:
         document = documents.from_json(documents.content(path))
         joules = document["modelled_energy"]["modelled_j_per_frame"]

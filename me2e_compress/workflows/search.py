@@ -1,4 +1,4 @@
-"""The modules whose int8 meets budgets and costs the plan least."""
+"""Find the modules whose int8 meets budgets and costs the plan least."""
 
 import dataclasses
 from functools import partial
@@ -31,13 +31,9 @@ class SearchOptions(TrialOptions):
 
     Attributes:
         max_mb: most MB of weights.
-        max_ms: most milliseconds a frame, on this CPU.
-        max_joules: most joules a frame: measured where a counter answers, else
+        max_ms: most milliseconds per frame, on this CPU; its target is onnxruntime.
+        max_joules: most joules per frame: measured where a counter answers, else
             modelled.
-
-    Raises:
-        RecipeError: no budget, one that is not positive and finite, or time on this
-            CPU of int8 for another target.
     """
 
     max_mb: float | None = None
@@ -45,7 +41,6 @@ class SearchOptions(TrialOptions):
     max_joules: float | None = None
 
     def __post_init__(self) -> None:
-        """Check the budget."""
         super().__post_init__()
         check_budgets(self.max_mb, self.max_ms, self.max_joules)
         if self.max_ms is not None and self.runs_on != "onnxruntime":
@@ -62,14 +57,7 @@ class SearchOptions(TrialOptions):
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class SearchResult(Result):
-    """What was tried, and the recipe.
-
-    Attributes:
-        output: the recipe that was written.
-        tried: assignments; the last one fits and is the recipe's.
-        limits: the budgets: unit and the most it may cost.
-        written: what was written, in words.
-    """
+    """What was tried, and the recipe; the last assignment fits and is the recipe's."""
 
     output: Path
     tried: tuple[Candidate, ...]
@@ -101,7 +89,7 @@ class SearchResult(Result):
         return (table("Tried, best first", columns, rows, note),)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row an assignment; a cost is that of the first budget."""
+        """Return one row per assignment; a cost is that of the first budget."""
         return [
             {
                 "modules": each.modules,
@@ -139,20 +127,16 @@ def search(
 ) -> SearchResult:
     """Find the modules whose int8 meets the budgets and costs the plan least.
 
-    Args:
-        model: the float ONNX file, or the name of one that ships.
-        frames: folder of recorded frames.
-        output: the recipe.
-        options: with one budget or more.
-        listener: is called with progress and warnings.
+    The model is a float ONNX file or the name of one that ships; the output is a
+    recipe.
 
     Raises:
-        GraphError: no such model, or the output would harm an input.
-        RecipeError: no such scheme, rule set or target.
-        EnergyError: a counter that answers is not usable.
-        FramesError: frames or saved ranges that do not fit.
-        PreconditionError: the graph is quantized already, or nothing can be int8.
-        EvaluationError: nothing fits; says what the least was.
+        GraphError: The model does not exist, or the output would harm an input.
+        RecipeError: There is no such scheme, rule set or target.
+        EnergyError: A counter that answers is not usable.
+        FramesError: Frames or saved ranges do not fit.
+        PreconditionError: The graph is quantized already, or nothing can become int8.
+        EvaluationError: Nothing fits; the message says what the least was.
     """
     files = TrialFiles(model_path(model), Path(frames), Path(output))
     with files.claimed(options):
@@ -162,6 +146,7 @@ def search(
 def _search(
     files: TrialFiles, options: SearchOptions, listener: Listener
 ) -> SearchResult:
+    # calibrate once, then search variants of that one graph
     trials, modules = files.trials(options, options.runs_on, listener)
     budgets = _budgets(options, trials)
     report = partial(listener.on_progress, "modules")
@@ -173,7 +158,7 @@ def _search(
 
 
 def _budgets(options: SearchOptions, trials: Trials) -> list[Budget]:
-    """List what is to be met: size, time, energy."""
+    # sizes and seconds in base units, as they are measured
     found = list[Budget]()
     if options.max_mb is not None:
         found.append(Budget(options.max_mb * 1e6, "bytes of weights", _weight_bytes))
@@ -192,7 +177,7 @@ def _weight_bytes(made: ir.Model) -> float:
 
 
 def _joules(trials: Trials, threads: int, kind: Joules, made: ir.Model) -> float:
-    """Return joules of a frame."""
+    # energy is measured or modelled for a file
     reference = trials.reference
     with TemporaryDirectory() as folder:
         file = Path(folder) / "int8.onnx"
@@ -208,7 +193,7 @@ def _joules(trials: Trials, threads: int, kind: Joules, made: ir.Model) -> float
 
 
 def _seconds(trials: Trials, threads: int, made: ir.Model) -> float:
-    """Return the least wall time of a frame, of 5."""
+    """Return the least wall time of a frame in 5 runs."""
     provider = trials.reference.session.provider
     session = Session(made, threads=threads, release=True, provider=provider)
     first = next(iter(trials.reference.frames))

@@ -1,4 +1,4 @@
-"""What int8 costs per module and node, and a recipe within a limit."""
+"""Measure what int8 costs per module and node, and write a recipe within a limit."""
 
 import dataclasses
 from functools import partial
@@ -49,10 +49,6 @@ class SensitivityOptions(TrialOptions):
         drive_limit: most points of driving score that the recipe may lose.
         workers: routes at a time.
         node_trials: most trials on the nodes of a module; 0 leaves nodes out.
-
-    Raises:
-        RecipeError: a number that is negative or not finite, or how to drive without
-            routes.
     """
 
     limit: float = 0.1
@@ -62,7 +58,6 @@ class SensitivityOptions(TrialOptions):
     node_trials: int = 24
 
     def __post_init__(self) -> None:
-        """Check what can be checked without a file."""
         super().__post_init__()
         check_number("--limit", self.limit, zero=True)
         check_number("--drive-limit", self.drive_limit, zero=True)
@@ -76,13 +71,8 @@ class SensitivityResult(Result):
     """What int8 costs, and the recipe.
 
     Attributes:
-        output: the recipe that was written.
-        found: module by module.
-        choice: what the recipe makes int8.
-        score: of the choice; None where nothing is int8.
+        score: loss of the choice; None where nothing is int8.
         driving: driving score of the choice; None where nothing is driven.
-        limit: of the loss.
-        written: what was written, in words.
     """
 
     output: Path
@@ -124,10 +114,12 @@ class SensitivityResult(Result):
             (each.module, str(each.nodes), *_cells(each.score, each.driving))
             for each in found.findings
         ]
+        # the float model stands first, all modules together last
         if driven:
             whole = number(found.float_driving, ".1f")
             rows.insert(0, ("none", "", "0", "", whole))
         rows.append(("together", "", *_cells(found.together, found.driving)))
+        # without drives the last column is left out
         columns = ("module", "nodes", f"loss {found.together.unit}", "worst dB", "DS")
         width = len(columns) if driven else len(columns) - 1
         size = megabytes(found.together.weight_bytes)
@@ -141,7 +133,7 @@ class SensitivityResult(Result):
         )
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a module."""
+        """Return one row per module."""
         return [
             {
                 "module": each.module,
@@ -168,22 +160,16 @@ def measure_sensitivity(
 ) -> SensitivityResult:
     """Measure what int8 costs per module and node, and write a recipe within a limit.
 
-    Where modules are driven, the episodes stay in ``RECIPE.drives``; run again, it
-    goes on from them.
-
-    Args:
-        model: the float ONNX file, or the name of one that ships.
-        frames: folder of recorded frames.
-        output: the recipe; overrides lie beside it where nodes stay float.
-        options: None takes the defaults.
-        listener: is called with progress and warnings.
+    The model is a float ONNX file or the name of one that ships; overrides lie beside
+    the recipe where nodes stay float. Where modules are driven, the episodes stay in
+    ``RECIPE.drives``; run again, it goes on from them.
 
     Raises:
-        GraphError: no such model, or an output would harm an input.
-        RecipeError: no such scheme, rule set or target.
-        FramesError: frames or saved ranges that do not fit.
-        PreconditionError: the graph is quantized already, or nothing can be int8.
-        EvaluationError: the model cannot drive.
+        GraphError: The model does not exist, or an output would harm an input.
+        RecipeError: There is no such scheme, rule set or target.
+        FramesError: Frames or saved ranges do not fit.
+        PreconditionError: The graph is quantized already, or nothing can become int8.
+        EvaluationError: The model cannot drive.
     """
     options = options or SensitivityOptions()
     files = TrialFiles(model_path(model), Path(frames), Path(output))
@@ -194,12 +180,14 @@ def measure_sensitivity(
 def _measured(
     files: TrialFiles, options: SensitivityOptions, listener: Listener
 ) -> SensitivityResult:
+    # variants drive only on request: that takes hours
     drive = None
     if options.drive is not None:
         folder = files.output.with_name(files.output.stem + ".drives")
         check_folder(folder, (files.frames,))
         drive = _on_routes(options.drive, files.model, folder, options)
     target = options.target or "tensorrt"
+    # calibrate once, try modules and nodes, then choose within the limits
     trials, modules = files.trials(options, target, listener, drive)
     found = analyse(
         trials,
@@ -219,18 +207,10 @@ def _measured(
 def _on_routes(
     routes: str, model: Path, folder: Path, options: SensitivityOptions
 ) -> Drive:
-    """Drive variants over routes of highway-env; the score is their mean DS, percent.
+    """Return a function that drives a variant and gives its mean DS, percent.
 
-    Args:
-        routes: as ``evaluate`` takes them.
-        model: that the variants are made of; it is tried before anything else.
-        folder: keeps the episodes, a folder a variant; what is there is not driven
-            again.
-        options: adapter and workers.
-
-    Raises:
-        MissingExtraError: driving needs the extra ``highway``.
-        EvaluationError: no such route, or the model cannot drive.
+    The model, which variants are made of, is tried before anything else. The folder
+    keeps the episodes of each variant, which are not driven again.
     """
     need_extra("highway", "driving a variant")
     from me2e_compress.evaluators.highway.conditions import Conditions
@@ -242,12 +222,14 @@ def _on_routes(
     from me2e_compress.metrics.scores import score
     from me2e_compress.workflows.evaluate import driver_of
 
+    # open the model before hours are spent on variants
     picked, set_size = routes_named(routes)
     adapter, provider = options.adapter, options.provider
     size = image_size_of(driver_of(str(model), adapter, provider).open())
 
     def drive(choice: Int8Choice, variant: ir.Model) -> float:
         results = folder / _name_of(choice, variant)
+        # the episodes stay, the variant's graph does not
         with TemporaryDirectory() as scratch:
             path = Path(scratch) / "variant.onnx"
             graph.save(variant, path)
@@ -264,7 +246,7 @@ def _on_routes(
 
 
 def _name_of(choice: Int8Choice, model: ir.Model) -> str:
-    """Name a variant: its int8 modules, and what tells it from all other graphs."""
+    """Name a variant by its int8 modules and the digest of its graph."""
     modules = "+".join(choice.modules) or "float"
     return f"{modules}-{graph.digest(model)[:12]}"
 

@@ -14,7 +14,7 @@ class ShippedDriver(Driver):
     """The trained driver that comes with the package.
 
     Attributes:
-        host_stage: Changes the plan on the host, as a text: ``collision-optimizer``;
+        host_stage: changes the plan on the host, as a text: ``collision-optimizer``;
             empty leaves it as the network has it.
     """
 
@@ -22,11 +22,7 @@ class ShippedDriver(Driver):
     host_stage: str = ""
 
     def resolved(self) -> Driver:
-        """Return the ONNX file that it is.
-
-        Raises:
-            GraphError: The file is missing or altered.
-        """
+        """Return the driver of the shipped ONNX file."""
         return OnnxDriver(shipped(self.name), host_stage=self.host_stage)
 
     def open(self) -> Policy:
@@ -34,5 +30,5 @@ class ShippedDriver(Driver):
         return self.resolved().open()
 
     def fingerprint(self) -> str:
-        """Return the digest of the file: results of either are the same."""
+        """Return the digest of the file: results under either name are the same."""
         return self.resolved().fingerprint()

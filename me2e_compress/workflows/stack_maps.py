@@ -9,15 +9,7 @@ from me2e_compress.runtime.stack.split_stack import SplitStack
 
 
 def map_of_stack(stack: SplitStack, named: str | Path | None) -> ModuleMap:
-    """Load the map that all files of a stack share; None finds the preset.
-
-    Args:
-        stack: the files.
-        named: preset or TOML file that the user gave.
-
-    Raises:
-        ModuleMapError: no such map, or a pattern matches nothing in any file.
-    """
+    """Load the map that all files share; a pattern must match in one of them."""
     models = [graph.load(each.path) for each in stack.files.values()]
     name = None if named is None else str(named)
     return map_of_files(models, stack.metadata.get(STACK), name)

@@ -1,6 +1,6 @@
 """The reference stacks in torch, their exporters and their synthetic frames.
 
-Importing this needs no torch; using an exporter does (extra ``zoo``).
+The package imports without torch; exporters need it (extra ``zoo``).
 """
 
 from me2e_compress.zoo.stacks import STACKS, Stack

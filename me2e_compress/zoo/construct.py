@@ -1,4 +1,4 @@
-"""The torch module of a stack, before it has weights."""
+"""Build the torch module of a stack, without weights."""
 
 from typing import TYPE_CHECKING, cast
 
@@ -13,11 +13,9 @@ if TYPE_CHECKING:
 
 
 def construct(spec: Stack, sampling: "Sampling" = "operator") -> "nn.Module":
-    """Build the module that weights of the original fit; its own mean nothing yet.
+    """Build the module that the original's weights fit; its own weights are meaningless.
 
-    Args:
-        spec: Of `Stack.with_heads`.
-        sampling: How features are sampled, of a stack that samples any.
+    ``spec`` comes from `Stack.with_heads`.
     """
     model: nn.Module
     if spec.name == TCP.name:

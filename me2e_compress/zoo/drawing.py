@@ -1,4 +1,4 @@
-"""Weights drawn from a seed, so that no two tensors are equal and none is constant.
+"""Draw weights from a seed, so that no two tensors are equal and none is constant.
 
 An exporter merges equal tensors, and trained ones are never equal.
 """
@@ -17,19 +17,19 @@ BIAS_STD = 0.1
 EMBEDDING_STD = 0.3
 DEFAULT_GAIN = math.sqrt(2)
 RESIDUAL_SCALE = 0.35
-"""Of the last normalisation of a residual block, so that 16 blocks do not explode."""
+"""Scale of the last normalisation of a residual block, so that 16 blocks stay stable."""
 
 ATTENTION_HEADS = 8
 
 
 @dataclass(frozen=True)
 class Gains:
-    """How strong weights are.
+    """The standard deviation of drawn weights.
 
     Attributes:
-        by_name: Standard deviation of an output for a unit input, by a pattern in the
-            name: the first that matches; 1.4 (ReLU, He et al. 2015) where none does.
-        last_norm: Pattern of the normalisations that end a residual block.
+        by_name: standard deviation of an output for a unit input, by a pattern of the
+            name: the first match counts; 1.4 (ReLU, He et al. 2015) if none matches.
+        last_norm: pattern of the normalisations that end a residual block.
     """
 
     by_name: Sequence[tuple[str, float]]
@@ -58,6 +58,7 @@ def _drawn(
     generator: torch.Generator,
 ) -> Tensor:
     noise = torch.empty_like(parameter).normal_(generator=generator)
+    # Normalisations are near 1 and 0
     if isinstance(owner, nn.BatchNorm2d | nn.LayerNorm) or "code_weights" in name:
         noise = noise.clamp(-3, 3) * BIAS_STD
         if name.endswith("bias"):
@@ -69,6 +70,7 @@ def _drawn(
         return _spread(parameter) + noise * BIAS_STD
     if parameter.dim() == 1:
         return noise * BIAS_STD
+    # Convolutions are smooth; linear layers sum to zero
     if parameter.dim() == 4:
         noise = _smooth(noise)
     elif isinstance(owner, nn.Linear):
@@ -77,9 +79,9 @@ def _drawn(
 
 
 def _smooth(kernels: Tensor) -> Tensor:
-    """Blur the kernels, at the same standard deviation: [out, in, k, k].
+    """Blur kernels [out, in, k, k] at the same standard deviation.
 
-    White-noise kernels respond to pixel noise more than to shapes; trained ones are
+    White-noise kernels respond more to pixel noise than to shapes; trained ones are
     smooth.
     """
     blurred = kernels
@@ -89,7 +91,8 @@ def _smooth(kernels: Tensor) -> Tensor:
 
 
 def _spread(bias: Tensor) -> Tensor:
-    """Return deformable DETR's offsets: a direction a head, a step more a point."""
+    """Return deformable DETR's offsets: one direction per head, one more step per point.
+    """
     angles = torch.arange(ATTENTION_HEADS) * (2 * math.pi / ATTENTION_HEADS)
     directions = torch.stack([angles.cos(), angles.sin()], -1)
     directions = directions / directions.abs().amax(-1, keepdim=True)
@@ -99,14 +102,9 @@ def _spread(bias: Tensor) -> Tensor:
 
 
 def take_statistics(backbone: nn.Module, images: Tensor) -> Tensor:
-    """Set the batch normalisations to the statistics of images, in place.
+    """Set a backbone's batch normalisations to the statistics of images, in place.
 
-    Args:
-        backbone: Maps the images to features.
-        images: [N, 3, H, W], normalised.
-
-    Returns:
-        The features.
+    The images are [N, 3, H, W], normalised. Returns the features.
     """
     norms = [each for each in backbone.modules() if isinstance(each, nn.BatchNorm2d)]
     for norm in norms:

@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from me2e_compress.zoo.vad.config import HeadsName
 
 GRID_SAMPLE_OPSET = 16
-"""GridSample exists from here on; below, sampling is spelled with Gather."""
+"""The first opset with GridSample; below, sampling is written with Gather."""
 
 FUSED_DOMAIN = "me2e"
-"""Of the nodes that stand for a whole operator."""
+"""The domain of fused nodes."""
 
 DYNAMO_OPSET = 18
-"""The only one that torch's dynamo exporter writes as asked; the TorchScript exporter
-writes those below."""
+"""The only opset that torch's dynamo exporter writes as requested; the TorchScript
+exporter writes those below."""
 
 OPSETS = range(13, DYNAMO_OPSET + 1)
 """From the first that onnxruntime and TensorRT agree on."""
@@ -51,27 +51,25 @@ def export(
     """Build a stack from a seed or a checkpoint and write it as one ONNX file.
 
     Parameters keep their state-dict names and nodes the scopes of their modules, which
-    is what a module map reads; constants are not folded. The metadata says what the
-    file is (`Stack.metadata`).
+    module maps read; constants are not folded. The metadata describe the file
+    (`Stack.metadata`). Returns the path.
 
     Args:
-        stack: Name in `STACKS`.
-        path: The ``.onnx`` to write; replaced in one step.
+        stack: a name in `STACKS`.
+        path: the ``.onnx`` to write, atomically.
         opset: 13 to 18; below 16 grid sampling is decomposed into gathers, and 18 is
-            what the dynamo exporter writes.
-        seed: Of all weights, unless they are given.
-        heads: Which last layers; None is the default of the stack.
-        fused: Whether deformable attention is one node, of the domain ``me2e``.
-        weights: Of the stack with these heads; the metadata names their file.
-
-    Returns:
-        The path.
+            written by the dynamo exporter.
+        seed: of all weights, unless they are given.
+        heads: which last layers; None is the default of the stack.
+        fused: whether deformable attention is one node, of the domain ``me2e``.
+        weights: of the stack with these heads; the metadata name their file.
 
     Raises:
         MissingExtraError: torch is not installed.
-        GraphError: Unknown stack or opset, the exporter wrote another opset, or the
+        GraphError: unknown stack or opset, the exporter wrote another opset, or the
             file cannot be written.
     """
+    # Refuse what no exporter can write
     spec = find(stack).with_heads(heads)
     if opset not in OPSETS:
         raise GraphError(
@@ -82,6 +80,7 @@ def export(
             f"cannot export {stack} at opset {opset} with plugins, which take up to"
             f" {DYNAMO_OPSET - 1}"
         )
+    # Build, trace, and save
     made = build(
         stack, opset=opset, seed=seed, heads=heads, fused=fused, weights=weights
     )
@@ -90,16 +89,7 @@ def export(
 
 
 def save(graph: onnx.ModelProto, metadata: Mapping[str, str], path: Path) -> Path:
-    """Write a traced graph with its metadata, and return the path.
-
-    Args:
-        graph: Gets the metadata.
-        metadata: Properties by key.
-        path: The ``.onnx``; replaced in one step.
-
-    Raises:
-        GraphError: It cannot be written.
-    """
+    """Write a traced graph with metadata properties atomically, and return the path."""
     for key, value in metadata.items():
         graph.metadata_props.add(key=key, value=value)
     return write(path, graph.SerializeToString())
@@ -114,12 +104,12 @@ def build(
     fused: bool = False,
     weights: "PublishedWeights | None" = None,
 ) -> "nn.Module":
-    """Return the torch module of a stack, its weights given or of a seed, ready to run.
+    """Return the torch module of a stack, with given weights or those of a seed.
 
     Raises:
         MissingExtraError: torch is not installed.
-        GraphError: Unknown stack or heads, a stack whose trained weights ship, or one
-            without deformable attention that is asked to fuse it.
+        GraphError: unknown stack or heads, a stack whose trained weights ship, or
+            ``fused`` for one without deformable attention.
     """
     spec = find(stack).with_heads(heads)
     if spec.trained:
@@ -128,6 +118,7 @@ def build(
         )
     if importlib.util.find_spec("torch") is None:
         raise MissingExtraError("torch", "zoo")
+    # TCP samples nothing: neither opset nor fusion matters
     if spec.name == TCP.name:
         if fused:
             raise GraphError(f"{stack} has no deformable attention: no plugin fits it")
@@ -137,6 +128,7 @@ def build(
 
         (chosen,) = spec.heads
         return build_tcp(seed=seed, heads=cast("ActionHeads", chosen))
+    # The opset decides how features are sampled
     native: Sampling = "operator" if opset >= GRID_SAMPLE_OPSET else "gather"
     sampling = "fused" if fused else native
     if weights is not None:
@@ -163,7 +155,7 @@ def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
     """Trace a module with example inputs and return the graph.
 
     Raises:
-        GraphError: The exporter wrote another opset than it was asked for.
+        GraphError: the exporter wrote another opset than requested.
     """
     import torch
 
@@ -195,7 +187,7 @@ def _by_torchscript(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelPr
 
 
 def _by_dynamo(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
-    """Scopes are in the nodes' metadata; the exporter's own passes are left out."""
+    """Scopes are in the nodes' metadata; the exporter's own passes are skipped."""
     import torch
 
     program = torch.onnx.export(
@@ -214,7 +206,7 @@ def _by_dynamo(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
 
 
 def example(spec: Stack) -> "tuple[Tensor, ...]":
-    """Return zeros in the shapes and types of the inputs, all that a trace needs."""
+    """Return zeros in the shapes and types of the inputs, which suffice for a trace."""
     import torch
 
     types = {"float32": torch.float32, "int64": torch.int64}
@@ -226,7 +218,7 @@ def example(spec: Stack) -> "tuple[Tensor, ...]":
 
 @contextmanager
 def _quiet_exporter() -> Iterator[None]:
-    """Silence torch's warnings about its exporter and traced shapes; nothing else."""
+    """Silence only torch's warnings about its exporter and traced shapes."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "You are using the legacy TorchScript")
         warnings.filterwarnings("ignore", category=DeprecationWarning, module="torch")
@@ -237,7 +229,7 @@ def _quiet_exporter() -> Iterator[None]:
 
 @contextmanager
 def _quiet_registry() -> Iterator[None]:
-    """Silence the dynamo exporter's wish for torchvision, which no stack here uses."""
+    """Silence the dynamo exporter's warning about torchvision, which no stack uses."""
     log = logging.getLogger("torch.onnx._internal.exporter._registration")
     level = log.level
     log.setLevel(logging.ERROR)

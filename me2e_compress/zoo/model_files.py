@@ -1,4 +1,4 @@
-"""Files of models, written all or nothing."""
+"""Write model files atomically."""
 
 import tempfile
 from pathlib import Path
@@ -8,14 +8,10 @@ from me2e_compress.errors import GraphError
 
 
 def write(path: Path, content: bytes) -> Path:
-    """Write a file, and its folder where there is none, and return the path.
-
-    Args:
-        path: The file; replaced in one step.
-        content: All of it.
+    """Write a file atomically, with its folder if needed, and return the path.
 
     Raises:
-        GraphError: It is a folder, its folder cannot be made, or the disk refuses.
+        GraphError: the path is a folder, or it or its folder cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Names of a checkpoint against those of a stack."""
+"""Match the names of a checkpoint with those of a stack."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,16 +22,15 @@ _NAMED = 3
 
 @dataclass(frozen=True)
 class Mismatch:
-    """What keeps a checkpoint from being a stack's; nothing, if all is empty.
+    """The differences between a checkpoint and a stack; false if there are none.
 
     Attributes:
-        wanted: How many tensors the stack has.
-        missing: Names, the original's.
-        unexpected: Names of the file.
-        other_shapes: Name, shape in the file, shape in the stack.
-        other_types: Name and element type, where it is not a floating-point one.
-        not_finite: Names of tensors that hold NaN, an infinity or what is one in
-            float32.
+        wanted: number of tensors that the stack has.
+        missing: names of the original.
+        unexpected: names in the file.
+        other_shapes: name, shape in the file, shape in the stack.
+        other_types: name and element type, where it is not a floating-point one.
+        not_finite: names of tensors with NaN, infinities, or overflows of float32.
     """
 
     wanted: int
@@ -42,11 +41,11 @@ class Mismatch:
     not_finite: Sequence[str]
 
     def __bool__(self) -> bool:
-        """Return whether there is anything."""
+        """Return whether there are differences."""
         return bool(self.line())
 
     def line(self) -> str:
-        """Return every kind of fault: how many, and the first names."""
+        """Return the number and first names of every kind of difference."""
         shapes = [
             f"{name} is {[*found]} in it, {[*own]} here"
             for name, found, own in self.other_shapes
@@ -68,13 +67,13 @@ def _first(names: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class NameMatch:
-    """Each tensor of a module beside the one of its published name.
+    """Pairs each tensor of a module with the one of its published name.
 
     Attributes:
-        module: On any device, the one without memory too.
-        names: What the original calls them.
-        state: Of the checkpoint.
-        ema: Take moving averages; buffers that have none are taken as they are.
+        module: on any device, including meta.
+        names: the original's names.
+        state: the checkpoint's tensors.
+        ema: take moving averages; buffers without one are taken as they are.
     """
 
     module: "nn.Module"
@@ -84,7 +83,7 @@ class NameMatch:
 
     @cached_property
     def wanted(self) -> "Mapping[str, tuple[str, Tensor]]":
-        """By published name: our name, and a tensor of the shape and type."""
+        """Our name and a tensor of the same shape and type, by published name."""
         return {
             self.names.published(name): (name, tensor)
             for name, tensor in self.module.state_dict().items()
@@ -92,7 +91,7 @@ class NameMatch:
         }
 
     def keys(self) -> Mapping[str, str]:
-        """Return which tensor of the file is read, by published name."""
+        """Return the name of the tensor to read from the file, by published name."""
         if not self.ema:
             return {name: name for name in self.wanted}
         parameters = dict(self.module.named_parameters())
@@ -112,18 +111,20 @@ class NameMatch:
         return [each for each in names if each.startswith(AVERAGE) and "." not in each]
 
     def unread(self) -> Sequence[str]:
-        """Return the names in the file that the graph leaves out."""
+        """Return the names in the file that the stack does not use."""
         return [name for name in self.state.tensors if self.names.is_unread(name)]
 
     def mismatch(self) -> Mismatch:
-        """Return what does not fit."""
+        """Return the differences."""
         tensors, keys = self.state.tensors, self.keys()
+        # Find the tensors of the file
         known = {*self.wanted, *self.averages(), *self.unread()}
         found = {
             keys[name]: (tensors[keys[name]], like)
             for name, (_, like) in self.wanted.items()
             if keys[name] in tensors
         }
+        # Compare shapes, then types and values
         shapes = [
             (key, tuple(tensor.shape), tuple(like.shape))
             for key, (tensor, like) in found.items()

@@ -1,4 +1,4 @@
-"""What parameters are called in published checkpoints, where we call them otherwise."""
+"""Map our parameter names to those of published checkpoints."""
 
 import re
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ class PublishedNames:
     """The names of a stack's original.
 
     Attributes:
-        renamed: Patterns in our names, and what the original has in their place; names
-            that none matches are the original's.
-        unread: Patterns of names of the original that our graph leaves out, since
-            driving does not read them.
-        computed: Patterns of our names for tables that no file holds, since they follow
+        renamed: patterns in our names and their replacements in the original; other
+            names are equal.
+        unread: patterns of the original's names that our graph omits, since driving
+            does not use them.
+        computed: patterns of our names for tables that no file holds, since they follow
             from the sizes.
     """
 
@@ -23,13 +23,13 @@ class PublishedNames:
     computed: Sequence[str] = ()
 
     def published(self, name: str) -> str:
-        """Return what the original calls our parameter or buffer."""
+        """Return the original's name of our parameter or buffer."""
         for ours, theirs in self.renamed:
             name = re.sub(ours, theirs, name)
         return name
 
     def is_unread(self, name: str) -> bool:
-        """Return whether a name of the original is one that we leave out."""
+        """Return whether our graph omits this name of the original."""
         return any(re.match(pattern, name) for pattern in self.unread)
 
     def is_computed(self, name: str) -> bool:

@@ -1,4 +1,4 @@
-"""Weights of a published checkpoint, name by name in a stack of ours."""
+"""Load the weights of a published checkpoint into a stack."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -20,11 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PublishedWeights:
-    """All tensors of a stack, as a checkpoint has them.
-
-    Attributes:
-        tensors: By our names; float32 but for counters.
-        record: What the file is, and what became of the rest of it.
+    """All tensors of a stack from a checkpoint, by our names; float32 except counters.
     """
 
     tensors: "Mapping[str, Tensor]"
@@ -33,7 +29,7 @@ class PublishedWeights:
     def fill(self, model: "nn.Module") -> None:
         """Set all parameters and buffers of a stack's module, in place.
 
-        What the module computed itself stays (`PublishedNames.computed`).
+        Tables that the module computed stay (`PublishedNames.computed`).
         """
         model.load_state_dict({**model.state_dict(), **self.tensors})
 
@@ -44,15 +40,15 @@ def published_weights(
     """Read the weights of a stack from a checkpoint of its original.
 
     Args:
-        stack: Name in `STACKS`.
-        path: As `read_state_dict` takes it.
-        heads: Which last layers; None is the default of the stack.
-        ema: Take the moving averages that mmcv's EMAHook keeps beside the parameters.
+        stack: a name in `STACKS`.
+        path: a file for `read_state_dict`.
+        heads: which last layers; None is the default of the stack.
+        ema: take the moving averages that mmcv's EMAHook stores with the parameters.
 
     Raises:
         MissingExtraError: torch is not installed, or safetensors for such a file.
-        GraphError: No such stack or heads, a file that cannot be read, or one that does
-            not hold exactly what the stack has.
+        GraphError: unknown stack or heads, an unreadable file, or one that does not
+            hold exactly the stack's tensors.
     """
     spec = _with_original(stack, heads)
     state = read_state_dict(path)
@@ -67,17 +63,9 @@ def published_weights(
 def mismatch(
     stack: str, path: Path, *, heads: str | None = None, ema: bool = False
 ) -> Mismatch:
-    """Compare a checkpoint with a stack, and return every name that does not fit.
+    """Return every name of a checkpoint that does not fit a stack.
 
-    Args:
-        stack: Name in `STACKS`.
-        path: As `read_state_dict` takes it.
-        heads: As in `published_weights`.
-        ema: As in `published_weights`.
-
-    Raises:
-        MissingExtraError: As `published_weights`.
-        GraphError: No such stack or heads, or a file that cannot be read.
+    For arguments and errors see `published_weights`.
     """
     spec = _with_original(stack, heads)
     return _match(spec, read_state_dict(path), ema).mismatch()
@@ -90,12 +78,14 @@ def taken(match: NameMatch) -> PublishedWeights:
     state, keys = match.state, match.keys()
     tensors: dict[str, Tensor] = {}
     converted: Counter[str] = Counter()
+    # A missing counter is 0
     for published, (name, like) in match.wanted.items():
         found = state.tensors.get(keys[published])
         tensors[name] = torch.zeros_like(like, device="cpu") if found is None else found
         if like.is_floating_point() and tensors[name].dtype != torch.float32:
             converted[str(tensors[name].dtype).removeprefix("torch.")] += 1
             tensors[name] = tensors[name].float()
+    # Record the file and what was not used
     record = WeightsRecord(
         file=state.path.name,
         sha256=state.sha256,
@@ -116,7 +106,7 @@ def _with_original(stack: str, heads: str | None) -> Stack:
 
 
 def _other_heads(stack: Stack, state: StateDict, ema: bool) -> str:
-    """Say which heads the tensors would fit, if any."""
+    """Return a hint which heads the tensors would fit, if any."""
     each = ((name, stack.with_heads(name)) for name in stack.heads)
     fits = [name for name, spec in each if not _match(spec, state, ema).mismatch()]
     return "".join(f"; it fits --heads {name}" for name in fits)

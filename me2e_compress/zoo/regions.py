@@ -1,7 +1,7 @@
-"""Which module of the stack the code that runs now belongs to.
+"""Mark which module of the stack the running code belongs to.
 
-The forward passes of the zoo say ``with region("motion"):`` around their parts. Outside
-of a recording this does nothing; `me2e_compress.zoo.truth` listens to it.
+The forward passes of the zoo wrap their parts in ``with region("motion"):``. This does
+nothing except in a recording: `tests.zoo.truth` listens to it.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,7 +15,7 @@ _listener: ContextVar[Listener | None] = ContextVar("region_listener", default=N
 
 @contextmanager
 def region(module: str) -> Iterator[None]:
-    """Mark what runs inside as part of a module; a no-op unless someone listens."""
+    """Mark the block as part of a module; a no-op unless someone listens."""
     listener = _listener.get()
     if listener is None:
         yield

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 BLOCKS = (3, 4, 6, 3)
-"""Of the four stages of ResNet-34 and of ResNet-50 (He et al. 2016, table 1)."""
+"""Blocks of the four stages of ResNet-34 and ResNet-50 (He et al. 2016, table 1)."""
 
 STEM = 64
 
 
 class BasicBlock(nn.Module):
-    """3x3 (strided), 3x3, and the shortcut."""
+    """3x3 (strided) and 3x3 convolutions, and the shortcut."""
 
     expansion = 1
 
@@ -34,7 +34,7 @@ class BasicBlock(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3 (strided), 1x1, and the shortcut."""
+    """1x1, 3x3 (strided) and 1x1 convolutions, and the shortcut."""
 
     expansion = 4
 
@@ -69,12 +69,10 @@ def _shortcut(channels: int, out: int, stride: int) -> nn.Module | None:
 
 
 class ResNet(nn.Module):
-    """Images to the feature maps of all stages.
+    """Maps images to the feature maps of all stages.
 
-    Args:
-        block: `BasicBlock` or `Bottleneck`.
-        blocks: Of each stage.
-        width: Channels of the stem; every stage doubles it.
+    ``blocks`` are counted per stage; ``width`` channels leave the stem, and every stage
+    doubles them.
     """
 
     def __init__(
@@ -111,7 +109,7 @@ class ResNet(nn.Module):
 
 
 class ResNet50(ResNet):
-    """Images to the C5 feature map."""
+    """Maps images to the C5 feature map."""
 
     def __init__(self, width: int = STEM) -> None:
         super().__init__(Bottleneck, BLOCKS, width)

@@ -12,18 +12,18 @@ from me2e_compress.zoo.model_files import write
 from me2e_compress.zoo.stacks import STACKS
 
 WEIGHTS = Path(__file__).with_name("weights")
-"""One ``NAME.onnx`` and ``NAME.json`` a model; in a checkout ``NAME.pt`` too."""
+"""One ``NAME.onnx`` and ``NAME.json`` per model; in a checkout ``NAME.pt`` too."""
 
 SHIPPED = tuple(stack.name for stack in STACKS.values() if stack.trained)
 """Names of the models."""
 
 
 class TrainingData(pydantic.BaseModel):
-    """What a model learned from.
+    """The training data of a model.
 
     Attributes:
-        seeds: of the generated routes; none of them is a route it is judged on.
-        frames: camera frames in all.
+        seeds: of the generated routes; none of them is an evaluation route.
+        frames: total number of camera frames.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -33,21 +33,20 @@ class TrainingData(pydantic.BaseModel):
 
 
 class ModelCard(pydantic.BaseModel):
-    """What is known of a shipped model; the files beside it must have its digests.
+    """The card of a shipped model; the model's files must have its digests.
 
     Attributes:
         sha256: of the ``.onnx``, lower-case hex.
         bytes: of the ``.onnx``.
-        checkpoint_sha256: of the ``.pt`` with the same weights in torch; None: there is
-            none.
-        parameters: trained numbers in it.
-        seed: of the initial weights and of everything drawn in training.
-        data: what it learned from.
-        command: how it was trained, in words, and the command that trains one such as
-            it.
-        hours: of training, on the machine that the page of ``command`` tells; None: not
+        checkpoint_sha256: of the ``.pt`` with the same weights in torch; None if there
+            is none.
+        parameters: number of trained parameters.
+        seed: of the initial weights and of all random choices in training.
+        data: the training data.
+        command: a description of the training, and a command that trains such a model.
+        hours: of training, on the machine that the page of ``command`` names; None: not
             measured.
-        scores: by name with the unit in it (``driving_score_percent``); None: not
+        scores: by name including the unit (``driving_score_percent``); None: not
             measured, as a whole or one by one.
     """
 
@@ -84,7 +83,7 @@ def card(name: str, folder: Path | None = None) -> ModelCard:
     """Return the card of a shipped model.
 
     Raises:
-        GraphError: no such model, or its card is missing or malformed.
+        GraphError: unknown model, or its card is missing or malformed.
     """
     if name not in SHIPPED:
         raise GraphError(f"no model {name!r} ships; there is {', '.join(SHIPPED)}")
@@ -92,32 +91,24 @@ def card(name: str, folder: Path | None = None) -> ModelCard:
 
 
 def shipped(name: str, folder: Path | None = None) -> Path:
-    """Return the file of a shipped model, once its digest matches its card.
+    """Return the file of a shipped model after checking its digest, once per process.
 
-    A process checks a file once.
-
-    Args:
-        name: one of `SHIPPED`.
-        folder: where models and cards lie; None for those of the package.
+    ``folder`` holds models and cards; None means those of the package.
 
     Raises:
-        GraphError: no such model, or its file or card is missing or altered.
+        GraphError: unknown model, or its file or card is missing or altered.
     """
     return _checked(name, folder or WEIGHTS)
 
 
 def checkpoint(name: str, folder: Path | None = None) -> Path:
-    """Return the weights of a shipped model as training goes on from them.
+    """Return the weights of a shipped model from which training can continue.
 
-    It is a file of `me2e_compress.training.checkpoint.Start`. The repository and the
-    source distribution hold it; the wheel does not.
-
-    Args:
-        name: one of `SHIPPED`.
-        folder: as in `shipped`.
+    It is a file of `driver.checkpoint.Start`. The repository and the source
+    distribution hold it; the wheel does not. ``folder`` is as in `shipped`.
 
     Raises:
-        GraphError: no such model, or its checkpoint or card is missing or altered.
+        GraphError: unknown model, or its checkpoint or card is missing or altered.
     """
     folder = folder or WEIGHTS
     expected = card(name, folder).checkpoint_sha256
@@ -133,17 +124,10 @@ def checkpoint(name: str, folder: Path | None = None) -> Path:
 
 
 def sample_frames(model: Path, folder: Path | None = None) -> Path | None:
-    """Find the recorded frames that come with the model that a file is a copy of.
+    """Return the folder of recorded frames of a shipped model, if a file is a copy of one.
 
-    They are two frames of a drive: enough to verify exact passes on what the model was
-    made to see, and none to calibrate on.
-
-    Args:
-        model: an ONNX file.
-        folder: as in `shipped`.
-
-    Returns:
-        A folder of frames; None where the file is no copy of a shipped model.
+    There are two frames of a drive: enough to verify exact passes on realistic input,
+    but not to calibrate. ``folder`` is as in `shipped`.
     """
     folder = folder or WEIGHTS
     for name in SHIPPED:
@@ -175,7 +159,7 @@ def _same(path: Path, expected: str) -> Path:
 
 
 def copy(name: str, target: Path, folder: Path | None = None) -> Path:
-    """Write a copy of a shipped model, replaced in one step, and return its path.
+    """Write a copy of a shipped model atomically, and return its path.
 
     Raises:
         GraphError: as `shipped`, or ``target`` is the shipped file itself or cannot be

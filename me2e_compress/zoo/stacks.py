@@ -1,4 +1,4 @@
-"""The stacks of the zoo: inputs, outputs and conventions, without their torch code."""
+"""The stacks of the zoo: inputs, outputs and conventions, without torch code."""
 
 import json
 from collections.abc import Mapping
@@ -12,12 +12,12 @@ Shape = tuple[int, ...]
 
 @dataclass(frozen=True)
 class ImageNorm:
-    """How pixels become the image input: (pixel - mean) / std, channel by channel.
+    """How pixels become the image input: (pixel - mean) / std, per channel.
 
     Attributes:
-        mean: In grey levels 0 to 255, in the order of `order`.
-        std: The same.
-        order: Channels of the model: red first or blue first.
+        mean: in grey levels 0 to 255, in the order of `order`.
+        std: like the mean.
+        order: channels of the model: red first or blue first.
     """
 
     mean: tuple[float, float, float]
@@ -31,7 +31,7 @@ IMAGENET = ImageNorm(
 """Statistics of ImageNet in grey levels, as torchvision and mmdetection have them."""
 
 CAFFE = ImageNorm(mean=(103.53, 116.28, 123.675), std=(1.0, 1.0, 1.0), order="bgr")
-"""The same means as Caffe's networks take them."""
+"""The same means in the form of Caffe's networks."""
 
 
 @dataclass(frozen=True)
@@ -39,22 +39,22 @@ class Stack:
     """Inputs, outputs and conventions of a stack.
 
     Attributes:
-        name: Its name on the command line.
-        inputs: Shapes by input name.
-        outputs: Names of the outputs, in order.
-        other_outputs: The same, of heads whose outputs are others.
-        recurrent: Output that answers each recurrent input.
-        plan: Name of the output that is the plan.
-        plan_deltas: The plan is metres a step, not positions.
-        plan_step_s: Seconds between its waypoints, where they are not six every 0.5 s.
-        heads: Names of the last layers to choose from, the default first, each with
-            the row of the plan that is driven without a command.
-        image: How the image input is normalised.
-        dtypes: Element type of the inputs that are not float32.
-        trained: The weights ship; else they are drawn from a seed.
-        sees: The six cameras one by one, or three of them as one wide image.
-        scale: Of the cameras' 1600 x 900 images.
-        straight_on: The command that follows the lane, of stacks that are told one.
+        name: its name on the command line.
+        inputs: shapes by input name.
+        outputs: names of the outputs, in order.
+        other_outputs: the same, of heads with other outputs.
+        recurrent: the output that feeds each recurrent input.
+        plan: name of the output that is the plan.
+        plan_deltas: whether the plan is metres per step, not positions.
+        plan_step_s: seconds between its waypoints, where they are not six every 0.5 s.
+        heads: names of the last layers to choose from, the default first, each with the
+            row of the plan that is driven without a command.
+        image: normalisation of the image input.
+        dtypes: element type of the inputs that are not float32.
+        trained: whether the weights ship; else they are drawn from a seed.
+        sees: the six cameras one by one, or three of them as one wide image.
+        scale: relative to the cameras' 1600 x 900 images.
+        straight_on: the command that follows the lane, for stacks with commands.
     """
 
     name: str
@@ -74,10 +74,10 @@ class Stack:
     straight_on: int = 0
 
     def with_heads(self, heads: str | None) -> "Stack":
-        """Return the stack with these heads alone; None is the default.
+        """Return the stack with only these heads; None is the default.
 
         Raises:
-            GraphError: There are no heads of that name.
+            GraphError: there are no heads of that name.
         """
         if heads is None:
             heads = next(iter(self.heads), None)
@@ -200,7 +200,7 @@ TCP = Stack(
 branch tcp/admlp, where it scores 39 actions. Outputs are named as there."""
 
 UNIAD_SLOTS = 249
-"""For tracks: with the 901 new queries of a frame 1150, the most that DL4AGX allows."""
+"""Slots for tracks: with the 901 new queries of a frame 1150, DL4AGX's maximum."""
 
 UNIAD_REMEMBERED: dict[str, Shape] = {
     "l2g_r_mat": (1, 3, 3),
@@ -216,7 +216,7 @@ UNIAD_REMEMBERED: dict[str, Shape] = {
     "track_mem_held": (UNIAD_SLOTS, 4),
     "max_obj_id": (1,),
 }
-"""What UniAD knows of the last frame, besides its bird's eye view."""
+"""UniAD's recurrent state, besides its bird's eye view."""
 
 UNIAD_COUNTS = ("obj_idxes", "disappear_time", "save_period", "max_obj_id")
 
@@ -282,11 +282,7 @@ STACKS: dict[str, Stack] = {
 
 
 def find(name: str) -> Stack:
-    """Return the stack of that name.
-
-    Raises:
-        GraphError: There is none.
-    """
+    """Return the stack of that name; an unknown name is a GraphError."""
     if name not in STACKS:
         raise GraphError(f"no stack {name!r} in the zoo: there are {', '.join(STACKS)}")
     return STACKS[name]

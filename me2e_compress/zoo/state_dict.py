@@ -1,4 +1,5 @@
-"""State dicts in files that other programs wrote: tensors by name, and no code run."""
+"""Read state dicts in files of other programs as tensors by name, without running code.
+"""
 
 import hashlib
 import importlib
@@ -24,11 +25,11 @@ WRAPPERS = ("state_dict", "model_state_dict", "model")
 Lightning."""
 
 PREFIXES = ("module.", "model.", "_orig_mod.")
-"""Put before names by DataParallel, by a Lightning module and by ``torch.compile``."""
+"""Prefixes of names from DataParallel, Lightning modules and ``torch.compile``."""
 
 EPOCHS = ("epoch",)
 ITERATIONS = ("iter", "iteration", "global_step")
-"""How mmcv and Lightning count, in ``meta`` or beside the tensors."""
+"""Keys of mmcv's and Lightning's counters, in ``meta`` or beside the tensors."""
 
 SAFETENSORS = ".safetensors"
 
@@ -44,8 +45,7 @@ _BROKEN = (
     struct.error,
     zipfile.BadZipFile,
 )
-"""What torch's reader raises, apart from its own refusal, of bytes that are no file of
-it."""
+"""What torch's reader raises, besides its own refusal, on foreign or broken files."""
 
 _NAMED = 5
 
@@ -55,11 +55,11 @@ class StateDict:
     """Tensors of a checkpoint.
 
     Attributes:
-        path: The file.
-        sha256: Of the file, lower-case hex.
-        tensors: By name, without the prefixes that wrappers put before it.
-        epoch: That the file states.
-        iteration: That the file states.
+        path: the file.
+        sha256: of the file, lower-case hex.
+        tensors: by name, without the prefixes of wrappers.
+        epoch: as stated in the file.
+        iteration: as stated in the file.
     """
 
     path: Path
@@ -70,16 +70,15 @@ class StateDict:
 
 
 def read_state_dict(path: Path) -> StateDict:
-    """Read the tensors of a checkpoint; whatever else is in it is not looked at.
+    """Read the tensors of a checkpoint and ignore everything else in it.
 
-    Args:
-        path: Of ``torch.save``, zipped or not, or ``.safetensors``. In it lie tensors
-            by name, or a dictionary that holds them under one of `WRAPPERS`.
+    ``path`` is a file of ``torch.save``, zipped or not, or ``.safetensors``, with
+    tensors by name, or with a dictionary of them under one of `WRAPPERS`.
 
     Raises:
         MissingExtraError: torch is not installed, or safetensors for such a file.
-        GraphError: The file cannot be read, is cut or broken, asks for code to be run,
-            or holds no tensors by name.
+        GraphError: the file cannot be read, is truncated or broken, would run code, or
+            holds no tensors by name.
     """
     if importlib.util.find_spec("torch") is None:
         raise MissingExtraError("torch", "zoo")
@@ -115,7 +114,8 @@ def _from_torch(path: Path) -> object:
 
 
 def _refusal(said: str) -> str:
-    """Say which function or class a file asks for, as torch's reader names it."""
+    """Return which function or class a file requests, from the message of torch's reader.
+    """
     asked = re.search(r"GLOBAL ([\w.]+)", said)
     if asked is None:
         return "neither a file of torch.save nor .safetensors"
@@ -140,7 +140,7 @@ def _from_safetensors(path: Path) -> object:
 
 
 def _tensors(whole: object) -> Mapping[Any, Any]:
-    """Return what lies under the wrapper's key, or all there is.
+    """Return the content under the wrapper's key, or everything.
 
     Raises:
         MalformedError: It holds no tensors by name, or under several keys.
@@ -171,7 +171,7 @@ def _is_tensor(name: object, value: object) -> bool:
 
 
 def _without_prefixes(tensors: "Mapping[str, Tensor]") -> "dict[str, Tensor]":
-    """Return the tensors by bare names.
+    """Return the tensors by bare names, which must be unique.
 
     Raises:
         MalformedError: Two become one.
@@ -188,7 +188,7 @@ def _without_prefixes(tensors: "Mapping[str, Tensor]") -> "dict[str, Tensor]":
 
 
 def _count(whole: object, keys: tuple[str, ...]) -> int | None:
-    """Return the first whole number under any of the keys, in ``meta`` or beside it."""
+    """Return the first integer under any of the keys, in ``meta`` or next to it."""
     if not isinstance(whole, Mapping):
         return None
     for place in (whole.get("meta"), whole):

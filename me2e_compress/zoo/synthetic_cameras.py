@@ -1,4 +1,5 @@
-"""Six pinhole cameras around a vehicle, and how they see boxes on a painted ground."""
+"""Six pinhole cameras around a vehicle, and how they render boxes on a painted ground.
+"""
 
 import math
 from collections.abc import Sequence
@@ -33,7 +34,7 @@ y forward, z up) and focal length and principal point in pixels of the full imag
 rounded from the calibration of nuScenes (Caesar et al. 2020), order of Bench2Drive."""
 
 LIDAR_HEIGHT_M = 1.84
-"""Of nuScenes' lidar above the ground."""
+"""Height of nuScenes' lidar above the ground."""
 
 NEAR_M = 0.3
 FAR_M = 1.0e6
@@ -45,13 +46,13 @@ SKY_HIGH = np.array([96.0, 148.0, 214.0], np.float32)
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A pinhole.
+    """A pinhole camera.
 
     Attributes:
         position: [3] metres, lidar frame.
         to_camera: [3, 3] lidar frame to camera (x right, y down, z forward).
-        intrinsics: [3, 3] pixels of the image.
-        hw: Pixels of the image, rows and columns.
+        intrinsics: [3, 3] in pixels of the image.
+        hw: pixels of the image, rows and columns.
     """
 
     position: Array
@@ -116,13 +117,10 @@ def render(
     boxes: Sequence[Cuboid],
     scale: float = SCALE,
 ) -> NDArray[np.uint8]:
-    """Draw what the six cameras see: [6, h, w, 3] RGB, 360 x 640 at the usual scale.
+    """Draw the images of the six cameras, [6, h, w, 3] RGB, 360 x 640 by default.
 
-    Args:
-        world: The ground.
-        ego: Where the vehicle stands in the world.
-        boxes: Everything that stands on the ground, in the world.
-        scale: Of the 1600 x 900 images.
+    ``boxes`` are everything on the ground, in world coordinates; ``scale`` is relative
+    to 1600 x 900 images.
     """
     cameras = rig(scale)
     images = np.empty((len(cameras), *cameras[0].hw, 3), np.uint8)
@@ -158,10 +156,11 @@ def _background(
 def _draw(
     box: Cuboid, ego: EgoPose, camera: Pinhole, rays: Array, colour: Array, depth: Array
 ) -> None:
-    """Cast the rays that may hit the box and paint where it is nearest."""
+    """Cast the rays that may hit the box, and paint the nearest hits."""
     window = _window(box, ego, camera)
     if window is None:
         return
+    # Rays in the frame of the box
     cos, sin = math.cos(ego.yaw - box.yaw), math.sin(ego.yaw - box.yaw)
     right, ahead = ego.to_lidar(box.x, box.y)
     start = camera.position - np.array([right, ahead, -LIDAR_HEIGHT_M], np.float32)
@@ -169,6 +168,7 @@ def _draw(
     origin, towards = turn.T @ start, rays[window] @ turn
     half = np.array([box.length / 2, box.width / 2, box.height / 2], np.float32)
     origin[2] -= half[2]
+    # Slab method: enter and leave per axis
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (-half - origin) / towards, (half - origin) / towards
     enter = np.minimum(one, other)
@@ -180,6 +180,7 @@ def _draw(
     hit &= (near < behind) | (behind == 0)
     if not hit.any():
         return
+    # Paint the side that was entered last
     axis = enter[hit].argmax(-1)
     at = origin + towards[hit] * near[hit][:, None]
     colour[window][hit] = box.paint(at, half, axis, turn.T @ SUN)

@@ -29,28 +29,26 @@ SENSOR_NOISE = 2.0
 def frames(
     spec: Stack, n: int, seed: int, scene_length: int = 8, first: int = 0
 ) -> Iterator[Frame]:
-    """Make frames one by one, keyed by input name, without the recurrent inputs.
+    """Yield frames one by one, keyed by input name, without the recurrent inputs.
 
-    Args:
-        spec: The stack.
-        n: Frames in all.
-        seed: Of everything.
-        scene_length: Frames a scene.
-        first: The frame to begin with, the first of a scene.
+    There are ``n`` frames in scenes of ``scene_length``; ``first`` is the frame to
+    begin with, the first of a scene.
 
     Raises:
-        FramesError: A count below 1.
+        FramesError: a count is below 1.
     """
     if n < 1 or scene_length < 1:
         raise FramesError(
             f"{n} frames in scenes of {scene_length}: both must be at least 1"
         )
+    # One world per scene
     cameras = rig(spec.scale)
     lidar2img = np.stack([camera.lidar2img() for camera in cameras])[None]
     for start in range(first, n, scene_length):
         scene = start // scene_length
         world = draw_world(np.random.default_rng([seed, scene]))
         for step in range(min(scene_length, n - start)):
+            # Each frame has its own noise, whatever was drawn before
             noise = np.random.default_rng([seed, scene, step + 1])
             seconds = step * FRAME_S
             boxes = world.boxes_at(seconds)
@@ -74,7 +72,7 @@ def frames(
 def _normalise(
     spec: Stack, seen: NDArray[np.uint8 | np.float32], noise: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Turn [n, h, w, 3] RGB pixels into [n, 3, H, W], zero-padded below."""
+    """Convert [n, h, w, 3] RGB pixels to [n, 3, H, W], zero-padded at the bottom."""
     grain = noise.normal(0, SENSOR_NOISE, seen.shape[:3])[..., None]
     pixels = np.clip(np.rint(seen + grain), 0, 255).astype(np.float32)
     mean = np.array(spec.image.mean, np.float32)
@@ -88,7 +86,7 @@ def _normalise(
 
 
 def _place_and_time(ego: EgoPose, seconds: float) -> Frame:
-    """Return where the lidar is, turned how (its axes as rows) and when."""
+    """Return position, orientation (its axes as rows) and time of the lidar."""
     cos, sin = math.cos(ego.yaw), math.sin(ego.yaw)
     axes = np.array([[sin, -cos, 0], [cos, sin, 0], [0, 0, 1]], np.float32)
     return {
@@ -124,7 +122,7 @@ TINT = 22.0
 
 
 def draw_world(rng: np.random.Generator) -> SyntheticWorld:
-    """Draw a road with 8 to 12 vehicles, parked ones, buildings, people and cones."""
+    """Draw a road with 8 to 12 vehicles, parked cars, buildings, people and cones."""
     bend = float(rng.uniform(-0.008, 0.008))
     speed_mps = float(rng.uniform(3, 10))
     boxes = [
@@ -152,13 +150,13 @@ def _place(bend: float, along: float, aside: float) -> tuple[float, float, float
 
 
 def _colour(rng: np.random.Generator, bounds: Range) -> tuple[float, float, float]:
-    """Draw a colour, mostly grey, as cars and houses are."""
+    """Draw a colour, mostly grey."""
     red, green, blue = np.clip(rng.uniform(*bounds) + rng.normal(0, TINT, 3), 0, 255)
     return float(red), float(green), float(blue)
 
 
 def _vehicle(rng: np.random.Generator, bend: float, ego_mps: float) -> Cuboid:
-    """Draw a vehicle that drives; in the ego's lane about as fast as the ego."""
+    """Draw a moving vehicle; in the ego's lane it is about as fast as the ego."""
     lane = int(rng.integers(0, LANES)) - LANES // 2
     ahead = lane != 0 or rng.random() < 0.7
     along = float(rng.uniform(9, 60) if ahead else rng.uniform(-50, -9))
@@ -197,7 +195,7 @@ def _building(rng: np.random.Generator, bend: float) -> Cuboid:
 
 
 def _small(rng: np.random.Generator, bend: float) -> Cuboid:
-    """Draw a pedestrian who walks along the pavement, or a cone."""
+    """Draw a pedestrian walking along the pavement, or a cone."""
     side = 1 if rng.random() < 0.5 else -1
     x, y, yaw = _place(bend, float(rng.uniform(-20, 40)), side * rng.uniform(6, 8.5))
     if rng.random() < 0.4:

@@ -1,4 +1,4 @@
-"""Three cameras as one wide image, and what TCP knows of its route."""
+"""Three cameras as one wide image, and TCP's route inputs."""
 
 from functools import cache
 
@@ -12,7 +12,7 @@ from me2e_compress.zoo.tcp.config import COMMANDS, SPEED_UNIT_MPS
 STRIP_HW = (256, 900)
 
 FRONT, FRONT_LEFT, FRONT_RIGHT = 0, 1, 2
-"""Of the six cameras."""
+"""Indices of cameras among the six."""
 
 CUTS = ((FRONT_LEFT, 0, 1400), (FRONT, 200, 1400), (FRONT_RIGHT, 200, 1600))
 """Camera, first and last column of 1600, from left to right (Bench2DriveZoo, branch
@@ -22,11 +22,11 @@ TARGET_S = 4.0
 """How far ahead of the vehicle its target point is."""
 
 FOLLOW_LANE = 3
-"""Of left, right, straight, follow, change left and change right."""
+"""Index among left, right, straight, follow, change left and change right."""
 
 
 def strip(seen: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Join three of six images, [6, 360, 640, 3] to [256, 900, 3] grey levels."""
+    """Join three of six images: [6, 360, 640, 3] to [256, 900, 3] grey levels."""
     parts = [seen[i, :, round(a * SCALE) : round(b * SCALE)] for i, a, b in CUTS]
     wide = np.concatenate(parts, axis=1).astype(np.float32)
     rows = interpolation(wide.shape[0], STRIP_HW[0])

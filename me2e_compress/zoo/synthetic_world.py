@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating[Any]]
 
 FRAME_S = 0.5
-"""Between frames: the rate of nuScenes' key frames, and of the plan's waypoints."""
+"""Seconds between frames, nuScenes' key frames and the plan's waypoints."""
 
 LANE_M = 3.5
 LANES = 3
@@ -28,7 +28,7 @@ GLASS = np.array([36.0, 44.0, 54.0], np.float32)
 
 @dataclass(frozen=True)
 class EgoPose:
-    """Metres and radians in the world; yaw 0 looks along x, left is positive."""
+    """A pose in metres and radians; yaw 0 looks along x, left is positive."""
 
     x: float
     y: float
@@ -51,10 +51,9 @@ class EgoPose:
 
 @dataclass(frozen=True)
 class Cuboid:
-    """A cuboid on the ground; metres, radians, metres a second, RGB.
+    """A cuboid on the ground, in metres, radians, metres per second and RGB.
 
-    Attributes:
-        window_m: Vertical period of a dark band; None paints none.
+    ``window_m`` is the vertical period of a dark band; None paints none.
     """
 
     x: float
@@ -68,7 +67,7 @@ class Cuboid:
     window_m: float | None = None
 
     def moved(self, seconds: float) -> "Cuboid":
-        """Return the same box later, straight on."""
+        """Return the box after driving straight on for some seconds."""
         way = self.speed_mps * seconds
         return replace(
             self,
@@ -91,16 +90,11 @@ class Cuboid:
     def paint(
         self, at: Array, half: Array, axis: NDArray[np.intp], sun: Array
     ) -> Array:
-        """Return the colour of points on the surface.
+        """Return the colours [N, 3], RGB, of points ``at`` [N, 3] on the surface.
 
-        Args:
-            at: [N, 3] in the frame of the box (length, width, height).
-            half: [3] half sizes.
-            axis: [N] which face pair was hit.
-            sun: [3] direction to the sun in the same frame.
-
-        Returns:
-            [N, 3] RGB.
+        Points, half sizes ``half`` [3] and the direction ``sun`` [3] are in the frame
+        of the box (length, width, height); ``axis`` [N] is the axis of the face that
+        was hit.
         """
         rows = np.arange(len(at))
         side = np.sign(at[rows, axis])
@@ -116,17 +110,17 @@ class Cuboid:
 
 @dataclass(frozen=True)
 class SyntheticWorld:
-    """The ground, and what was on it when the scene began.
+    """The ground, and the objects on it when the scene began.
 
     Attributes:
-        bend: Curvature of the road at the start, 1 / m; its middle is
-            y = bend * x ** 2 / 2.
-        crossing_m: Where a zebra crossing begins.
+        bend: curvature of the road at the start, 1 / m; its middle is y = bend * x ** 2
+            / 2.
+        crossing_m: where a zebra crossing begins.
         tile: [256, 256] brightness of the ground, repeated.
-        boxes: At time 0.
-        speed_mps: Of the ego vehicle at time 0.
-        accel_mps2: Of the ego vehicle.
-        lane_m: Offset of the ego vehicle from the middle of the road, left positive.
+        boxes: at time 0.
+        speed_mps: of the ego vehicle at time 0.
+        accel_mps2: of the ego vehicle.
+        lane_m: offset of the ego vehicle from the middle of the road, left positive.
     """
 
     bend: float
@@ -138,7 +132,7 @@ class SyntheticWorld:
     lane_m: float
 
     def ego(self, seconds: float) -> EgoPose:
-        """Return where the ego vehicle is; it keeps its lane."""
+        """Return the pose of the ego vehicle, which keeps its lane."""
         way = self.speed_mps * seconds + self.accel_mps2 * seconds**2 / 2
         return EgoPose(
             way,
@@ -152,17 +146,20 @@ class SyntheticWorld:
 
     def ground(self, x: Array, y: Array) -> Array:
         """Return the colour [..., 3] of the ground at world positions in metres."""
+        # Distance from the middle of the road
         aside = y - self.bend * x * x / 2
         away = np.abs(aside)
         edge = LANES * LANE_M / 2
         colour = np.where((away < edge + 2.5)[..., None], PAVEMENT, GRASS)
         road = away < edge
         colour[road] = ASPHALT
+        # Lines and the zebra crossing
         solid = np.abs(away - edge + 0.3) < LINE_M
         divider = np.abs(away - LANE_M / 2) < LINE_M / 2
         dashed = divider & (x % DASH_PERIOD_M < DASH_M)
         zebra = (np.abs(x - self.crossing_m) < 1.5) & (aside % 1.0 < 0.5) & road
         colour[solid | dashed | zebra] = PAINT
+        # Brightness varies by a repeated tile
         column = (x / TILE_CELL_M).astype(np.int32) % TILE
         row = (y / TILE_CELL_M).astype(np.int32) % TILE
         return colour + self.tile[row, column][..., None]

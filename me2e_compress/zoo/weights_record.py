@@ -1,4 +1,4 @@
-"""Which checkpoint a graph was made of."""
+"""Record which checkpoint a graph was made from."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -10,22 +10,22 @@ from me2e_compress.documents import MalformedError, from_json
 from me2e_compress.zoo.stacks import STACKS
 
 RECORD = "me2e.weights"
-"""Key of the metadata that says which checkpoint a graph was made of."""
+"""Metadata key of the checkpoint that a graph was made from."""
 
 
 @dataclass(frozen=True)
 class WeightsRecord:
-    """What is known of the weights in a graph, and what became of the rest of a file.
+    """The checkpoint of a graph's weights, and what was not used of it.
 
     Attributes:
-        file: Name of the checkpoint.
-        sha256: Of it, lower-case hex.
-        epoch: That it states.
-        iteration: That it states.
-        averaged: Its moving averages were taken.
-        converted: How many tensors became float32, by the type they had.
-        unread: Names of tensors left out, since driving does not read them.
-        averages: How many moving averages were left out.
+        file: name of the checkpoint.
+        sha256: of the file, lower-case hex.
+        epoch: as stated in the file.
+        iteration: as stated in the file.
+        averaged: whether its moving averages were taken.
+        converted: number of tensors converted to float32, by their old type.
+        unread: names of omitted tensors, which driving does not use.
+        averages: number of moving averages that were not used.
     """
 
     file: str
@@ -43,7 +43,7 @@ class WeightsRecord:
         return {RECORD: json.dumps({key: getattr(self, key) for key in keys})}
 
     def lines(self) -> tuple[str, ...]:
-        """Return what there is to say, a line each."""
+        """Return the lines of a report."""
         counts = {"epoch": self.epoch, "iteration": self.iteration}
         stated = [f"{key} {n}" for key, n in counts.items() if n is not None]
         said = [", ".join([f"weights: {self.file}", *stated, f"sha256 {self.sha256}"])]
@@ -61,12 +61,9 @@ class WeightsRecord:
 
 
 def named_weights(metadata: Mapping[str, str]) -> str:
-    """Return the line that names the checkpoint of a graph; empty if nothing is known.
+    """Return the line that names the checkpoint of a graph; empty if unknown.
 
-    A stack that was exported without one has random weights.
-
-    Args:
-        metadata: Of the graph, by key.
+    A stack exported without a checkpoint has random weights.
     """
     text = metadata.get(RECORD)
     if text is None:

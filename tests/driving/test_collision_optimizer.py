@@ -119,6 +119,16 @@ def test_a_stage_that_does_not_fit_is_refused_before_anything_drives(
         with_stage(driver, stage)
 
 
+def test_a_stage_that_answers_no_host_work_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(CollisionOptimizer, "work", lambda self, plan, outputs: plan)
+    model = straight_on(tmp_path / "m.onnx")
+
+    with pytest.raises(EvaluationError, match="work returned ndarray: it must be a Ho"):
+        OnnxDriver(model, host_stage="collision-optimizer").open()
+
+
 def test_a_host_stage_is_part_of_what_identifies_a_driver(tmp_path: Path) -> None:
     model = straight_on(tmp_path / "m.onnx")
     plain = OnnxDriver(model).fingerprint()

@@ -1,4 +1,6 @@
+from collections.abc import Callable
 from fractions import Fraction
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -12,6 +14,7 @@ from me2e_compress.driving.realtime import (
     delayed_frames,
     skipped_decisions,
 )
+from me2e_compress.errors import EvaluationError
 
 latencies = st.lists(st.integers(0, 600_000), min_size=1, max_size=12)
 steps = st.sampled_from([50_000, 25_000, 10_000])
@@ -144,3 +147,12 @@ def test_without_latency_both_models_act_at_once() -> None:
         clock = control_clock(model, -1, 50_000)
         clock.decide(0, 0)
         assert clock.advance() == 0
+
+
+@pytest.mark.parametrize("charged", [50.5, -3, float("nan")])
+@pytest.mark.parametrize("count", [skipped_decisions, delayed_frames])
+def test_what_is_no_whole_microseconds_is_refused(
+    count: Callable[[Any], int], charged: object
+) -> None:
+    with pytest.raises(EvaluationError, match="must be whole microseconds, 0 or more"):
+        count(charged)

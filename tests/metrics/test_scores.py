@@ -1,12 +1,17 @@
+import dataclasses
 import math
+from pathlib import Path
 
 import pytest
 
 from me2e_compress.metrics.abilities import ABILITIES
+from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.metrics.scores import score
-from me2e_compress.workflows.score import scores_table
+from me2e_compress.workflows.evaluate_result import EvaluateResult
+from me2e_compress.workflows.result import Result
+from me2e_compress.workflows.score import ScoreResult, scores_table
 from tests.metrics.drives import cruise, drive, infraction
 
 CRASH = infraction(InfractionKind.COLLISION_VEHICLE)
@@ -38,6 +43,7 @@ def test_a_partial_set_is_said_so_and_never_divided_by_220() -> None:
         "driven": 5,
         "expected": 220,
         "partial": True,
+        "failed": 0,
     }
     assert not score(SET, expected=5).partial
 
@@ -96,3 +102,28 @@ def test_the_column_of_units_holds_units_and_the_note_the_reasons() -> None:
     assert "Emergency_Brake, Give_Way, Traffic_Signs (no such route was driven)" in (
         table.note
     )
+
+
+def test_a_failure_that_ends_a_route_is_said() -> None:
+    broken = dataclasses.replace(
+        drive(ending=Ending.POLICY_FAILED, route="r2"), failure="ValueError: no"
+    )
+
+    found = score((drive(), broken))
+
+    assert found.failures == {"r2": "ValueError: no"}
+    assert found.failed.startswith("1 of 2 routes ended because the policy or the")
+    assert found.failed.endswith("failed: ValueError: no (r2)")
+    assert score((drive(),)).failed == ""
+
+
+@pytest.mark.parametrize("kind", [EvaluateResult, ScoreResult])
+def test_both_commands_warn_of_failures(kind: type[Result]) -> None:
+    scores = score((drive(ending=Ending.SIMULATOR_FAILED),))
+    if kind is EvaluateResult:
+        found: Result = EvaluateResult("mine", Path("out"), scores)
+    else:
+        found = ScoreResult({"out": scores})
+
+    assert found.status == "warning"
+    assert "simulator failed (r1)" in found.alerts()[0]

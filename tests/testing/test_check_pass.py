@@ -54,6 +54,24 @@ class DropsOneNegation(Pass):
         return PassResult(model, 0)
 
 
+@dataclass(frozen=True)
+class LeavesWhatIsUnread(Pass):
+    """Bypass two negations, and leave both behind.
+
+    Given:   x -> Neg -> Neg -> Neg
+    Result:  x -> Neg
+    """
+
+    name: ClassVar[str] = "leaves-what-is-unread"
+    exact: ClassVar[bool] = True
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        first, second, *_ = model.graph
+        assert first.inputs[0] is not None
+        second.outputs[0].replace_all_uses_with(first.inputs[0])
+        return PassResult(model, 1)
+
+
 NEGATIONS = """
 <ir_version: 9, opset_import: ["" : 17]>
 m (float[1,4] x) => (float[1,4] y) {
@@ -68,6 +86,14 @@ m (float[1,4] x) => (float[1,4] y) {
 def test_a_pass_that_is_not_idempotent_is_caught(context: Context) -> None:
     with pytest.raises(VerificationError, match="not idempotent"):
         check_pass(DropsOneNegation(), ir.from_onnx_text(NEGATIONS), context)
+
+
+def test_a_second_run_that_claims_and_changes_nothing_is_explained(
+    context: Context,
+) -> None:
+    words = r"on its second run, .* claims 1 changes but made none; .*remove_dead"
+    with pytest.raises(VerificationError, match=words):
+        check_pass(LeavesWhatIsUnread(), ir.from_onnx_text(NEGATIONS), context)
 
 
 @pytest.mark.parametrize(

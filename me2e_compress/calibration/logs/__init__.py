@@ -1,6 +1,6 @@
-"""Driving that somebody recorded: data sets that frames are made from.
+"""Recorded driving: data sets from which frames are made.
 
-To add a data set: write its class, then add it to this table.
+To add a data set, write its class, then add it to this table.
 """
 
 from me2e_compress.calibration.logs.base import Agent, DriveLog, LogMoment, LogScene

@@ -1,8 +1,9 @@
-"""What a driving log tells of a moment, whatever its files look like.
+"""The common interface of driving logs.
 
-Frames: *lidar* is x right, y forward, z up at the roof lidar (nuScenes, UniAD, VAD);
-*ego* is x forward, y left, z up on the ground under the centre of the vehicle; the
-*world* is right-handed. A matrix ``a_to_b`` [4, 4] takes (x, y, z, 1) of a to b.
+Coordinate frames: *lidar* is x right, y forward, z up at the roof lidar (nuScenes,
+UniAD, VAD); *ego* is x forward, y left, z up on the ground under the centre of the
+vehicle; the *world* is right-handed. A matrix ``a_to_b`` [4, 4] maps (x, y, z, 1) of a
+to b.
 """
 
 from abc import ABC, abstractmethod
@@ -26,21 +27,16 @@ CAMERAS = (
     "CAM_BACK_LEFT",
     "CAM_BACK_RIGHT",
 )
-"""In the order of Bench2Drive's models."""
+"""Cameras in the order of Bench2Drive's models."""
 
 CAN_BUS_SIZE = 18
 
 
 @dataclass(frozen=True)
 class Agent:
-    """A road user, a box on the ground of the world; metres, radians.
+    """A road user as a box on the ground of the world; metres, radians.
 
-    Attributes:
-        x: of its centre.
-        y: the same.
-        heading: counter-clockwise from the x axis.
-        length: along its heading.
-        width: across.
+    ``heading`` is counter-clockwise from the x axis, along the length.
     """
 
     x: float
@@ -52,22 +48,22 @@ class Agent:
 
 @dataclass(frozen=True, eq=False)
 class LogMoment:
-    """What was recorded at one moment.
+    """The recorded data of one moment.
 
     Attributes:
         time_us: microseconds since any fixed time.
         pictures: the file of each camera.
-        lidar_to_image: of each camera [4, 4]: lidar metres to (u * depth, v * depth,
+        lidar_to_image: [4, 4] of each camera: lidar metres to (u * depth, v * depth,
             depth, 1), pixels of the whole picture.
         lidar_to_world: [4, 4].
         lidar_to_ego: [4, 4].
-        l2g_rows: whether the data set's own models are fed the rotation of lidar to
+        l2g_rows: whether the data set's own models take the rotation of lidar to
             world for rows (p @ r), which is its transpose.
-        can_bus: [18] as the data set's own models are fed it, but [0:3] is the
-            position and [17] the heading in degrees, not their changes.
-        agents: the road users; None where the log does not tell.
-        command: where the route goes next, counted as the data set's models do; None
-            where the log does not tell.
+        can_bus: [18] as the data set's own models take it, but [0:3] is the position
+            and [17] the heading in degrees, not their changes.
+        agents: the road users; None where the log has none.
+        command: the route's next command, numbered as in the data set's models; None
+            where the log has none.
     """
 
     time_us: int
@@ -82,7 +78,7 @@ class LogMoment:
 
 
 LogScene: TypeAlias = Sequence[LogMoment]
-"""Moments in order; what is not asked for need not be read."""
+"""Moments in order, read lazily."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,18 +86,18 @@ class DriveLog(ABC):
     """A data set of recorded driving.
 
     Attributes:
-        scenes: which, by name; none means all.
-        cameras: which, in the order of the image input; none means all six, in the
+        scenes: names of the scenes; empty means all.
+        cameras: cameras in the order of the image input; empty means all six, in the
             order of the models that are trained on it.
         every: takes every n-th moment.
         size: rows and columns of the image input, where the model leaves them open.
         width: columns of the image input that a picture takes, the others are zeros;
-            None as its stack has it, else all.
+            None takes the stack's value, else all.
     """
 
     name: ClassVar[str]
     half_second: ClassVar[int]
-    """Moments in half a second."""
+    """Number of moments in half a second."""
     ego_size: ClassVar[tuple[float, float]]
     """Length and width of the ego vehicle, metres."""
 
@@ -112,7 +108,6 @@ class DriveLog(ABC):
     width: int | None = None
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if self.every < 1:
             raise ValueError(f"every {self.every}: must be at least 1")
         if self.width is not None and self.width < 1:
@@ -122,7 +117,7 @@ class DriveLog(ABC):
 
     @abstractmethod
     def names(self) -> Sequence[str]:
-        """List the scenes that there are, in order.
+        """List the scenes in order.
 
         Raises:
             FramesError: it is no such data set; the message names what is missing.
@@ -133,22 +128,18 @@ class DriveLog(ABC):
         """Return the moments of a scene.
 
         Raises:
-            FramesError: the first thing of it that is missing or malformed.
+            FramesError: something of it is missing or malformed.
         """
 
     @abstractmethod
     def command_of(self, right_m: float) -> int:
         """Return the command of a route that ends so far to the right in 3 s.
 
-        Asked where `LogMoment.command` is None.
+        It is called where `LogMoment.command` is None.
         """
 
     def chosen(self) -> tuple[str, ...]:
-        """List the scenes that are asked for.
-
-        Raises:
-            FramesError: one of them is not there.
-        """
+        """List the requested scenes; FramesError if one is missing."""
         there = tuple(self.names())
         for name in self.scenes:
             if name not in there:
@@ -157,17 +148,17 @@ class DriveLog(ABC):
         return self.scenes or there
 
     def as_contract(self) -> Self:
-        """Return it with CAN bus and commands as the policy contract has them."""
+        """Return the log with CAN bus and commands as in the policy contract."""
         return self
 
     @property
     def all_cameras(self) -> tuple[str, ...]:
-        """Name all cameras, in the order of the models that are trained on it."""
+        """All cameras, in the order of the models that are trained on it."""
         return CAMERAS
 
     @property
     def seen(self) -> tuple[str, ...]:
-        """Name the cameras in their order."""
+        """The chosen cameras, in their order."""
         return self.cameras or self.all_cameras
 
 
@@ -175,7 +166,7 @@ def pose(rotation: Sequence[float], translation: Sequence[float], what: str) -> 
     """Return the [4, 4] of a quaternion w, x, y, z and a translation.
 
     Raises:
-        FramesError: one of the numbers is not finite, or the quaternion is zero.
+        FramesError: a number is not finite, or the quaternion is zero.
     """
     w, x, y, z = found = np.array(rotation, np.float64)
     size = float(found @ found)
@@ -193,22 +184,14 @@ def pose(rotation: Sequence[float], translation: Sequence[float], what: str) -> 
 
 
 def intrinsics(matrix: object, what: str) -> Floats:
-    """Return the [4, 4] of a [3, 3] camera matrix.
-
-    Raises:
-        FramesError: it has another shape, or is not finite.
-    """
+    """Return the [4, 4] of a [3, 3] camera matrix."""
     out = np.eye(4)
     out[:3, :3] = matrix_of(matrix, (3, 3), what)
     return out
 
 
 def matrix_of(value: object, shape: tuple[int, ...], what: str) -> Floats:
-    """Return an array of numbers that a file holds.
-
-    Raises:
-        FramesError: it has another shape, or is not finite.
-    """
+    """Convert a file's value to an array of this shape, with finite numbers."""
     try:
         found = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -221,5 +204,5 @@ def matrix_of(value: object, shape: tuple[int, ...], what: str) -> Floats:
 
 
 def heading_of(a_to_b: Floats) -> float:
-    """Return where the y axis of lidar points in b, radians from its x axis."""
+    """Return the direction of lidar's y axis in b, radians from the x axis of b."""
     return float(np.arctan2(a_to_b[1, 1], a_to_b[0, 1]))

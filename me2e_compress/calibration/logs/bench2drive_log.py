@@ -1,7 +1,7 @@
 """Bench2Drive (Jia et al. 2024): clips of CARLA at 10 Hz, six cameras, boxes.
 
-Its files are of CARLA's left-handed world (x forward, y right); what leaves here is
-right-handed, with the lidar turned to x right, y forward, as its UniAD and VAD take it.
+Its files use CARLA's left-handed world (x forward, y right); the moments here are
+right-handed, with the lidar turned to x right, y forward, as its UniAD and VAD do.
 """
 
 import gzip
@@ -28,14 +28,14 @@ from me2e_compress.calibration.logs.base import (
 from me2e_compress.errors import FramesError
 
 ROAD_USERS = ("vehicle", "walker")
-"""Classes of boxes that a plan collides with."""
+"""Classes of boxes that a plan may collide with."""
 STOREY_M = 10.0
-"""Boxes so far above or below the ego are on another road (Bench2DriveZoo)."""
+"""Boxes this far above or below the ego are on another road (Bench2DriveZoo)."""
 PERIOD_US = 100_000
 DEEPEST = 3
-"""Folders between the root and ``anno``, at most."""
+"""Most folders between the root and ``anno``."""
 LARGEST_BYTES = 64_000_000
-"""Of an annotation, unpacked; one has about 1 MB."""
+"""Most bytes of an unpacked annotation; one has about 1 MB."""
 
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 """Left-handed to right-handed, and back."""
@@ -51,12 +51,12 @@ class Bench2DriveLog(DriveLog):
 
     Attributes:
         root: the folder that holds the clips, or is one.
-        scenes: clips by their folder below the root; none means all.
-        cameras: in the order of the image input; none means front first.
-        every: takes every n-th of 10 pictures a second; 5 is what UniAD and VAD see.
+        scenes: clips by their folder below the root; empty means all.
+        cameras: in the order of the image input; empty means front first.
+        every: takes every n-th of 10 pictures a second; UniAD and VAD take 5.
         size: rows and columns of the image input, where the model leaves them open.
         width: columns of the image input that a picture takes, the others are zeros;
-            None as its stack has it, else all.
+            None takes the stack's value, else all.
     """
 
     name: ClassVar[str] = "bench2drive"
@@ -82,16 +82,16 @@ class Bench2DriveLog(DriveLog):
         return found
 
     def scene(self, name: str) -> Sequence[LogMoment]:
-        """Return the moments of a clip, read when they are asked for."""
+        """Return the moments of a clip, which are read lazily."""
         return _Clip(self.root / name, self.seen)
 
     def command_of(self, right_m: float) -> int:
-        """Return follow the lane: every moment has a command of its own."""
+        """Return "follow the lane"; unused, since every moment has its own command."""
         return 3
 
 
 class _Clip(Sequence[LogMoment]):
-    """A clip, whose annotations are read when they are asked for, each once."""
+    """A clip whose annotations are read lazily, each once."""
 
     def __init__(self, folder: Path, cameras: Sequence[str]) -> None:
         self.folder, self.cameras = folder, cameras
@@ -130,8 +130,10 @@ class _Clip(Sequence[LogMoment]):
         sensors = about["sensors"]
         world_to_lidar = _matrix(sensors["LIDAR_TOP"], "world2lidar", path)
         lidar_to_ego = _matrix(sensors["LIDAR_TOP"], "lidar2ego", path)
+        # Turn the left-handed matrices to right-handed ones.
         lidar_to_ego = _MIRROR @ lidar_to_ego @ _SWAP
         lidar_to_world = _inverse(_SWAP @ world_to_lidar @ _MIRROR)
+        # Project lidar points into each camera.
         to_image, pictures = dict[str, Floats](), dict[str, Path]()
         for camera in self.cameras:
             if camera not in sensors:
@@ -179,7 +181,7 @@ def _matrix(sensor: Mapping[str, Any], key: str, path: Path) -> Floats:
 
 
 def _can_bus(about: Mapping[str, Any], lidar_to_world: Floats, path: Path) -> Floats:
-    """Fill it as Bench2DriveZoo's UniAD and VAD do."""
+    """Fill the CAN bus as Bench2DriveZoo's UniAD and VAD do."""
     heading = heading_of(lidar_to_world)
     forward, left, up = matrix_of(about["acceleration"], (3,), f"{path}: acceleration")
     rates = matrix_of(about["angular_velocity"], (3,), f"{path}: angular_velocity")
@@ -195,7 +197,7 @@ def _can_bus(about: Mapping[str, Any], lidar_to_world: Floats, path: Path) -> Fl
 
 
 def _command(near: object, path: Path) -> int:
-    """Count from 0; what CARLA calls void (-1) is to follow the lane."""
+    """Return the command from 0; CARLA's void (-1) means to follow the lane."""
     if not isinstance(near, int) or near > 6:
         raise FramesError(f"{path}: command_near {near!r} is none of -1, 1 to 6")
     return (near if near > 0 else 4) - 1

@@ -1,4 +1,4 @@
-"""Ground truth of a frame: what the moments after it tell."""
+"""Ground truth of a frame, from the moments after it."""
 
 import math
 from collections.abc import Sequence
@@ -22,19 +22,15 @@ from me2e_compress.runtime.recorded_future import (
 )
 
 TOLERANCE_S = 0.25
-"""A moment counts as that of a step if it is at most half a step off."""
+"""Largest difference, half a step, between a moment's time and that of its step."""
 
 
 def recorded_future(
     log: DriveLog, scene: LogScene, at: int, lidar_to_ground: Floats
 ) -> RecordedFuture:
-    """Return what happened in the three seconds after a moment.
+    """Return the recorded three seconds after moment ``at`` of a scene.
 
-    Args:
-        log: whose the scene is.
-        scene: all of its moments.
-        at: which one.
-        lidar_to_ground: [4, 4] to the ground frame of the model's plan.
+    ``lidar_to_ground`` [4, 4] leads to the ground frame of the model's plan.
     """
     now = scene[at]
     later = [_later(scene, at, step, log.half_second) for step in range(1, STEPS + 1)]
@@ -55,10 +51,10 @@ def recorded_future(
 
 
 def command_at(log: DriveLog, scene: LogScene, at: int) -> int:
-    """Return the recorded command, or else what the vehicle went on to do.
+    """Return the recorded command, or one derived from the vehicle's later path.
 
-    UniAD and VAD: how far to the right of the lidar it was at the last moment of the
-    next three seconds.
+    As in UniAD and VAD, that depends on how far to the right of the lidar the vehicle
+    is at the last known moment of the next three seconds.
     """
     now = scene[at]
     if now.command is not None:
@@ -70,7 +66,7 @@ def command_at(log: DriveLog, scene: LogScene, at: int) -> int:
 
 
 def _later(scene: LogScene, at: int, step: int, half_second: int) -> LogMoment | None:
-    """Return the moment so many half seconds later; None where the log has none."""
+    """Return the moment ``step`` half seconds later; None where the log has none."""
     index = at + step * half_second
     if index >= len(scene):
         return None

@@ -1,4 +1,4 @@
-"""Frames of a model from a driving log."""
+"""Build the frames of a model from a driving log."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -23,17 +23,12 @@ MADE = (
     "l2g_r_mat",
     "l2g_t",
 )
-"""Inputs that a log gives."""
+"""Inputs that can be made from a log."""
 
 
 @dataclass(frozen=True)
 class InputForm:
-    """What an input takes.
-
-    Attributes:
-        shape: of it; None where a side is open.
-        dtype: of its elements.
-    """
+    """Shape and type of an input; a side of None is open."""
 
     shape: tuple[int | None, ...]
     dtype: np.dtype[Any]
@@ -41,13 +36,14 @@ class InputForm:
 
 @dataclass(frozen=True)
 class LoggedInputs:
-    """How a model is fed from a log.
+    """How the inputs of a model are made from a log.
 
     Attributes:
-        forms: of the inputs that are to be made, by name; recurrent ones are not.
+        forms: shape and type of the inputs to make, by name; recurrent ones are left
+            out.
         image: normalisation and size of the input img; None without one.
         forward_left: whether the model's ground frame is the ego's (x forward, y left)
-            and not the lidar's (x right, y forward).
+            instead of the lidar's (x right, y forward).
         width: columns of the image that a picture takes; None means all.
     """
 
@@ -60,7 +56,7 @@ class LoggedInputs:
         """Check that a log can feed the model.
 
         Raises:
-            FramesError: it takes what no log gives, or another number of cameras.
+            FramesError: an input cannot be made, or the number of cameras differs.
         """
         for name in self.forms:
             if name not in MADE:
@@ -68,6 +64,7 @@ class LoggedInputs:
                     f"input {name} is not made from a log; there are {', '.join(MADE)}"
                     ", and what an adapter makes (--adapter)"
                 )
+        # The image must have room for the pictures of all cameras.
         image = self.forms.get("img")
         if image is None or self.image is None:
             return
@@ -88,35 +85,35 @@ class LoggedInputs:
             )
 
     def ground(self, now: LogMoment) -> Floats:
-        """Return [4, 4] of lidar to the model's ground frame."""
+        """Return [4, 4] from lidar to the model's ground frame."""
         return now.lidar_to_ego if self.forward_left else np.eye(4)
 
     def arrays(
         self, log: DriveLog, scene: LogScene, at: int, before: int | None
     ) -> dict[str, Array]:
-        """Return what the model is fed at a moment."""
+        """Return the model's inputs at a moment."""
         return _arrays(log, self, scene, at, before)
 
     def columns(self, log: DriveLog, image: PixelInput) -> int:
-        """Return how many columns of the image a picture takes."""
+        """Return the columns of the image that a picture takes."""
         return log.width or self.width or image.columns
 
 
 class LogFeeder(Protocol):
-    """Lays the moments of a log out as the inputs of a model."""
+    """Builds the inputs of a model from the moments of a log."""
 
     def check(self, log: DriveLog) -> None:
         """Check that a log can feed the model."""
         ...
 
     def ground(self, now: LogMoment) -> Floats | None:
-        """Return [4, 4] of lidar to the frame of its plan; None tells no future."""
+        """Return [4, 4] from lidar to the plan's frame; None records no future."""
         ...
 
     def arrays(
         self, log: DriveLog, scene: LogScene, at: int, before: int | None
     ) -> dict[str, Array]:
-        """Return what the model is fed at a moment; ``before`` None begins a scene."""
+        """Return the model's inputs at a moment; ``before`` None begins a scene."""
         ...
 
 
@@ -129,28 +126,25 @@ def log_frames(
     done: int = 0,
     first: int = 0,
 ) -> Iterator[Frame]:
-    """Read frames of a model off a log, one after the other, images as bytes.
+    """Yield frames of a model from a log in order, with images as bytes.
 
     Args:
         log: the data set.
-        model: how it is fed.
-        count: frames at most, in all.
-        scene_length: frames a scene at most; None takes all.
-        done: frames that are there already, in whole scenes.
-        first: place of the scene to begin with.
-
-    Yields:
-        Frames keyed by input name, with what happened next.
+        model: builds the inputs.
+        count: most frames in all.
+        scene_length: most frames of a scene; None takes all.
+        done: frames that exist already, in whole scenes.
+        first: number of the scene to begin with.
 
     Raises:
-        FramesError: the first thing that is missing or malformed, by its name; or a
-            count below 1.
+        FramesError: something is missing or malformed, or a count is below 1.
     """
     if count < 1 or (scene_length is not None and scene_length < 1):
         raise FramesError(
             f"{count} frames in scenes of {scene_length}: both must be at least 1"
         )
     model.check(log)
+    # Take every n-th moment of each scene until there are enough.
     for place, name in list(enumerate(log.chosen()))[first:]:
         scene = log.scene(name)
         chosen = range(0, len(scene), log.every)[
@@ -176,6 +170,7 @@ def _arrays(
     back = np.linalg.inv(model.ground(now))
     to_world = now.lidar_to_world @ back
     turn = to_world[:3, :3]
+    # All inputs are relative to the model's ground frame.
     made: dict[str, Array] = {
         "can_bus": changes(now, None if before is None else scene[before]),
         "command": np.asarray(command_at(log, scene, at)),
@@ -183,6 +178,7 @@ def _arrays(
         "l2g_r_mat": turn.T if now.l2g_rows else turn,
         "l2g_t": to_world[:3, 3],
     }
+    # Projections follow the scaling and cropping of pictures.
     projections = [now.lidar_to_image[camera] @ back for camera in log.seen]
     if model.image is not None:
         columns = model.columns(log, model.image)
@@ -203,9 +199,9 @@ def _arrays(
 
 
 def changes(now: LogMoment, before: LogMoment | None) -> Floats:
-    """Turn position and heading into what they changed by since the frame before.
+    """Return the CAN bus with changes of position and heading since the last frame.
 
-    As UniAD and VAD do between the frames that they are shown; zero at the first.
+    UniAD and VAD do the same between their frames; the changes are zero at the first.
     """
     bus = now.can_bus.copy()
     if before is None:

@@ -23,9 +23,9 @@ from me2e_compress.errors import FramesError
 
 LIDAR = "LIDAR_TOP"
 CENTRE_M = 0.5
-"""Of the vehicle, ahead of its lidar: UniAD's and VAD's planning metric."""
+"""Distance of the vehicle's centre ahead of its lidar: UniAD's and VAD's metric."""
 TURN_M = 2.0
-"""To the side in 3 s, from which on the command is a turn: UniAD and VAD."""
+"""Sideways distance in 3 s from which the command is a turn: UniAD and VAD."""
 CONVERTED = (
     "CAM_FRONT",
     "CAM_FRONT_RIGHT",
@@ -34,31 +34,32 @@ CONVERTED = (
     "CAM_BACK_LEFT",
     "CAM_BACK_RIGHT",
 )
-"""Cameras in the order of mmdetection3d's converter: of UniAD and VAD for nuScenes."""
+"""Cameras in the order of mmdetection3d's converter, used by UniAD and VAD for
+nuScenes."""
 CAN_BUS_KEYS = ("accel", "rotation_rate", "vel")
-"""Of a pose message, in the order of the published ``can_bus``, from its 8th number."""
+"""Keys of a pose message in the order of the published ``can_bus``, from index 7."""
 
 
 @dataclass(frozen=True)
 class NuScenesLog(DriveLog):
-    """nuScenes: tables of a version, pictures under samples/, CAN bus if it is there.
+    """nuScenes: tables of a version, pictures under samples/, CAN bus if present.
 
-    The CAN bus expansion is looked for in ``can_bus/`` in the folder and beside it;
-    where it has nothing of a scene, its numbers are zeros, as in UniAD and VAD.
+    The CAN bus expansion is searched in ``can_bus/`` in the folder and beside it;
+    without data of a scene, its numbers are zeros, as in UniAD and VAD.
 
     Attributes:
         root: the folder that holds ``v1.0-*`` and ``samples``.
-        version: of the tables; none means the only one that there is.
-        layout: how commands are counted, the CAN bus is filled and cameras stand:
-            ``nuscenes`` as UniAD and VAD for nuScenes do (right, left, straight; front
-            right before front left), ``bench2drive`` as Bench2Drive's and the policy
-            contract (left, right, straight, follow; front left before front right).
-        scenes: by name, such as scene-0061; none means all.
-        cameras: in the order of the image input; none means all, as `layout` has them.
+        version: version of the tables; empty means the only one present.
+        layout: order of commands, CAN bus and cameras: ``nuscenes`` as UniAD and VAD
+            for nuScenes (right, left, straight; front right before front left),
+            ``bench2drive`` as Bench2Drive and the policy contract (left, right,
+            straight, follow; front left before front right).
+        scenes: by name, such as scene-0061; empty means all.
+        cameras: in the order of the image input; empty means all, as in `layout`.
         every: takes every n-th key frame.
         size: rows and columns of the image input, where the model leaves them open.
         width: columns of the image input that a picture takes, the others are zeros;
-            None as its stack has it, else all.
+            None takes the stack's value, else all.
     """
 
     name: ClassVar[str] = "nuscenes"
@@ -71,12 +72,12 @@ class NuScenesLog(DriveLog):
     layout: Literal["nuscenes", "bench2drive"] = "nuscenes"
 
     def as_contract(self) -> Self:
-        """Return it in the layout of Bench2Drive, which is the policy contract's."""
+        """Return it in Bench2Drive's layout, which is that of the policy contract."""
         return replace(self, layout="bench2drive")
 
     @property
     def all_cameras(self) -> tuple[str, ...]:
-        """Name all cameras, as the layout has them."""
+        """All cameras, in the order of the layout."""
         return CONVERTED if self.layout == "nuscenes" else CAMERAS
 
     def names(self) -> Sequence[str]:
@@ -91,7 +92,7 @@ class NuScenesLog(DriveLog):
         return [self._moment(each, messages) for each in tables.samples_of(row)]
 
     def command_of(self, right_m: float) -> int:
-        """Return right, left or straight by what the vehicle went on to do."""
+        """Return right, left or straight by the vehicle's later path."""
         right, left, straight = (0, 1, 2) if self.layout == "nuscenes" else (1, 0, 3)
         if abs(right_m) < TURN_M:
             return straight
@@ -109,6 +110,7 @@ class NuScenesLog(DriveLog):
                 raise FramesError(f"{where} has no {channel}")
         lidar_to_car, car_to_world = self._poses(data[LIDAR])
         lidar_to_world = car_to_world @ lidar_to_car
+        # Each camera has its own time, and so its own vehicle pose.
         to_image = dict[str, Floats]()
         for camera in self.seen:
             camera_to_car, there = self._poses(data[camera])
@@ -116,6 +118,7 @@ class NuScenesLog(DriveLog):
             inside = intrinsics(sensor["camera_intrinsic"], f"{where}: {camera}")
             to_camera = np.linalg.inv(there @ camera_to_car)
             to_image[camera] = inside @ to_camera @ lidar_to_world
+        # The ego frame lies at the vehicle's centre on the ground.
         to_ego = np.array(lidar_to_car)
         to_ego[:2, 3] = -CENTRE_M * (lidar_to_car[:2, :2] @ [0.0, 1.0])
         return LogMoment(
@@ -131,7 +134,7 @@ class NuScenesLog(DriveLog):
         )
 
     def _poses(self, data: Row) -> tuple[Floats, Floats]:
-        """Return sensor to vehicle and vehicle to world, when the sensor looked."""
+        """Return sensor to vehicle and vehicle to world, at the time of the sensor."""
         tables = self._tables
         return tables.pose_of(tables.sensor(data)), tables.pose_of(tables.ego(data))
 
@@ -139,6 +142,7 @@ class NuScenesLog(DriveLog):
         self, sample: Row, car_to_world: Floats, lidar: Row, messages: Sequence[Row]
     ) -> Floats:
         bus = np.zeros(CAN_BUS_SIZE)
+        # Take the last message before the sample, else the first.
         before = [m for m in messages if m["utime"] <= sample["timestamp"]]
         message = before[-1] if before else next(iter(messages), None)
         if message is not None:

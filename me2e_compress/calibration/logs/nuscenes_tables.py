@@ -1,7 +1,7 @@
-"""The tables of nuScenes: files of rows that refer to each other by token.
+"""Read the tables of nuScenes, whose rows refer to each other by token.
 
 ``sample_data.json`` of v1.0-trainval has more than 1 GB; tables are read row by row,
-and only what is asked for is kept.
+and only the required rows are kept.
 """
 
 import json
@@ -17,25 +17,22 @@ from me2e_compress.errors import FramesError
 Row: TypeAlias = Mapping[str, Any]
 
 ROAD_USERS = ("vehicle.", "human.")
-"""Categories that a plan collides with, as UniAD and VAD take them."""
+"""Categories that a plan may collide with, as in UniAD and VAD."""
 NAMES = ("token", "name", "next", "channel")
 TIMES = ("timestamp", "utime")
 LATEST_US = 1 << 62
-"""Of a time, microseconds."""
+"""Latest valid time, microseconds."""
 PIECE = 1 << 22
-"""Characters that are read at once; no row is larger."""
+"""Characters to read at once; no row is larger."""
 _SPACE = " \t\r\n,"
 
 
 def rows(path: Path, *fields: str) -> Iterator[Row]:
     """Read the rows of a table one by one.
 
-    Args:
-        path: of the table.
-        fields: that every row must have.
-
     Raises:
-        FramesError: no such table, malformed, or a row lacks a field.
+        FramesError: the table is missing or malformed, or a row lacks one of
+            ``fields``.
     """
     with documents.reading(path, FramesError, "not a table of nuScenes"):
         for index, row in enumerate(_objects(path)):
@@ -45,7 +42,7 @@ def rows(path: Path, *fields: str) -> Iterator[Row]:
 
 
 def _check(row: Row, name: str, index: int) -> None:
-    """Check a field: what names another row is text, a time a whole number."""
+    """Check a field: references are text, times are integers."""
     if name not in row:
         raise documents.MalformedError(f"row {index} has no {name}")
     kind = int if name in TIMES else str if name.endswith(NAMES) else object
@@ -56,27 +53,19 @@ def _check(row: Row, name: str, index: int) -> None:
 
 
 def by_token(path: Path, keep: Callable[[Row], bool], *fields: str) -> dict[str, Row]:
-    """Read those rows that are to be kept, by their token.
-
-    Raises:
-        FramesError: see :func:`rows`.
-    """
+    """Read the rows to keep, by their token."""
     return {row["token"]: row for row in rows(path, "token", *fields) if keep(row)}
 
 
 class NuScenesTables:
-    """The rows of some scenes.
-
-    Args:
-        folder: of the tables.
-        wanted: scenes by name; none means all.
-    """
+    """The rows of some scenes, given by name; none means all."""
 
     def __init__(self, folder: Path, wanted: Sequence[str]) -> None:
         self.folder = folder
         self.scenes = [
             *rows(folder / "scene.json", "token", "name", "first_sample_token")
         ]
+        # Keep the samples of the scenes, and what they refer to.
         tokens = {s["token"] for s in self.scenes if not wanted or s["name"] in wanted}
         self.samples = by_token(
             folder / "sample.json",
@@ -100,7 +89,7 @@ class NuScenesTables:
         self._agents = self._boxes()
 
     def _key_frames(self) -> dict[str, dict[str, Row]]:
-        """Return what each sensor recorded of each sample."""
+        """Return the row of each sample and sensor."""
         channels = by_token(self.folder / "sensor.json", lambda row: True, "channel")
         found: dict[str, dict[str, Row]] = {token: {} for token in self.samples}
         path = self.folder / "sample_data.json"
@@ -118,6 +107,7 @@ class NuScenesTables:
         things = by_token(
             self.folder / "instance.json", lambda row: True, "category_token"
         )
+        # Resolve the category of each box, and keep road users.
         found: dict[str, list[Agent]] = {}
         path = self.folder / "sample_annotation.json"
         names = ("sample_token", "instance_token", "translation", "size", "rotation")
@@ -143,15 +133,15 @@ class NuScenesTables:
         return found
 
     def agents_of(self, sample: str) -> tuple[Agent, ...] | None:
-        """Return the road users; None where the version has no annotations at all."""
+        """Return the road users; None where the version has no annotations."""
         return tuple(self._agents.get(sample, ())) if self._agents else None
 
     def sensor(self, data: Row) -> Row:
-        """Return the calibration of what recorded a row of sample_data."""
+        """Return the calibration of the sensor of a sample_data row."""
         return self._of(self.sensors, data, "calibrated_sensor")
 
     def ego(self, data: Row) -> Row:
-        """Return where the vehicle was at a row of sample_data."""
+        """Return the vehicle's pose of a sample_data row."""
         return self._of(self.poses, data, "ego_pose")
 
     def pose_of(self, row: Row) -> Floats:
@@ -192,6 +182,7 @@ def _objects(path: Path) -> Iterator[dict[str, Any]]:
             at = _past(text, at, _SPACE)
             if text[at : at + 1] == "]":
                 return
+            # Decode one row; at the end of the piece, read another one.
             try:
                 row, at = decode(text, at)
             except (ValueError, RecursionError) as error:

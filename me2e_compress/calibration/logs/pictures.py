@@ -1,8 +1,8 @@
-"""Pictures of a log as bytes of an image input, and where points of space land there.
+"""Decode a log's pictures to an image input, and return the pixel transform.
 
-Sizes as the published stacks have them: a picture is scaled to so many columns; what is
-then too tall loses its upper rows (Lift-Splat, BEVDet, SparseDrive), what is too small
-is padded below and to the right when it is fed (mmdetection, UniAD, VAD: 1600 x 900 at
+Sizes follow the published stacks: a picture is scaled to the given columns; if it is
+then too tall it loses its upper rows (Lift-Splat, BEVDet, SparseDrive), if too small
+it is padded below and to the right when fed (mmdetection, UniAD, VAD: 1600 x 900 at
 0.4 is 640 x 360, padded to 384 rows).
 """
 
@@ -25,11 +25,11 @@ _JPEG, _PNG = b"\xff\xd8", b"\x89PNG"
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture that was read.
+    """A decoded picture.
 
     Attributes:
         planes: uint8 [3, h, w], at most as large as the input.
-        place: [4, 4] pixels of the whole picture to those of the input, both times
+        place: [4, 4] from pixels of the whole picture to those of the input, both times
             depth.
     """
 
@@ -38,15 +38,10 @@ class Picture:
 
 
 def read_picture(path: Path, pixels: PixelInput, columns: int) -> Picture:
-    """Read a JPEG or PNG and lay it out as an input takes it.
-
-    Args:
-        path: of the file.
-        pixels: the input.
-        columns: of the input that the picture takes.
+    """Read a JPEG or PNG and lay it out for an input of which it takes ``columns``.
 
     Raises:
-        FramesError: it is missing, half-written, or no picture.
+        FramesError: it is missing, truncated, or no picture.
     """
     import cv2  # takes a tenth of a second to import
 
@@ -55,6 +50,7 @@ def read_picture(path: Path, pixels: PixelInput, columns: int) -> Picture:
     rows = max(1, round(height * columns / width))
     if (rows, columns) != (height, width):
         found = np.asarray(cv2.resize(found, (columns, rows)), np.uint8)
+    # Crop at the top, and order the channels.
     above = max(0, rows - pixels.rows)
     order = slice(None, None, -1) if pixels.order == "rgb" else slice(None)
     planes = np.moveaxis(found[above:, :, order], -1, 0)
@@ -64,18 +60,14 @@ def read_picture(path: Path, pixels: PixelInput, columns: int) -> Picture:
 
 
 def read_pixels(path: Path, size: tuple[int, int]) -> tuple[Bytes, Floats]:
-    """Read a JPEG or PNG and scale it as a whole.
-
-    Args:
-        path: of the file.
-        size: rows and columns.
+    """Read a JPEG or PNG and scale it to ``size`` (rows, columns) without cropping.
 
     Returns:
-        RGB [rows, columns, 3], and [4, 4] pixels of the picture to those, both times
-        depth.
+        RGB [rows, columns, 3], and [4, 4] from pixels of the picture to those, both
+        times depth.
 
     Raises:
-        FramesError: it is missing, half-written, or no picture.
+        FramesError: it is missing, truncated, or no picture.
     """
     import cv2
 
@@ -107,7 +99,7 @@ def _decoded(path: Path) -> Bytes:
 
 
 def _is_whole(content: bytes) -> bool:
-    """Look for the end of the file: OpenCV pads with grey what breaks off."""
+    """Look for the end marker: OpenCV pads truncated pictures with grey."""
     if content.startswith(_JPEG):  # a thumbnail ends before the picture begins
         return content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")
     return content.startswith(_PNG) and b"IEND" in content[-16:]

@@ -1,6 +1,6 @@
-"""From what was seen on the frames to one range a tensor.
+"""Observers compute one range per tensor from statistics.
 
-To add an observer: write its class, then add it to this table.
+To add an observer, write its class, then add it to this table.
 """
 
 from me2e_compress.calibration.observers.base import (

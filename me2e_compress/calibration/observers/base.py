@@ -1,4 +1,4 @@
-"""From frames to ranges to the int8 step: what every observer is, and max-min."""
+"""The interface of observers, the int8 step, and the max-min observers."""
 
 import abc
 import dataclasses
@@ -20,10 +20,9 @@ def scale_of(low: float, high: float) -> np.float32:
 
     Equation 3 of the paper divides ``high - low`` by ``q_max - q_min``. That fits a
     range centred on zero; with zero point 0 it would clip the upper half of a tensor
-    that is never negative (what follows a ReLU). So the range is first made symmetric,
-    [-r, r] with r = max(|low|, |high|), and the formula gives 2r / 254 = r / 127.
-
-    A tensor that is zero throughout has no step of its own: it gets 1.
+    that is never negative (after a ReLU). So the range is first made symmetric, [-r, r]
+    with r = max(|low|, |high|), and the formula gives 2r / 254 = r / 127. A tensor that
+    is always zero gets the step 1.
 
     Raises:
         FramesError: a bound is NaN or infinite.
@@ -41,11 +40,11 @@ Bounds: TypeAlias = npt.NDArray[np.float32]
 
 @dataclasses.dataclass(frozen=True)
 class Observer(abc.ABC):
-    """From statistics to ranges: derive a frozen dataclass, its fields are options.
+    """Base of observers: derive a frozen dataclass, whose fields are the options.
 
     Class attributes:
-        name: what recipes and the command line call it.
-        counts: True if it needs histograms, a second pass over the frames.
+        name: its name in recipes and on the command line.
+        counts: whether it needs histograms, i.e. a second pass over the frames.
     """
 
     name: ClassVar[str]
@@ -55,16 +54,12 @@ class Observer(abc.ABC):
     def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
         """Return the low and the high bound of every tensor's range.
 
-        Both are finite, and within what was seen of the tensor: see :func:`within`.
+        Both are finite and do not exceed the observed extremes, see :func:`within`.
         """
 
 
 def check_option(name: str, option: str, value: float, largest: float) -> None:
-    """Refuse the option of an observer that is not above 0 and at most ``largest``.
-
-    Raises:
-        RecipeError: names observer and option.
-    """
+    """Raise a RecipeError if an option is not above 0 and at most ``largest``."""
     if not 0 < value <= largest:  # NaN too
         raise RecipeError(
             f"{name}: {option} must be above 0 and at most {largest:g}, found {value:g}"
@@ -74,8 +69,7 @@ def check_option(name: str, option: str, value: float, largest: float) -> None:
 def within(seen: Statistics, reach: Bounds) -> tuple[Bounds, Bounds]:
     """Clip the extremes of every tensor at plus and minus its reach.
 
-    Where all that was seen lies beyond the reach, the range shrinks to the nearest
-    value that was seen.
+    If all observed values are beyond the reach, the range shrinks to the nearest one.
     """
     lows, highs = seen.lows.min(axis=0), seen.highs.max(axis=0)
     low, high = np.maximum(lows, -reach), np.minimum(highs, reach)
@@ -84,9 +78,9 @@ def within(seen: Statistics, reach: Bounds) -> tuple[Bounds, Bounds]:
 
 @dataclasses.dataclass(frozen=True)
 class MaxMin(Observer):
-    """Static max-min: the extremes over all frames, as equation 3 of the paper reads.
+    """Static max-min: the extremes over all frames, as in equation 3 of the paper.
 
-    Not the moving average that other tools call min-max too.
+    It differs from the moving average that other tools also call min-max.
     """
 
     name: ClassVar[str] = "max-min"
@@ -100,22 +94,18 @@ class MaxMin(Observer):
 class MovingAverage(Observer):
     """Exponential moving average of the extremes, in the order of the frames.
 
-    ``range += weight * (frame - range)``, begun at the first frame. A rare extreme
-    counts for little, and is clipped.
+    ``range += weight * (frame - range)``, starting with the first frame. A rare extreme
+    has little weight, and is clipped.
 
     Attributes:
         weight: of a new frame, above 0 and at most 1; the default is that of torch's
             ``MovingAverageMinMaxObserver``.
-
-    Raises:
-        RecipeError: another weight.
     """
 
     name: ClassVar[str] = "moving-average"
     weight: float = 0.01
 
     def __post_init__(self) -> None:
-        """Check the weight."""
         check_option(self.name, "weight", self.weight, 1.0)
 
     def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:

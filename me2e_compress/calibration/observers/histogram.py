@@ -1,4 +1,4 @@
-"""Ranges read off histograms of magnitudes: what is rare may be clipped."""
+"""Observers that use histograms of magnitudes, and may clip rare values."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,14 +17,14 @@ from me2e_compress.calibration.observers.base import (
 from me2e_compress.calibration.statistics import BINS, Statistics
 
 Counts: TypeAlias = npt.NDArray[np.int64]
-"""How many magnitudes fell into each of the bins: int64 [bins]."""
+"""Number of magnitudes in each of the bins: int64 [bins]."""
 
 LEVELS = 128
-"""Magnitudes of the int8 grid, 0 to 127: TensorRT's entropy method compares with as
-many (S. Migacz, 8-bit inference with TensorRT, GTC 2017)."""
+"""Magnitudes of the int8 grid, 0 to 127; TensorRT's entropy method uses as many (S.
+Migacz, 8-bit inference with TensorRT, GTC 2017)."""
 
 _STRIDE = BINS // 256
-"""Thresholds are tried every so many bins: 240 of them instead of 1,920."""
+"""Bins between tried thresholds: 240 of them instead of 1,920."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,9 +34,6 @@ class Percentile(Observer):
     Attributes:
         percent: above 0 and at most 100; the default is that of TensorRT's and
             onnxruntime's tools.
-
-    Raises:
-        RecipeError: another percentage.
     """
 
     name: ClassVar[str] = "percentile"
@@ -44,11 +41,10 @@ class Percentile(Observer):
     percent: float = 99.99
 
     def __post_init__(self) -> None:
-        """Check the percentage."""
         check_option(self.name, "percent", self.percent, 100.0)
 
     def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        """Cut every tensor off at its percentile, rounded up to the edge of a bin."""
+        """Clip every tensor at its percentile, rounded up to the edge of a bin."""
         return within(seen, _reaches(seen, self._edge))
 
     def _edge(self, counts: Counts) -> int:
@@ -59,13 +55,13 @@ class Percentile(Observer):
 
 @dataclasses.dataclass(frozen=True)
 class MeanSquaredError(Observer):
-    """The threshold whose int8 grid moves the elements least, in mean square."""
+    """The threshold whose int8 grid has the least mean squared error."""
 
     name: ClassVar[str] = "mse"
     counts: ClassVar[bool] = True
 
     def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        """Cut every tensor off where rounding and clipping cost least."""
+        """Clip every tensor where rounding and clipping cost least."""
         return within(seen, _reaches(seen, lambda counts: _best(counts, _noise)))
 
 
@@ -73,20 +69,20 @@ class MeanSquaredError(Observer):
 class Entropy(Observer):
     """The threshold whose int8 grid keeps the distribution best: least KL divergence.
 
-    Migacz's method. Zero stands on every grid, so the bin of zeros counts as its
-    neighbour: the zeros behind a ReLU would drown the rest.
+    Migacz's method. Zero is on every grid, so the bin of zeros is set to its
+    neighbour's count: otherwise the zeros after a ReLU would dominate.
     """
 
     name: ClassVar[str] = "entropy"
     counts: ClassVar[bool] = True
 
     def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        """Cut every tensor off where the distribution suffers least."""
+        """Clip every tensor where the KL divergence is least."""
         return within(seen, _reaches(seen, lambda counts: _best(counts, _divergence)))
 
 
 def _reaches(seen: Statistics, edge: Callable[[Counts], int]) -> Bounds:
-    """Turn the chosen edge of every histogram into a magnitude."""
+    """Convert the chosen bin edge of every histogram to a magnitude."""
     edges = [edge(counts) if counts.any() else BINS for counts in seen.counted()]
     return np.ldexp(np.array(edges, np.float64) / BINS, seen.exponents).astype(
         np.float32
@@ -94,7 +90,7 @@ def _reaches(seen: Statistics, edge: Callable[[Counts], int]) -> Bounds:
 
 
 def _best(counts: Counts, cost: Callable[[Counts, int], float]) -> int:
-    """Try thresholds up to the last bin in use, which is the first choice."""
+    """Return the cheapest threshold; in a tie, the last bin in use."""
     top = int(np.flatnonzero(counts)[-1]) + 1
     tried = [top, *range(LEVELS, top, _STRIDE)]
     costs = [cost(counts, edge) for edge in tried]
@@ -103,7 +99,7 @@ def _best(counts: Counts, cost: Callable[[Counts, int], float]) -> int:
 
 
 def _noise(counts: Counts, edge: int) -> float:
-    """Sum the squared errors of a grid that ends at an edge, in bins."""
+    """Return the summed squared error of a grid that ends at an edge, in bins."""
     centres = np.arange(BINS) + 0.5
     step = edge / QUANT_MAX
     rounded = np.minimum(np.rint(centres / step), QUANT_MAX) * step
@@ -113,7 +109,7 @@ def _noise(counts: Counts, edge: int) -> float:
 def _divergence(counts: Counts, edge: int) -> float:
     """Return the KL divergence between the bins below an edge and their grid of levels.
 
-    What lies beyond the edge counts into the last bin before it. A level spreads its
+    Elements beyond the edge count in the last bin before it. A level spreads its
     elements evenly over those of its bins that are not empty.
     """
     kept = counts[:edge].astype(np.float64)
@@ -122,6 +118,7 @@ def _divergence(counts: Counts, edge: int) -> float:
     clipped[-1] += counts[edge:].sum()
     if not kept.any():
         return np.inf
+    # Spread each level's elements over its bins in use.
     level = np.arange(edge) * LEVELS // edge
     filled = clipped > 0
     held = np.bincount(level, kept, LEVELS)

@@ -1,1 +1,1 @@
-"""The commands, one file each: what it takes, one call, what it shows."""
+"""The commands, one file each: its options, one call of a workflow, its output."""

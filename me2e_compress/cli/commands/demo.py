@@ -47,6 +47,7 @@ def demo(
     The trained driver is compressed and drives before and after; vad-tiny, at its
     published size and with random weights, is compressed, compared and timed.
     """
+    # the trained driver drives, other stacks are only timed
     runs = provider_named(provider, plugins or ())
     if stack in SHIPPED:
         need_extra("highway", "driving in the demo")
@@ -55,6 +56,7 @@ def demo(
         steps = DriverDemo(stack, output, recipe, routes, workers, runs, force).steps
     else:
         steps = StackDemo(stack, output, recipe, rounds, threads, runs, force).steps
+    # each step says what it found as soon as it is done
     output.mkdir(parents=True, exist_ok=True)
     found = dict[str, Result]()
     for name, step in steps.items():
@@ -66,6 +68,7 @@ def demo(
             say(f"{name:<10}{seconds:4.0f} s   {figure(found[name])}")
             if is_verbose():
                 show(found[name])
+    # with -v every step was shown in full already
     whole = DemoResult(found)
     if as_json:
         show(whole, as_json)

@@ -79,6 +79,7 @@ def evaluate(
     not drive.
     """
     runs = provider_named(provider, plugins or ())
+    # --check drives nothing, and needs no folder
     if check:
         _check(policy, adapter, runs, as_json)
         return

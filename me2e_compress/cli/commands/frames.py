@@ -46,8 +46,8 @@ def frames(
 
     A synthetic world is drawn for stacks of the zoo; for highway, or any ONNX file or
     stack of files (STACK.toml) that keeps the policy contract (--adapter), the expert
-    drives fresh routes. With
-    --from, recorded driving of nuScenes or Bench2Drive is laid out as either takes it.
+    drives fresh routes. With --from, recorded driving of nuScenes or Bench2Drive is
+    laid out as either takes it.
     """
     options = workflow.FramesOptions(
         count,

@@ -50,6 +50,7 @@ def profile(
 
     With --import nothing is run: the latencies are those that another tool measured.
     """
+    # a measurement and an import share the options that both understand
     device = provider_named(provider, plugins or ())
     options = workflow.ProfileOptions(
         *(samples, warm_up, threads, device, by_module, module_map, figure, force),
@@ -69,6 +70,7 @@ def profile(
         else:
             found = workflow.profile(model, frames, output, options, listener)
     show(found, as_json)
+    # files besides the trace are named on stderr
     if found.figure is not None:
         tell(f"wrote {found.figure}")
     if found.energy_output is not None:

@@ -61,6 +61,7 @@ def score(
     With --joules or --modelled also EER_AV, which compares all folders. The other
     options but --budget-ms and --json are about results of real runs in CARLA.
     """
+    # options of real runs are passed on only if one was given
     options = Bench2DriveOptions(
         metrics,
         junctions,

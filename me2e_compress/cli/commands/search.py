@@ -89,6 +89,7 @@ def search(
     """Find the scheme within the budgets that costs the plan, or the road, least."""
     check_budgets(max_mb, max_ms, max_joules)
     dims, runs_on = sizes(set_dim or ()), provider_named(provider, plugins or ())
+    # without --on-road nothing drives: the loss is judged by the plan
     if not on_road:
         _refuse_the_road({
             "drives": drives, "modules": modules, "ablate": ablate,
@@ -129,7 +130,6 @@ def search(
 
 
 def _refuse_the_road(options: Mapping[str, object]) -> None:
-    """Refuse options that say how to drive where nothing does."""
     for name, value in options.items():
         if value is not None:
             raise RecipeError(f"--{name} says how to drive: add --on-road")

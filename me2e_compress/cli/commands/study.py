@@ -61,6 +61,7 @@ def study(
     from me2e_compress.workflows.checks import check_folder
 
     more = plugins or ()
+    # read and check everything that the study needs before it starts
     asked = load_study(definition, routes, provider, more, trust_code=trust_code)
     if tables is not None:
         asked = asked.of_blocks(tables.split(","))
@@ -70,6 +71,7 @@ def study(
     if dry_run:
         show(ahead, as_json)
         return
+    # the report quotes the command that repeats the study
     options: list[tuple[str, str | Path | None]] = [
         ("--routes", routes),
         ("--tables", tables),
@@ -81,6 +83,7 @@ def study(
     chosen = [str(word) for each in options if each[1] is not None for word in each]
     chosen += ["--trust-code"] * trust_code
     words = ("me2e-compress", "study", str(definition), "-o", str(output), *chosen)
+    # drive, or go on, and write the report
     if records is None:
         tell(ahead.headline)
     with listening() as listener:

@@ -29,17 +29,17 @@ class Adapter(BaseModel):
     """The contents of a TOML adapter; what is left out follows from the model.
 
     Attributes:
-        inputs: The contract's name (img, lidar2img, can_bus, command, timestamp) to
-            the graph's.
-        feeds: What each other input of the graph is made of, by its name.
-        images: What each image input shows, by its name.
+        inputs: The contract's name (img, lidar2img, can_bus, command, timestamp) to the
+            graph's.
+        feeds: The sources of each other input of the graph, by its name.
+        images: The settings of each image input, by its name.
         recurrent: Recurrent input to the output that answers it, and to its first
             value; inputs that the adapter feeds in another way are not recurrent.
-        plan: Which output is the plan, when its waypoints are to be reached, whether it
-            holds steps, which mode is taken; ``command_input = "command"`` lets the
+        plan: Which output is the plan, the times of its waypoints, whether it holds
+            steps, which mode is taken; ``command_input = "command"`` lets the
             navigator's command pick it.
         control: Which outputs are the controls, which drive in place of the plan.
-        fusion: Both drive, fused.
+        fusion: Options to fuse the plan and the controls.
         image: Normalisation of image inputs that have none of their own.
         axes: Ground frame of the model.
     """
@@ -66,11 +66,7 @@ class Adapter(BaseModel):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a TOML file.
-
-        Raises:
-            EvaluationError: No such file, not TOML, or an unknown key or value.
-        """
+        """Read a TOML file."""
         try:
             content = documents.from_toml(documents.content(path))
             return cls.model_validate(content, context=path.parent)
@@ -86,11 +82,7 @@ class Adapter(BaseModel):
 
     @classmethod
     def digest(cls, path: Path) -> str:
-        """Return what identifies an adapter with the files that it names.
-
-        Raises:
-            EvaluationError: See `load`, or one of them is not there.
-        """
+        """Return what identifies an adapter together with the files that it names."""
         entries = (cls.load(path).recurrent or {}).values()
         files = [path, *(each.file for each in entries if each.file is not None)]
         if missing := [file for file in files if not file.is_file()]:
@@ -98,13 +90,10 @@ class Adapter(BaseModel):
         return "+".join(map(sha256_of, files))
 
     def metadata(self, own: Mapping[str, str]) -> dict[str, str]:
-        """Return what it says of a graph's state and plan, as metadata of the graph.
+        """Return the adapter's recurrent pairs and plan in the form of graph metadata.
 
-        Args:
-            own: Of the graph: holds of what the adapter does not name.
-
-        Raises:
-            GraphError: These are malformed.
+        ``own`` is the graph's own metadata, which holds for what the adapter does not
+        name.
         """
         named = (self.recurrent or {}).items()
         pairs = {

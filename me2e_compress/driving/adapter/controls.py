@@ -1,4 +1,4 @@
-"""Throttle, steer and brake as a model says them."""
+"""Read throttle, steering and brake from a model's outputs."""
 
 import re
 from collections.abc import Mapping
@@ -32,15 +32,15 @@ class _Table(BaseModel):
 class BetaActions(_Table):
     """Beta distributions of acceleration and steer, as in OpenDriveLab's TCP.
 
-    An action of 0 to 1 becomes -1 to 1: full brake to full throttle, full left to full
-    right.
+    An action of 0 to 1 is mapped to -1 to 1: full brake to full throttle, full left to
+    full right.
 
     Attributes:
         alpha: The output with both alphas, acceleration first.
-        beta: The same of both betas.
-        take: The ``mode``, as TCP's agent does: where both parameters are 1 or less
-            there is none and the mean is taken, where one is the end on the other's
-            side; or the ``mean``.
+        beta: The output with both betas, acceleration first.
+        take: The ``mode``, as TCP's agent does: if both parameters are 1 or less there
+            is no mode and the mean is taken; if one is, the mode is the end of the
+            range on the other's side. Or the ``mean``.
     """
 
     alpha: str
@@ -48,12 +48,7 @@ class BetaActions(_Table):
     take: Literal["mode", "mean"] = "mode"
 
     def read(self, outputs: Outputs) -> PedalsAndWheel:
-        """Return the action.
-
-        Raises:
-            EvaluationError: Not two numbers each, or not parameters of a Beta
-                distribution.
-        """
+        """Return the action."""
         alpha, beta = (_row(outputs, name, 2) for name in (self.alpha, self.beta))
         if not (np.minimum(alpha, beta) >= 0).all() or np.isinf(alpha + beta).any():
             raise EvaluationError(
@@ -77,19 +72,15 @@ class ScoredActions(_Table):
     """A choice among fixed actions, as in Bench2DriveZoo's TCP.
 
     Attributes:
-        scores: The output with a score of each.
-        actions: Throttle, steer and brake of each.
+        scores: The output with one score per action.
+        actions: Throttle, steer and brake of each action.
     """
 
     scores: str
     actions: tuple[tuple[float, float, float], ...] = Field(min_length=1)
 
     def read(self, outputs: Outputs) -> PedalsAndWheel:
-        """Return the action of the largest score, the first of equals.
-
-        Raises:
-            EvaluationError: There are not as many scores, or one is not finite.
-        """
+        """Return the action with the largest score, the first of equals."""
         scores = _row(outputs, self.scores, len(self.actions))
         if not np.isfinite(scores).all():
             raise EvaluationError(f"a score of {self.scores} is not finite")
@@ -97,22 +88,23 @@ class ScoredActions(_Table):
 
 
 class ControlAdapter(_Table):
-    """How to read controls off a model's outputs.
+    """How to read controls from a model's outputs.
 
-    Each number is an output that has one, ``steer``, or one of several, ``action[1]``,
-    counted over the whole output. Either throttle and steer, with or without a brake;
-    or one acceleration, which brakes below 0, and steer; or ``beta``; or ``scored``.
+    Each number is an output with one element, ``steer``, or an element of a larger one,
+    ``action[1]``, indexed over the flattened output. Give throttle and steer, with or
+    without a brake; or one acceleration, which brakes below 0, and steer; or ``beta``;
+    or ``scored``.
 
     Attributes:
-        throttle: Where it is said.
-        brake: The same.
-        acceleration: The same, in place of both.
-        steer: The same.
-        throttle_range: What the model says at no and at full throttle.
-        brake_range: The same of the brake.
-        acceleration_range: What it says at full brake and at full throttle.
-        steer_range: What it says at full left and at full right.
-        clip: Whether what is beyond its range is its end; else it ends the route.
+        throttle: The output or element that holds the throttle.
+        brake: The output or element that holds the brake.
+        acceleration: The output or element that replaces throttle and brake.
+        steer: The output or element that holds the steering.
+        throttle_range: The model's values at no and at full throttle.
+        brake_range: The model's values at no and at full brake.
+        acceleration_range: The model's values at full brake and at full throttle.
+        steer_range: The model's values at full left and at full right.
+        clip: Whether values beyond their range are clipped; else they end the route.
         beta: Beta distributions in place of all these.
         scored: A choice among actions in place of all these.
     """
@@ -146,7 +138,7 @@ class ControlAdapter(_Table):
 
     @property
     def outputs(self) -> dict[str, str]:
-        """What is read of each output, by its name in the document."""
+        """The output or element of each quantity, by its name in the document."""
         if self.beta is not None:
             both = "of acceleration and steer"
             return {self.beta.alpha: f"alpha {both}", self.beta.beta: f"beta {both}"}
@@ -156,11 +148,7 @@ class ControlAdapter(_Table):
         return {where: name for name, where in said if where is not None}
 
     def read(self, outputs: Outputs) -> PedalsAndWheel:
-        """Return what the model asks for.
-
-        Raises:
-            EvaluationError: An output has not as many numbers.
-        """
+        """Return the model's controls."""
         table = self.beta or self.scored
         if table is not None:
             return table.read(outputs)
@@ -172,7 +160,7 @@ class ControlAdapter(_Table):
         return PedalsAndWheel(throttle, steer, brake)
 
     def _number(self, name: str, outputs: Outputs, least: float) -> float:
-        """Return a number from ``least`` to 1, its range's ends."""
+        """Return a number from ``least`` to 1, the ends of its range."""
         said = element(outputs, getattr(self, name))
         begin, end = getattr(self, f"{name}_range")
         share = (said - begin) / (end - begin)
@@ -181,7 +169,7 @@ class ControlAdapter(_Table):
 
 
 def output_named(text: str, outputs: Mapping[str, object]) -> tuple[str, int | None]:
-    """Return the output of ``name`` or ``name[k]``, and k."""
+    """Split ``name`` or ``name[k]`` into the output's name and k."""
     found = None if text in outputs else _ELEMENT.fullmatch(text)
     if found is None:
         return text, None
@@ -189,11 +177,7 @@ def output_named(text: str, outputs: Mapping[str, object]) -> tuple[str, int | N
 
 
 def element(outputs: Outputs, text: str) -> float:
-    """Return the number that a text names.
-
-    Raises:
-        EvaluationError: The output has several and none is named, or not as many.
-    """
+    """Return the number that ``name`` or ``name[k]`` refers to."""
     name, index = output_named(text, outputs)
     row = _row(outputs, name, None)
     if index is None and len(row) != 1:
@@ -213,5 +197,5 @@ def _row(outputs: Outputs, name: str, size: int | None) -> npt.NDArray[np.float6
 
 
 def _by_acceleration(acceleration: float, steer: float) -> PedalsAndWheel:
-    """Press the throttle above 0, the brake below; NaN stays NaN, on the throttle."""
+    """Map above 0 to throttle, below to brake; NaN stays NaN, on the throttle."""
     return PedalsAndWheel(max(acceleration, 0.0), steer, max(0.0, -acceleration))

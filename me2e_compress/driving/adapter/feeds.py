@@ -21,10 +21,7 @@ LARGEST = 1e30
 class FeedPart:
     """A source, normalised: (value - mean) / std.
 
-    Attributes:
-        source: What it is made of.
-        mean: One number, or as many as the last dimension has.
-        std: The same.
+    ``mean`` and ``std`` are one number, or as many as the last dimension has.
     """
 
     source: InputSource
@@ -33,12 +30,7 @@ class FeedPart:
 
     @classmethod
     def read(cls, table: dict[str, Any]) -> Self:
-        """Make it of a table: source, mean, std, and the source's own options.
-
-        Raises:
-            ValueError: It names no source, or one that does not exist, or a wrong
-                option.
-        """
+        """Read a table: source, mean, std, and the source's own options."""
         options = dict(table)
         name = options.pop("source", None)
         if not isinstance(name, str):
@@ -54,12 +46,7 @@ class FeedPart:
             raise ValueError(str(error)) from error
 
     def value(self, seen: Observed) -> Array:
-        """Return it, of the source's shape.
-
-        Raises:
-            EvaluationError: The observation does not tell it, or there are not as many
-                means as numbers.
-        """
+        """Return the normalised value, of the source's shape."""
         array = self.source.value(seen)
         if self.mean == 0.0 and self.std == 1.0:
             return array
@@ -81,11 +68,7 @@ class Feed(BaseModel):
     """How one input is made: of a source, or of parts in a row.
 
     As a table: ``source`` and its options, ``mean``, ``std``; or ``parts``, a list of
-    such tables, whose numbers are flattened and stand one after the other.
-
-    Attributes:
-        parts: At least one.
-        joined: Whether they were given as ``parts``.
+    such tables, whose numbers are flattened and concatenated (``joined``).
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
@@ -109,28 +92,24 @@ class Feed(BaseModel):
 
     @classmethod
     def by(cls, source: InputSource) -> Self:
-        """Return the feed that is a source as it is."""
+        """Return the feed of one source without normalisation."""
         return cls.model_construct(parts=(FeedPart(source),))
 
     def value(self, seen: Observed) -> Array:
-        """Return what the input is fed, without a batch dimension.
-
-        Raises:
-            EvaluationError: See `FeedPart.value`.
-        """
+        """Return the input's value, without a batch dimension."""
         arrays = [part.value(seen) for part in self.parts]
         if not self.joined:
             return arrays[0]
         return np.concatenate([each.reshape(-1) for each in arrays])
 
     def sizes(self, seen: Observed) -> str:
-        """Tell the sources with how many numbers each gives, for messages."""
+        """Name the sources with their element counts, for messages."""
         found = ((p.source.name, p.source.value(seen).size) for p in self.parts)
         return ", ".join(f"{name} {size}" for name, size in found)
 
     @property
     def command(self) -> NavigationCommand | None:
-        """The command that it is, where it is nothing else."""
+        """The navigation command, if the feed is nothing else."""
         source = self.parts[0].source
         if len(self.parts) > 1 or not isinstance(source, NavigationCommand):
             return None

@@ -1,4 +1,4 @@
-"""One image input of a graph: which cameras, which part of them, how laid out."""
+"""One image input of a graph: its cameras, crops and layout."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal, Self, TypeAlias
@@ -31,22 +31,22 @@ class ImageInput(BaseModel):
     """What an image input shows; what is left out follows from the graph.
 
     Attributes:
-        cameras: Which, in the model's order.
+        cameras: Names of the cameras, in the model's order.
         camera_size: Rows and columns of a camera's picture, to which `crop` refers.
-        rendered: Rows and columns that cameras are rendered in, where that is not
-            `camera_size`; pictures are scaled to it as wholes.
+        rendered: Rows and columns that cameras are rendered in, if not `camera_size`;
+            whole pictures are scaled to it.
         crop: Left, top, right and bottom, pixels of `camera_size`, of each camera, or
-            of one for all; None takes all of a picture.
+            of one for all; None takes whole pictures.
         stitch: Join the cameras from left to right into one picture.
-        size: Rows and columns to which the result is resized, bilinearly; where the
-            input has more, the rest below and to the right is zero.
+        size: Rows and columns to which the result is resized, bilinearly; if the input
+            is larger, the rest below and to the right is zero.
         layout: Letters of the dimensions: b batch, n cameras, c channels, h rows, w
             columns.
-        mean: See `ImageNormalization`; without it the adapter's [image] or the model's
-            metadata tells. An input of uint8 takes no normalisation.
-        std: The same.
-        scale: What grey levels are multiplied by before that: 0.00392156862745098 (1 /
-            255) where mean and std are of 0 to 1.
+        mean: See `ImageNormalization`; the default is that of the adapter's [image] or
+            of the model's metadata. An input of uint8 takes no normalisation.
+        std: Like mean.
+        scale: Factor on grey levels before mean and std: 0.00392156862745098 (1 / 255)
+            where these are of 0 to 1.
         order: Red first or blue first.
     """
 
@@ -122,11 +122,9 @@ class ImageInput(BaseModel):
 
 @dataclass(frozen=True)
 class ImagePort:
-    """The dimensions of an image input of a graph, read by a layout.
+    """The layout of an image input of a graph, and its size.
 
-    Attributes:
-        layout: Letters of its dimensions.
-        size: Its rows and columns, where the graph tells them; else the usual ones.
+    ``size`` is rows and columns, from the graph if it fixes them, else the usual ones.
     """
 
     layout: str
@@ -134,11 +132,8 @@ class ImagePort:
 
     @classmethod
     def of(cls, name: str, shape: Shape, table: ImageInput) -> Self:
-        """Read a port's shape.
-
-        Raises:
-            EvaluationError: It is not that of these images.
-        """
+        """Read a port's shape."""
+        # without a layout in the table, the rank of the shape tells it
         pictures = 1 if table.stitch else len(table.cameras)
         single = {5: "bnchw", 4: "bchw", 3: "chw"}
         several = {5: "bnchw", 4: "nchw"}
@@ -161,6 +156,7 @@ class ImagePort:
                     " cameras it shows"
                 )
             raise EvaluationError(f"{said}{wanted}")
+        # open sides take the table's size, or the default
         rows, columns = (shape[layout.index(letter)] for letter in "hw")
         usual_rows, usual_columns = table.size or DEFAULT_IMAGE_SIZE
         return cls(
@@ -173,11 +169,7 @@ class ImagePort:
 
 
 def rendered_size(name: str, table: ImageInput, port: ImagePort) -> tuple[int, int]:
-    """Return rows and columns that an image input wants its cameras rendered in.
-
-    Raises:
-        EvaluationError: Nothing tells it, or the input is smaller than its pictures.
-    """
+    """Return rows and columns that an image input wants its cameras rendered in."""
     rows, columns = table.size or port.size
     if rows > port.size[0] or columns > port.size[1]:
         raise EvaluationError(

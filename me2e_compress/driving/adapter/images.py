@@ -1,4 +1,4 @@
-"""How pixels become the image input of a model."""
+"""Normalisation of a model's image input."""
 
 from collections.abc import Mapping
 from typing import Literal, Self, TypeAlias
@@ -28,9 +28,9 @@ class ImageNormalization(BaseModel):
     Attributes:
         input: Name of the image input.
         mean: In grey levels 0 to 255 (times `scale`), in the order of `order`.
-        std: The same.
+        std: Like mean.
         order: Channels of the model: red first or blue first.
-        scale: What pixels are multiplied by before that.
+        scale: Factor on pixels before mean and std.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -50,11 +50,7 @@ class ImageNormalization(BaseModel):
 
     @classmethod
     def of(cls, metadata: Mapping[str, str]) -> Self:
-        """Read it from a model's metadata.
-
-        Raises:
-            EvaluationError: There is none, or it is malformed.
-        """
+        """Read it from a model's metadata."""
         text = metadata.get(IMAGE)
         if text is None:
             raise EvaluationError(

@@ -1,4 +1,4 @@
-"""What the cameras show, made the images that a graph takes."""
+"""Convert camera pictures to the images that a graph takes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,13 +23,9 @@ Floats = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class InputImages:
-    """Makes one image input of what the cameras show.
+    """Makes one image input from the cameras' pictures.
 
-    Args:
-        table: What it shows.
-        port: Of the graph.
-        rendered: Rows and columns of the cameras' pictures.
-        normalization: None leaves bytes.
+    ``rendered`` holds their rows and columns; ``normalization`` None leaves bytes.
     """
 
     table: ImageInput
@@ -39,12 +35,12 @@ class InputImages:
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Of the cameras, among the six."""
+        """Indices of the cameras among the six."""
         return tuple(map(CAMERA_NAMES.index, self.table.cameras))
 
     @property
     def windows(self) -> tuple[Crop, ...]:
-        """Left, top, right and bottom of what is taken, in rendered pixels."""
+        """Left, top, right and bottom of each crop, in rendered pixels."""
         rows, columns = self.rendered
         if (crops := self.table.crops) is None:
             return ((0, 0, columns, rows),) * len(self.indices)
@@ -61,15 +57,7 @@ class InputImages:
         )
 
     def check(self, name: str) -> None:
-        """Check that what is taken is there, and can be joined.
-
-        Args:
-            name: Of the input.
-
-        Raises:
-            EvaluationError: A crop of the rendered pictures has no pixel, or those that
-                are stitched have different heights.
-        """
+        """Check that no crop is empty, and that crops to stitch have one height."""
         rows, columns = self.rendered
         said = f"input {name}: of cameras rendered in {rows} x {columns}"
         if not all(a < c and b < d for a, b, c, d in self.windows):
@@ -87,11 +75,7 @@ class InputImages:
         return self.table.size or self.port.size
 
     def apply(self, images: Bytes) -> Array:
-        """Return the input, laid out as the graph takes it.
-
-        Args:
-            images: uint8 RGB [6, H, W, 3], of the rendered size.
-        """
+        """Return the input in the graph's layout, from uint8 RGB [6, H, W, 3]."""
         taken = self._taken(images)
         if self.normalization is None:
             planes: Array = np.moveaxis(taken, -1, 1)
@@ -103,7 +87,7 @@ class InputImages:
     def projections(
         self, lidar2img: npt.NDArray[np.float32]
     ) -> npt.NDArray[np.float32]:
-        """Return [cameras, 4, 4], to this input's pixels, of [6, 4, 4] to rendered."""
+        """Convert [6, 4, 4] to rendered pixels into [cameras, 4, 4] to this input's."""
         chosen = lidar2img[list(self.indices)]
         moves = np.stack([self._pixel_move(at) for at in range(len(self.windows))])
         if np.array_equal(moves, np.broadcast_to(np.eye(4), moves.shape)):
@@ -141,7 +125,7 @@ class InputImages:
 
 
 def _resized(picture: Bytes, size: tuple[int, int]) -> Bytes:
-    """Return a picture [rows, columns, 3] of this size, bilinearly, pixel centres."""
+    """Resize a picture [rows, columns, 3] bilinearly, by pixel centres."""
     if picture.shape[:2] == size:
         return picture
     try:
@@ -153,7 +137,7 @@ def _resized(picture: Bytes, size: tuple[int, int]) -> Bytes:
 
 
 def _padded(planes: Array, size: Sequence[int]) -> Array:
-    """Return [n, c, rows, columns] with zeros below and to the right."""
+    """Pad [n, c, rows, columns] with zeros below and to the right."""
     if planes.shape[-2:] == tuple(size):
         return planes
     padded = np.zeros((*planes.shape[:2], *size), planes.dtype)

@@ -1,4 +1,4 @@
-"""What feeds each input of a graph, whether or not it could drive."""
+"""The feed of each input of a graph, whether or not the model could drive."""
 
 from collections.abc import Mapping
 
@@ -25,24 +25,21 @@ from me2e_compress.runtime.session import DTYPES, SessionPort
 def input_uses(
     session: AnySession, adapter: Adapter, recurrent: Mapping[str, str]
 ) -> tuple[PortUse, ...]:
-    """List the inputs of a graph, in its order, with what each is fed.
-
-    Args:
-        session: The graph.
-        adapter: How its inputs relate to the contract.
-        recurrent: Recurrent input to the output that answers it.
-    """
+    """List the inputs of a graph, in its order, with what each is fed."""
+    # what can be made, and why the rest cannot
     ports = {k: v for k, v in session.inputs.items() if k not in recurrent}
     tables = {k: v for k, v in image_tables(adapter, ports).items() if k in ports}
     given = {k: v for k, v in feeds_by_input(adapter, ports).items() if k in ports}
     images, problems = _images(session, adapter, tables)
     size = next((each.rendered for each in images.values()), DEFAULT_IMAGE_SIZE)
     problems |= ModelInputs(session.inputs, adapter, images, given, size).faults()
+    # each input's feed in words
     words = {
         name: f"{answer} of the frame before" for name, answer in recurrent.items()
     }
     words |= {name: image_words(table) for name, table in tables.items()}
     words |= {name: feed_words(feed) for name, feed in given.items()}
+    # faults of types and first values
     for name, port in session.inputs.items():
         if port.type not in DTYPES:
             problems[name] = f"input {name} is {port.type}: it cannot be fed"

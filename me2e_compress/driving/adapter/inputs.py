@@ -1,4 +1,4 @@
-"""An observation laid out as the inputs of a graph."""
+"""Convert an observation to the inputs of a graph."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -33,22 +33,14 @@ CONTRACT: Mapping[str, str] = {
     "command": "command",
     "timestamp": "timestamp",
 }
-"""Inputs of the contract that are no images, to what feeds them."""
+"""Inputs of the contract that are no images, with the sources that feed them."""
 
 BYTES = "tensor(uint8)"
 
 
 @dataclass(frozen=True)
 class ModelInputs:
-    """How a graph is fed at each decision, recurrent inputs left out.
-
-    Attributes:
-        ports: Of the graph.
-        adapter: How they relate to the contract.
-        images: Image inputs, by the graph's name.
-        given: The other ones.
-        image_size: Rows and columns in which the cameras are rendered.
-    """
+    """How a graph is fed at each decision, without recurrent inputs."""
 
     ports: Mapping[str, SessionPort]
     adapter: Adapter
@@ -63,14 +55,8 @@ class ModelInputs:
     ) -> Self:
         """Check the inputs of a graph against the contract.
 
-        Args:
-            session: The graph.
-            adapter: How its inputs relate to the contract.
-            recurrent: Recurrent input to the output that answers it.
-
         Raises:
-            EvaluationError: Naming the first port that is missing, unknown, fed by
-                nothing, or of a shape or type that cannot be fed.
+            EvaluationError: Names the first port that cannot be fed.
         """
         ports = {k: v for k, v in session.inputs.items() if k not in recurrent}
         _check_names(session, adapter, recurrent)
@@ -86,27 +72,23 @@ class ModelInputs:
 
     @property
     def normalization(self) -> ImageNormalization | None:
-        """How the first image input is normalised; None where it is not."""
+        """How the first image input is normalised; None if it is not."""
         found = (each.normalization for each in self.images.values())
         return next(found, None)
 
     @property
     def cameras(self) -> tuple[int, ...]:
-        """Places among the six of those that the model sees, ascending."""
+        """Indices among the six cameras of those that the model sees, ascending."""
         return tuple(
             sorted({at for each in self.images.values() for at in each.indices})
         )
 
     def reset(self) -> None:
-        """Begin a route: nothing was before."""
+        """Begin a route: forget the last one."""
         self._track.clear()
 
     def feeds(self, observation: Observation) -> dict[str, Array]:
-        """Lay an observation out as the graph takes it; call it once a decision.
-
-        Raises:
-            EvaluationError: It lacks what an input is made of.
-        """
+        """Convert an observation to the graph's inputs; call it once per decision."""
         arrays: dict[str, Array] = {}
         if self.images:
             if observation.images is None:
@@ -145,7 +127,7 @@ class ModelInputs:
         )
 
     def faults(self) -> dict[str, str]:
-        """Say of every input that cannot be fed so why, in the order of the feeds."""
+        """Return the reason for each input that cannot be fed, in feed order."""
         nothing = self.nothing(0)
         self._track.note(0, nothing.motion)
         seen, found = self._seen(nothing), dict[str, str]()
@@ -170,7 +152,7 @@ def contract_names(adapter: Adapter) -> dict[str, str]:
 def image_tables(
     adapter: Adapter, ports: Mapping[str, SessionPort]
 ) -> dict[str, ImageInput]:
-    """Return what each image input shows: as the adapter says, and the contract's."""
+    """Return the settings of each image input, from the adapter and the contract."""
     usual = adapter.inputs.get(IMAGES, IMAGES)
     if usual in ports and usual not in {**adapter.images, **adapter.feeds}:
         return {usual: ImageInput(), **adapter.images}
@@ -180,7 +162,7 @@ def image_tables(
 def feeds_by_input(
     adapter: Adapter, ports: Mapping[str, SessionPort]
 ) -> dict[str, Feed]:
-    """Return how each other input is fed: as the adapter says, and the contract's."""
+    """Return the feed of each other input, from the adapter and the contract."""
     named = {**adapter.images, **adapter.feeds}
     usual = contract_names(adapter)
     return {
@@ -193,11 +175,8 @@ def feeds_by_input(
 def images_by_input(
     session: AnySession, adapter: Adapter, tables: Mapping[str, ImageInput]
 ) -> tuple[dict[str, InputImages], tuple[int, int]]:
-    """Return the image inputs, and the size in which the cameras are rendered.
-
-    Raises:
-        EvaluationError: One cannot be made so, or its normalisation is not known.
-    """
+    """Return the image inputs, and the size in which the cameras are rendered."""
+    # one rendered size serves all inputs: the largest that any of them asks for
     ports = {
         name: ImagePort.of(name, session.inputs[name].shape, table)
         for name, table in tables.items()
@@ -205,6 +184,7 @@ def images_by_input(
     sizes = [rendered_size(name, tables[name], port) for name, port in ports.items()]
     rows, columns = zip(*(sizes or [DEFAULT_IMAGE_SIZE]), strict=True)
     rendered = max(rows), max(columns)
+    # inputs of bytes are not normalised
     found: dict[str, InputImages] = {}
     for name, table in tables.items():
         norm = None
@@ -221,7 +201,7 @@ def images_by_input(
 def _check_names(
     session: AnySession, adapter: Adapter, recurrent: Mapping[str, str]
 ) -> None:
-    """Check that what the adapter names is there, and named once."""
+    """Check that every name in the adapter exists and is used once."""
     for name, answer in recurrent.items():
         _exists(name, session.inputs, "input")
         _exists(answer, session.outputs, "output")
@@ -245,7 +225,7 @@ def _exists(name: str, ports: Mapping[str, SessionPort], kind: str) -> None:
 
 
 def unfed(name: str) -> str:
-    """Say what could feed an input."""
+    """Return the message for an input that nothing feeds."""
     return (
         f"input {name} is none of {', '.join((IMAGES, *CONTRACT))}, no output is known"
         f" to feed it back, and the adapter has no [feeds.{name}] (sources:"

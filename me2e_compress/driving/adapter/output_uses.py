@@ -1,4 +1,4 @@
-"""What each output of a graph is used as, whether or not it could drive."""
+"""The use of each output of a graph, whether or not the model could drive."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,12 +16,10 @@ from me2e_compress.runtime.plan_adapter import CONTRACT_STEP_S, PlanAdapter
 
 @dataclass(frozen=True)
 class OutputUses:
-    """What drives, and what is read for it.
+    """Which outputs drive, and how they are read.
 
-    Attributes:
-        drives_by: The plan, the controls or both, in words; empty where there is none.
-        uses: What is read of each output, by its name.
-        problems: What is named and not there.
+    ``drives_by`` names the plan, the controls or both in words, and is empty if there
+    is none; ``uses`` is by output; ``problems`` are names that do not exist.
     """
 
     drives_by: str
@@ -30,7 +28,7 @@ class OutputUses:
 
     @classmethod
     def of(cls, session: AnySession, adapter: Adapter) -> Self:
-        """Find them for a graph."""
+        """Find the uses of a graph's outputs."""
         try:
             found = ModelOutputs.of(session, adapter)
         except (EvaluationError, GraphError) as error:
@@ -50,12 +48,7 @@ class OutputUses:
     def ports(
         self, session: AnySession, recurrent: Mapping[str, str]
     ) -> tuple[PortUse, ...]:
-        """List the outputs of the graph, in its order.
-
-        Args:
-            session: The graph.
-            recurrent: Recurrent input to the output that answers it.
-        """
+        """List the outputs of the graph, in its order."""
         back = {answer: f"fed back to {name}" for name, answer in recurrent.items()}
         return tuple(
             PortUse(name, port.shape, element_type(port.type), _both(name, self, back))

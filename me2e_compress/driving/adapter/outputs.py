@@ -1,4 +1,4 @@
-"""What a graph's outputs say, as a policy's answer."""
+"""Convert a graph's outputs to a policy's answer."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,18 +16,15 @@ from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 
 COMMAND = "command"
-"""What the navigator's command is called beside the inputs."""
+"""Name of the navigator's command among the inputs."""
 
 
 @dataclass(frozen=True)
 class ModelOutputs:
-    """How a graph is read at each decision, recurrent outputs left out.
+    """How a graph's outputs are read at each decision, without recurrent ones.
 
-    Attributes:
-        adapter: How its outputs relate to the contract.
-        plan: How its plan is read; None where controls alone drive.
-        control: How its controls are read; None where the plan alone drives.
-        fusion: Fuses both, and remembers; None where one drives.
+    ``plan`` is None if the controls alone drive, ``control`` if the plan alone drives;
+    ``fusion`` fuses both and has state.
     """
 
     adapter: Adapter
@@ -37,12 +34,7 @@ class ModelOutputs:
 
     @classmethod
     def of(cls, session: AnySession, adapter: Adapter) -> Self:
-        """Find what is read of a graph's outputs.
-
-        Raises:
-            EvaluationError: Nothing names the plan or the controls, or the graph has no
-                such output.
-        """
+        """Find the outputs of a graph to read."""
         outputs, control = list(session.outputs), adapter.control
         fusion = None if adapter.fusion is None else HeadFusion(adapter.fusion)
         if control is not None:
@@ -64,16 +56,7 @@ class ModelOutputs:
         feeds: Mapping[str, Array],
         observation: Observation,
     ) -> Trajectory | None:
-        """Return the plan in the ego frame; None where controls alone drive.
-
-        Args:
-            outputs: Of the graph.
-            feeds: What it was fed.
-            observation: What that was made of.
-
-        Raises:
-            GraphError: See `PlanAdapter.plan`.
-        """
+        """Return the plan in the ego frame; None where controls alone drive."""
         if self.plan is None:
             return None
         command = np.array([observation.command])
@@ -86,17 +69,7 @@ class ModelOutputs:
         outputs: Mapping[str, Array],
         observation: Observation,
     ) -> Answer:
-        """Return what drives: the plan, the controls, or both fused.
-
-        Args:
-            plan: From :meth:`trajectory`, as the host left it.
-            outputs: Of the graph.
-            observation: What the graph was fed is made of.
-
-        Raises:
-            EvaluationError: An output has not as many numbers, or fusion lacks the
-                target point.
-        """
+        """Return the plan (as the host stage left it), the controls, or both fused."""
         if self.control is None:
             assert plan is not None
             return plan
@@ -111,11 +84,7 @@ class ModelOutputs:
 
 
 def check_control(control: ControlAdapter, outputs: Sequence[str]) -> None:
-    """Check that a graph has the outputs that are read as controls.
-
-    Raises:
-        EvaluationError: One is not there.
-    """
+    """Check that a graph has the outputs that are read as controls."""
     there = dict.fromkeys(outputs)
     for text, what in control.outputs.items():
         name, _ = output_named(text, there)
@@ -127,11 +96,7 @@ def check_control(control: ControlAdapter, outputs: Sequence[str]) -> None:
 
 
 def check_command(plan: PlanAdapter, inputs: Collection[str]) -> None:
-    """Check that what picks the plan's mode is there: an input, or the command.
-
-    Raises:
-        EvaluationError: It is not.
-    """
+    """Check that the input that picks the plan's mode exists, or is the command."""
     if plan.command_input not in (None, COMMAND, *inputs):
         raise EvaluationError(
             f"no input {plan.command_input}, which picks the plan's mode"
@@ -143,16 +108,8 @@ def check_command(plan: PlanAdapter, inputs: Collection[str]) -> None:
 def plan_of(
     adapted: PlanAdapter | None, metadata: Mapping[str, str], outputs: Sequence[str]
 ) -> PlanAdapter:
-    """Return the adapter's reading of the plan, or else the model's own.
-
-    Args:
-        adapted: What the adapter says of it.
-        metadata: Of the model.
-        outputs: Of the model, by name.
-
-    Raises:
-        EvaluationError: Nothing names the plan, or the model has no such output.
-    """
+    """Return the adapter's reading of the plan, or else the metadata's."""
+    # the plan and the scores that pick its mode must be outputs
     found = adapted or PlanAdapter.of(metadata, outputs)
     there = ", ".join(outputs)
     if found is None:

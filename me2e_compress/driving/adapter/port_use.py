@@ -1,4 +1,4 @@
-"""What an input of a graph is fed from, or what an output is used as."""
+"""An input of a graph with its feed, or an output with its use."""
 
 from dataclasses import dataclass
 
@@ -9,12 +9,8 @@ from me2e_compress.driving.ports import Shape
 class PortUse:
     """One input or output of a graph, and its part in driving.
 
-    Attributes:
-        name: Of the port.
-        shape: As the graph declares it.
-        type: Its element type, ``float`` or ``int64``.
-        use: What an input is fed, or what an output is read as; None is nothing.
-        problem: Why the model cannot drive so; empty where it can.
+    ``use`` is an input's feed or how an output is read, None for nothing; ``problem``
+    says why the model cannot drive so, and is empty where it can.
     """
 
     name: str

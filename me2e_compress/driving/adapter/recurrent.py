@@ -1,4 +1,4 @@
-"""Which inputs are fed back, and what they hold where a route begins."""
+"""Which inputs are fed back, and their values where a route begins."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,11 +30,11 @@ class RecurrentEntry(BaseModel):
     """One entry of ``[recurrent]``; a text alone is the output.
 
     Attributes:
-        answer: The output that is fed back; in the file ``from``. None leaves it to
-            the model's metadata and the naming rules.
+        answer: The output that is fed back; in the file ``from``. None leaves it to the
+            model's metadata and the naming rules.
         first: The value where a route begins: ``zeros``; a file ``.npy``, or ``.npz``
             with an array of the input's name, relative to the adapter; or an input of
-            the graph, whose value of that moment it is.
+            the graph, whose value at that moment it takes.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -50,14 +50,14 @@ class RecurrentEntry(BaseModel):
     @field_validator("first")
     @classmethod
     def _beside(cls, text: str, info: ValidationInfo) -> str:
-        """Find a file beside the adapter."""
+        """Resolve a file relative to the adapter."""
         if Path(text).suffix in _FILES and info.context is not None:
             return str(info.context / text)
         return text
 
     @property
     def file(self) -> Path | None:
-        """The file of the first value, if it is of one."""
+        """The file of the first value, if it is read from one."""
         path = Path(self.first)
         return path if path.suffix in _FILES else None
 
@@ -70,16 +70,8 @@ def answers_by_input(
 ) -> dict[str, str]:
     """Return each recurrent input with the output that answers it.
 
-    The model's own stand beside those that are named, but for inputs that the adapter
-    feeds.
-
-    Args:
-        session: The model.
-        entries: Of the adapter; None names none.
-        fed_otherwise: Inputs that are not recurrent, whatever the model says.
-
-    Raises:
-        EvaluationError: No output answers one that is named.
+    The pairs of the model's own metadata are added to the adapter's entries, except for
+    inputs in ``fed_otherwise``, which the adapter feeds.
     """
     own = {k: v for k, v in session.recurrent.items() if k not in fed_otherwise}
     found: dict[str, str] = {}
@@ -98,10 +90,9 @@ def answers_by_input(
 class FirstValues:
     """What recurrent inputs hold at the first decision of a route.
 
-    Attributes:
-        held: Of files.
-        given: Recurrent input to the input of the graph whose value it takes.
-        zeros: Of the others that the model itself does not know as recurrent.
+    ``held`` values are read from files; ``given`` maps a recurrent input to the input
+    whose value it takes; ``zeros`` are for inputs that only the adapter calls
+    recurrent.
     """
 
     held: Mapping[str, Array]
@@ -112,11 +103,7 @@ class FirstValues:
     def of(
         cls, session: AnySession, entries: Entries, recurrent: Mapping[str, str]
     ) -> Self:
-        """Read the files, and hold every value against its input.
-
-        Raises:
-            EvaluationError: No such file or input, or a value of another shape or type.
-        """
+        """Read the files, and check every value against its input."""
         held: dict[str, Array] = {}
         given: dict[str, str] = {}
         ports = session.inputs
@@ -131,7 +118,7 @@ class FirstValues:
         return cls(held, given, {name: zeros(name, ports[name]) for name in others})
 
     def at(self, feeds: Mapping[str, Array]) -> dict[str, Array]:
-        """Return those that are not zeros, at a decision of these feeds."""
+        """Return those that are not zeros, given the feeds of the first decision."""
         return {**self.held, **{to: feeds[name] for to, name in self.given.items()}}
 
 

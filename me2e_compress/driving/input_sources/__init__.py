@@ -1,4 +1,4 @@
-"""What a model can be fed with, by name.
+"""Input sources by name: what a model can be fed with.
 
 To add a source: write its class, then add it to the table.
 """

@@ -1,4 +1,4 @@
-"""What an input source is."""
+"""The interface of input sources."""
 
 import abc
 from collections.abc import Mapping
@@ -18,15 +18,11 @@ from me2e_compress.runtime.frames import Array
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Observed:
-    """What a source may look at.
+    """The data of a decision that sources may use.
 
-    Attributes:
-        observation: Of this decision.
-        axes: Ground frame of the model.
-        track: Where the ego has been on this route, this decision included.
-        projections: Ego frame to pixels of each image input as the model sees it, by
-            the input's name, float32 [cameras, 4, 4]; without image inputs, under the
-            empty name, to those of the six cameras.
+    ``track`` includes this decision. ``projections`` map the ego frame to pixels of
+    each image input as the model sees it, float32 [cameras, 4, 4], by the input's name;
+    without image inputs, under the empty name, to those of the six cameras.
     """
 
     observation: Observation
@@ -36,11 +32,7 @@ class Observed:
 
     @property
     def motion(self) -> EgoKinematics:
-        """Where the ego is and how it moves.
-
-        Raises:
-            EvaluationError: The observation does not say.
-        """
+        """The ego's pose and motion."""
         if self.observation.motion is None:
             raise EvaluationError(
                 "the adapter asks where the ego is, and the observation does not say"
@@ -52,24 +44,20 @@ class Observed:
         return np.asarray(vectors, np.float64) @ self.axes.to_ego[:2, :2]
 
     def angle(self, counter_clockwise: float) -> float:
-        """Return an angle, or a rate of one, as the model's axes count it."""
+        """Convert an angle, or a rate of one, to the model's axes."""
         return -counter_clockwise if self.axes.is_left_handed else counter_clockwise
 
 
 @dataclass(frozen=True)
 class InputSource(abc.ABC):
-    """Says one thing of a decision in numbers; its fields are its options.
-
-    Class attributes:
-        name: What adapters call it.
-    """
+    """Turns one fact about a decision into numbers; its fields are its options."""
 
     name: ClassVar[str]
 
     @abc.abstractmethod
     def value(self, seen: Observed) -> Array:
-        """Return it, always of the same shape and type, without a batch dimension.
+        """Return an array of fixed shape and type, without a batch dimension.
 
         Raises:
-            EvaluationError: The observation does not tell it.
+            EvaluationError: The observation lacks the data.
         """

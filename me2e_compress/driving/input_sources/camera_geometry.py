@@ -1,4 +1,4 @@
-"""How cameras stand and project, for the pictures that the model sees."""
+"""Camera poses and projections, for the pictures that the model sees."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -55,7 +55,7 @@ class Intrinsics(InputSource):
 
     Attributes:
         images: The image input whose pixels they are; empty where there is one.
-        homogeneous: With a row and a column of the unit matrix more.
+        homogeneous: Pad to 4 by 4 with a row and a column of the unit matrix.
     """
 
     name: ClassVar[str] = "intrinsics"
@@ -89,8 +89,8 @@ def _projections(seen: Observed, images: str) -> Floats:
 def _intrinsics(projections: Floats) -> Floats:
     """Return [cameras, 3, 3], upper triangular, the last row (0, 0, 1).
 
-    Of K R its rows are f r1 + c r3, g r2 + d r3 and r3, the rs being orthonormal: no
-    camera here has skew.
+    The rows of K R are f r1 + c r3, g r2 + d r3 and r3, with orthonormal r: no camera
+    here has skew.
     """
     rows, forward = projections[:, :2, :3], projections[:, 2, :3]
     centre = np.einsum("kij,kj->ki", rows, forward)

@@ -14,15 +14,15 @@ from me2e_compress.runtime.frames import Array
 class CanBus(InputSource):
     """UniAD's and VAD's 18 numbers: [18].
 
-    ``bench2drive``, as the contract has them, has the speed at 7, acceleration at 10
-    and rates of turning at 13. ``nuscenes`` (BEVFormer's ``_get_can_bus_info``) has
-    acceleration at 7, rates of turning at 10 and the velocity at 13. Both have the
-    place at 0, the quaternion at 3, the heading in radians at 16, in degrees at 17.
+    ``bench2drive``, as in the contract, has the speed at 7, acceleration at 10 and
+    angular rates at 13. ``nuscenes`` (BEVFormer's ``_get_can_bus_info``) has
+    acceleration at 7, angular rates at 10 and the velocity at 13. Both have the
+    position at 0, the quaternion at 3, the heading in radians at 16, in degrees at 17.
 
     Attributes:
-        layout: Whose.
-        absolute: Place and degrees as they are, for a model that compares them with
-            those of its last frame itself; else what changed since the last decision.
+        layout: Which layout.
+        absolute: Absolute position and degrees, for a model that compares them with
+            those of its last frame itself; else the change since the last decision.
     """
 
     name: ClassVar[str] = "can-bus"

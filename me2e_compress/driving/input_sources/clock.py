@@ -1,4 +1,4 @@
-"""When it is, and whether anything was before."""
+"""Input sources of time."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -9,7 +9,7 @@ from me2e_compress.driving.input_sources.base import InputSource, Observed
 from me2e_compress.runtime.frames import Array
 
 MICROSECONDS = 1_000_000
-"""In a second."""
+"""Microseconds in a second."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What never changes."""
+"""An input source of constants."""
 
 import math
 from dataclasses import dataclass
@@ -21,9 +21,6 @@ class ConstantInput(InputSource):
     Attributes:
         values: The numbers, row by row.
         shape: Their shape; empty for one row of them.
-
-    Raises:
-        EvaluationError: The shape has not as many, or one is not finite.
     """
 
     name: ClassVar[str] = "constant"
@@ -31,7 +28,6 @@ class ConstantInput(InputSource):
     shape: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the shape."""
         if not all(abs(each) <= LARGEST for each in self.values):
             raise EvaluationError(f"constant: values must be finite, up to {LARGEST:g}")
         sides = self.shape or (len(self.values),)

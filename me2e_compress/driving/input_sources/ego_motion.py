@@ -1,4 +1,4 @@
-"""How the ego moves, in SI units and the model's axes."""
+"""Input sources of the ego's motion, in SI units and the model's axes."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -36,7 +36,7 @@ class Acceleration(InputSource):
     """The acceleration, m/s2: [2], or [3].
 
     Attributes:
-        vertical: The vertical one, too.
+        vertical: Add the vertical component.
     """
 
     name: ClassVar[str] = "acceleration"

@@ -18,8 +18,8 @@ class LidarToGlobalRotation(InputSource):
     """UniAD's ``l2g_r_mat``: [3, 3].
 
     Attributes:
-        transposed: For points as rows, p @ R + t, as UniAD of nuScenes takes it; else
-            for columns, R @ p + t.
+        transposed: For row vectors, p @ R + t, as UniAD of nuScenes takes it; else for
+            column vectors, R @ p + t.
     """
 
     name: ClassVar[str] = "l2g-rotation"

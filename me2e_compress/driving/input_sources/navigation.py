@@ -1,4 +1,4 @@
-"""Where the route goes next: a command, a point to aim at."""
+"""Input sources of the route ahead: a command, a point to aim at."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -17,14 +17,11 @@ class NavigationCommand(InputSource):
     """The command, a number [] or one-hot [classes].
 
     Attributes:
-        numbers: The model's number of left, right, straight, follow the lane, change
-            to the left and change to the right. The default is Bench2Drive's (CARLA's
+        numbers: The model's number of left, right, straight, follow the lane, change to
+            the left and change to the right. The default is Bench2Drive's (CARLA's
             RoadOption less one); nuScenes' VAD, which has right, left and straight
             alone, is [1, 0, 2, 2, 1, 0].
         one_hot: How many classes the vector has; 0 gives the number itself.
-
-    Raises:
-        EvaluationError: A number has no place in the vector, or is negative.
     """
 
     name: ClassVar[str] = "command"
@@ -32,7 +29,6 @@ class NavigationCommand(InputSource):
     one_hot: int = 0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if self.one_hot and not 0 <= min(self.numbers) <= max(self.numbers) < (
             self.one_hot
         ):
@@ -65,11 +61,7 @@ class TargetPoint(InputSource):
     which: Literal["near", "far"] = "near"
 
     def value(self, seen: Observed) -> Array:
-        """Return float64 [2].
-
-        Raises:
-            EvaluationError: The simulator tells none.
-        """
+        """Return float64 [2]."""
         points = seen.observation.target_points
         if points is None:
             raise EvaluationError(

@@ -1,4 +1,4 @@
-"""The ego's own past: positions, headings, speeds."""
+"""Input sources of the ego's history: positions, headings, speeds."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -16,19 +16,16 @@ Quantity = Literal["x", "y", "heading", "speed"]
 class Past(InputSource):
     """States of the ego before now: [steps, quantities], the oldest first.
 
-    Places and headings are seen from where the ego is now, metres and radians in the
+    Positions and headings are relative to the present pose, metres and radians in the
     model's axes; the present is not among them. Between decisions they are
     interpolated; before a route's first decision the ego stood still.
 
     Attributes:
-        steps: How many.
+        steps: How many states.
         spacing_s: Seconds from one to the next, the last being that long ago.
-        quantities: Of each: x, y, heading, speed (m/s).
-        deltas: What changed from each to the one after it, the last one to now.
-        newest_first: The other way round.
-
-    Raises:
-        EvaluationError: No step, or no time between two.
+        quantities: Columns of the result: x, y, heading, speed (m/s).
+        deltas: Changes from each state to the one after it, the last one to now.
+        newest_first: Reverse the order.
     """
 
     name: ClassVar[str] = "past"
@@ -39,7 +36,6 @@ class Past(InputSource):
     newest_first: bool = False
 
     def __post_init__(self) -> None:
-        """Check the times."""
         if self.steps < 1 or not 0.0 < self.spacing_s < float("inf"):
             raise EvaluationError(
                 f"past: {self.steps} steps {self.spacing_s:g} s apart: both must be"

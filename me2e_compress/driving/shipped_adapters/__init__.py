@@ -9,18 +9,14 @@ __all__ = ["adapter_file", "shipped_adapters"]
 
 
 def shipped_adapters() -> list[str]:
-    """Name them."""
+    """List their names."""
     folder = resources.files(__name__)
     names = (file.name for file in folder.iterdir() if file.name.endswith(".toml"))
     return sorted(name.removesuffix(".toml") for name in names)
 
 
 def adapter_file(named: Path) -> Path:
-    """Find the file that a path or a name means; an existing file wins.
-
-    Raises:
-        EvaluationError: Neither.
-    """
+    """Return the file of a path or a shipped name; an existing file wins."""
     if named.is_file():
         return named
     if str(named) in shipped_adapters():

@@ -1,6 +1,5 @@
-"""Reads the results of real Bench2Drive and CARLA leaderboard runs.
+"""Readers of results of real Bench2Drive and CARLA leaderboard runs.
 
-One record becomes one `Episode`: what the simulator scored stands in `Episode.given`,
-the motion of the ego comes from the agent's ``metric_info.json``. Nothing of CARLA is
-imported.
+One record becomes one `Episode`: the simulator's own scores are in `Episode.given`, the
+ego's motion comes from the agent's ``metric_info.json``. CARLA is not imported.
 """

@@ -1,4 +1,4 @@
-"""Which recording belongs to which record."""
+"""Match recordings to records."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,16 +9,11 @@ from me2e_compress.evaluators.bench2drive.result_files import ResultFile
 
 
 class DriveRecordings:
-    """Finds the recording of a record, and those that are of none.
+    """Finds the recording (or log) of a record, and those that match no record.
 
-    The name of a drive ends in the time of its start, so another drive of the same
-    route has another. A folder on the way to the recording is called after it, or the
-    file is; agents may put the name of the routes' file before it. A recording that
-    lies beside the only record of a folder is that record's.
-
-    Args:
-        paths: Of all recordings; or of all logs, which are found alike.
-        results: All results files.
+    A drive's name ends in its start time, so repeated drives of a route differ. The
+    recording's folder or file has that name, sometimes with the name of the routes file
+    as a prefix. A recording next to the only record of a folder belongs to that record.
     """
 
     def __init__(self, paths: Sequence[Path], results: Sequence[ResultFile]) -> None:
@@ -33,7 +28,7 @@ class DriveRecordings:
         }
 
     def of(self, record: RouteRecord) -> tuple[Path, ...]:
-        """Return the recordings of a record, the best fitting first; mostly one."""
+        """Return the recordings of a record, best match first; usually one."""
         found = self._named(record.recording) if record.recording else ()
         if not found:
             where = self._beside.get(record.content)
@@ -44,7 +39,7 @@ class DriveRecordings:
 
     @property
     def of_none(self) -> list[Path]:
-        """Recordings that are of no record asked for so far."""
+        """Recordings that matched no record asked for so far."""
         return [path for path in self._names if path not in self._taken]
 
     def _named(self, name: str) -> tuple[Path, ...]:

@@ -1,4 +1,4 @@
-"""The decisions that `RealTimeAgent` noted of a drive, a line each."""
+"""Decisions logged by `RealTimeAgent`, one per line."""
 
 from pathlib import Path
 from typing import Annotated
@@ -25,9 +25,8 @@ def read_decisions(path: Path) -> tuple[InferenceRecord, ...]:
     """Read a ``decisions.jsonl``.
 
     Raises:
-        BrokenRecordingError: A line is not whole.
-        MalformedError: It is no text file.
-        OSError: It cannot be read.
+        BrokenRecordingError: A line is incomplete.
+        MalformedError: It is not a text file.
     """
     found = list[InferenceRecord]()
     lines = documents.content(path, documents.LARGEST_LOG_BYTES).splitlines()

@@ -1,4 +1,4 @@
-"""Results of real runs as an evaluator: what drove in CARLA, as episodes."""
+"""Evaluator that turns results of real CARLA runs into episodes."""
 
 import dataclasses
 from collections import Counter
@@ -35,30 +35,26 @@ from me2e_compress.metrics.scores import FULL_SET
 
 @dataclass(frozen=True)
 class CollectedResults:
-    """Every route once, and what was found beside.
+    """Every route once, and everything else that was found.
 
     Attributes:
-        episodes: In the order of their routes' numbers.
-        route_set: The version of Bench2Drive that brought the routes; None if they
-            are of neither.
-        crashed: Routes on which the simulator or the agent broke down.
+        episodes: In the order of route numbers.
+        route_set: The version of Bench2Drive that the routes are from, if any.
         missing: Numbers of the set's routes without a record.
-        foreign: Routes of another set.
-        repeated: Routes with the same record more than once, as a merged file has
-            beside its parts.
-        rerun: Routes that crashed first and were driven again: the crash does not
+        repeated: Routes with identical records, as when a merged file lies next to its
+            parts.
+        rerun: Routes that crashed first and were driven again; the crash does not
             count.
-        contradictory: Routes driven more than once with different results: the lowest
-            driving score counts.
-        broken: Files and records that are not whole, with the reason.
-        unfinished: Results files without a record, as a worker that was killed on its
-            first route leaves them.
+        contradictory: Routes with different results; the lowest driving score counts.
+        broken: Incomplete files and records, with the reason.
+        unfinished: Results files without a record, left by a worker killed on its first
+            route.
         unrecorded: Routes without a recording of the ego.
-        off_rate: Routes recorded at another rate than the simulator's, with the
-            seconds between two steps.
+        off_rate: Seconds between two steps, for routes not recorded at the simulator's
+            rate.
         repetitions: How often the set was driven: a leaderboard's ``--repetitions``.
-        stated: Merged files, which say something of themselves.
-        notes: Surprises, one line each.
+        stated: Merged files that state scores of their own.
+        notes: Unexpected findings, one line each.
     """
 
     episodes: tuple[Episode, ...]
@@ -107,7 +103,7 @@ class Bench2DriveResults:
         yield from self.collect().episodes
 
     def collect(self) -> CollectedResults:
-        """Read everything, and say what was found beside the episodes.
+        """Read everything, and report what was found besides the episodes.
 
         Raises:
             EvaluationError: There is no such folder, or no record below it.
@@ -117,6 +113,7 @@ class Bench2DriveResults:
             apart = find_files(self.metrics)
             found.recordings += apart.recordings
             found.decisions += apart.decisions
+        # links may lead to the same file twice
         found.recordings = _once(found.recordings)
         found.decisions = _once(found.decisions)
         if not any(file.records for file in found.results):
@@ -139,8 +136,6 @@ def _nothing(found: FoundFiles) -> str:
 
 
 class _Collection:
-    """Sorts what was found."""
-
     def __init__(self, found: FoundFiles) -> None:
         self.found = found
         self.repeated, self.rerun = list[str](), list[str]()
@@ -156,6 +151,7 @@ class _Collection:
         records = self._one_each()
         recorded = DriveRecordings(self.found.recordings, self.found.results)
         logs = DriveRecordings(self.found.decisions, self.found.results)
+        # episodes with frames and decisions
         episodes = tuple(
             dataclasses.replace(
                 self._with_frames(each, recorded),
@@ -166,6 +162,7 @@ class _Collection:
         if others := recorded.of_none:
             more = f" and {len(others) - 1} others" if len(others) > 1 else ""
             self.notes.insert(0, f"{others[0]}{more}: of no record")
+        # which routes of the set are missing, and which are foreign
         numbers = [each.number for each in records]
         route_set = likely_set(numbers)
         whole = ROUTE_SETS[route_set] if route_set else frozenset[str]()
@@ -206,14 +203,17 @@ class _Collection:
         return sorted(chosen, key=lambda each: (by_number(each.number), each.content))
 
     def _chosen(self, route: str, records: Sequence[RouteRecord]) -> RouteRecord:
-        """Choose one record of a route; what cannot be known must not flatter.
+        """Choose one record of a route, so that uncertainty never improves a result.
 
-        A crash gives way to a drive, as when Bench2Drive resumes. Of drives that ended
-        differently the lowest score counts: the best of two would be no evaluation.
+        A drive replaces a crash, as when Bench2Drive resumes. Among drives with
+        different results the lowest score counts: taking the best would bias the
+        evaluation.
         """
+        # identical copies count once
         distinct = list({each.content: each for each in records}.values())
         if len(distinct) < len(records):
             self.repeated.append(route)
+        # crashes count only without a drive
         drives = [each for each in distinct if not each.crashed]
         if drives and len(drives) < len(distinct):
             self.rerun.append(route)
@@ -241,7 +241,7 @@ class _Collection:
         return episode
 
     def _decisions(self, paths: Sequence[Path]) -> tuple[InferenceRecord, ...]:
-        """Return the decisions of a drive; a log that is not whole is named."""
+        """Return the decisions of a drive; an incomplete log is reported."""
         for path in paths:
             try:
                 return read_decisions(path)
@@ -250,7 +250,7 @@ class _Collection:
         return ()
 
     def _read(self, path: Path) -> RecordedRoute | None:
-        """Return a recording; one that is not whole is named."""
+        """Return a recording; an incomplete one is reported."""
         try:
             raw = documents.from_json(documents.content(path), finite=False)
             return read_recording(raw)

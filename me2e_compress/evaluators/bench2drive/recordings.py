@@ -1,8 +1,8 @@
-"""What an agent recorded of its ego: ``metric_info.json``, as frames.
+"""Ego recordings of agents, ``metric_info.json``, as frames.
 
-Bench2Drive's agents write, for every step, acceleration (m/s2, world), angular velocity
+For every step, Bench2Drive's agents write acceleration (m/s2, world), angular velocity
 (degrees per second), forward and right vector, location (m) and rotation (degrees), in
-CARLA's left-handed world. There is no time in it: it follows from the motion itself.
+CARLA's left-handed world. They write no time; it is inferred from the motion.
 """
 
 import re
@@ -35,21 +35,21 @@ Floats = npt.NDArray[np.float64]
 
 
 class BrokenRecordingError(ValueError):
-    """A recording is not whole; the message is one line, without the file."""
+    """A recording is incomplete; the message is one line, without the file name."""
 
 
 @dataclass(frozen=True)
 class RecordedRoute:
-    """One recording in our conventions: x east, y north, turns counter-clockwise.
+    """One recording in our conventions: x east, y north, angles counter-clockwise.
 
     Attributes:
-        steps: [N] the agent's own counts, in the order of the file.
+        steps: [N] step counts of the agent, in the order of the file.
         position_m: [N, 2].
         acceleration_mps2: [N, 2] in the world.
-        heading_rad: [N], without jumps.
+        heading_rad: [N], unwrapped.
         yaw_rate_radps: [N].
-        along_mps2: [N] acceleration along the ego's heading.
-        left_mps2: [N] acceleration to its left.
+        along_mps2: [N] acceleration along the heading.
+        left_mps2: [N] acceleration to the left.
     """
 
     steps: npt.NDArray[np.int64]
@@ -62,17 +62,14 @@ class RecordedRoute:
 
     @property
     def in_order(self) -> bool:
-        """Whether the steps follow each other as they were driven."""
+        """Whether the steps are strictly increasing."""
         return bool((np.diff(self.steps) > 0).all())
 
     def frames(self, interval_s: float) -> tuple[EgoFrame, ...]:
-        """Return a frame a step.
+        """Return one frame per step.
 
-        The speed is that of the positions. What of the route was passed is not
-        recorded: ``route_m`` is the way driven.
-
-        Args:
-            interval_s: Seconds from one step to the next.
+        The speed is the derivative of the position. Route progress is not recorded:
+        ``route_m`` is the distance driven.
         """
         moved = _lengths(np.diff(self.position_m, axis=0))
         columns = {
@@ -105,22 +102,22 @@ class RecordedRoute:
     def interval_s(self, duration_s: float | None = None) -> float:
         """Return the seconds from one step to the next.
 
-        Position and acceleration tell of the same motion, and so do heading and yaw
-        rate; what they say decides where they are alike. Where they are only roughly,
-        as at 2 Hz, the duration divided by the steps decides if it is one of the usual
-        intervals and roughly agrees; it decides alone for an ego that went straight
-        ahead at one speed. Without any of them, as for one that stood, the agent's
-        steps are ticks.
-
-        Args:
-            duration_s: Simulated seconds of the whole route.
+        Position and acceleration describe the same motion, and so do heading and yaw
+        rate: where such a pair correlates, their ratio gives the interval. With a weak
+        correlation, as at 2 Hz, the route's duration divided by the steps decides if it
+        is near a usual interval and roughly agrees; it decides alone for an ego that
+        drove straight at constant speed. Without any of these, as for an ego that
+        stood, the agent's steps are taken as ticks.
         """
+        # the best correlated pair of signals
         found = [each for each in self._ties() if each.likeness > _LIKENESS]
         moved = max(found, key=lambda each: each.likeness, default=None)
         lasted = None if duration_s is None else _usual(duration_s / len(self.steps))
+        # no motion to infer from: duration, or the agent's steps
         if moved is None:
             stood = float(np.ptp(self.position_m, axis=0).max()) < _STOOD_M
             return self._from_steps() if stood or lasted is None else lasted
+        # a weak correlation yields to a duration that agrees
         apart = abs(np.log(lasted / moved.interval_s)) if lasted else np.inf
         if lasted and moved.likeness < _SURE and apart < _AGREES:
             return lasted
@@ -129,9 +126,10 @@ class RecordedRoute:
     def _ties(self) -> Iterator["_Tie"]:
         """Compare pairs of signals that differ by a power of the interval.
 
-        Second differences of the position are dt2 times the acceleration: CARLA's is
-        that of the step that led to a moment, one that was computed may be that of the
-        moment between. First differences of the heading are dt times the yaw rate.
+        Second differences of the position are dt^2 times the acceleration. CARLA's
+        belongs to the step that led to a moment, a computed one to the moment in
+        between, so both are tried. First differences of the heading are dt times the
+        yaw rate.
         """
         bends, turns = np.diff(self.position_m, 2, axis=0), np.diff(self.heading_rad)
         between = (self.yaw_rate_radps[1:] + self.yaw_rate_radps[:-1]) / 2.0
@@ -148,14 +146,14 @@ class RecordedRoute:
 
 @dataclass(frozen=True)
 class _Tie:
-    """What two signals say of the interval, and how alike they are, -1 to 1."""
+    """The interval that two signals imply, and their correlation, -1 to 1."""
 
     interval_s: float
     likeness: float
 
     @classmethod
     def of(cls, of: Floats, over: Floats, power: float, least: float) -> "_Tie":
-        """Compare their root mean squares: noise in either moves that the least."""
+        """Compare root mean squares: they are least sensitive to noise."""
         if not over.size:
             return cls(0.0, 0.0)
         left, right = (float(np.sqrt((each * each).mean())) for each in (of, over))
@@ -166,7 +164,6 @@ class _Tie:
 
 
 def _lengths(vectors: Any) -> Floats:
-    """Return the length of each of [N, 2] vectors."""
     return np.asarray(np.hypot(vectors[:, 0], vectors[:, 1]))
 
 
@@ -175,20 +172,16 @@ def _nearest(interval_s: float) -> float:
 
 
 def _usual(interval_s: float) -> float | None:
-    """Return the interval that is within a tenth of one of the usual, if it is."""
+    """Return the usual interval within 10 % of this one, if there is one."""
     nearest = _nearest(interval_s)
     return nearest if abs(np.log(nearest / interval_s)) < _EQUALS else None
 
 
 def read_recording(raw: object) -> RecordedRoute:
-    """Read a ``metric_info.json``.
-
-    Args:
-        raw: As JSON gives it; numbers may be infinite or NaN.
+    """Read a parsed ``metric_info.json``; its numbers may be infinite or NaN.
 
     Raises:
-        BrokenRecordingError: It holds no step, or one that lacks a part, is of another
-            form or not finite.
+        BrokenRecordingError: There is no step, or one is incomplete or not finite.
     """
     if not isinstance(raw, dict) or not raw:
         raise BrokenRecordingError("no step is recorded")

@@ -1,7 +1,7 @@
-"""One record of a results file: how a route ended, what it cost, what was scored.
+"""One record of a results file: how a route ended, its infractions and scores.
 
-The form is that of leaderboard/utils/statistics_manager.py, of Bench2Drive and of the
-CARLA leaderboard alike; scenario and folder of recordings are Bench2Drive's additions.
+The format is that of leaderboard/utils/statistics_manager.py, shared by Bench2Drive and
+the CARLA leaderboard; Bench2Drive adds scenario and recording folder.
 """
 
 import re
@@ -44,21 +44,21 @@ CRASHES = (Ending.POLICY_FAILED, Ending.SIMULATOR_FAILED)
 
 
 class BrokenRecordError(ValueError):
-    """A record is not whole; the message is one line, without the file."""
+    """A record is incomplete; the message is one line, without the file name."""
 
 
 @dataclass(frozen=True)
 class RouteRecord:
-    """One record, read.
+    """One parsed record.
 
     Attributes:
-        episode: What happened, without frames.
-        number: The route's id in its file of routes: ``1711``.
-        recording: Name of the folder of its ``metric_info.json``; None if it has none.
-        duration_s: Simulated seconds; None where it does not tell.
-        content: How the route ended, its infractions and scores, to tell a copy from
-            a drive with another result.
-        notes: What of it could not be understood, one line each.
+        episode: The episode, without frames.
+        number: The route's id in its routes file, such as ``1711``.
+        recording: Name of the folder of its ``metric_info.json``, if any.
+        duration_s: Simulated seconds; None if not stated.
+        content: How the route ended, its infractions and scores, to tell a copy from a
+            drive with another result.
+        notes: What could not be interpreted, one line each.
     """
 
     episode: Episode
@@ -75,14 +75,11 @@ class RouteRecord:
 
 
 def read_record(raw: object) -> RouteRecord:
-    """Read one record.
-
-    Args:
-        raw: As JSON gives it; numbers may be infinite or NaN.
+    """Read one parsed record; its numbers may be infinite or NaN.
 
     Raises:
-        BrokenRecordError: It lacks a part, one is of another type or not finite, or
-            the route was not finished.
+        BrokenRecordError: A part is missing, mistyped or not finite, or the route was
+            not finished.
     """
     try:
         record = _Record.model_validate(raw)
@@ -90,6 +87,7 @@ def read_record(raw: object) -> RouteRecord:
         raise BrokenRecordError(_complaint(error)) from error
     if not _ROUTE.fullmatch(record.route_id):
         raise BrokenRecordError(f"route_id: {record.route_id[:60]!r} is no name")
+    # infractions, ending and scenario
     infractions, ratios, notes = _infractions(record)
     ending = _ending(record.status)
     scenario = type_of(record.scenario_name or "")
@@ -112,6 +110,7 @@ def read_record(raw: object) -> RouteRecord:
             record.scores.score_composed,
         ),
     )
+    # metadata that tells copies from other drives
     duration_s = record.meta.duration_game
     return RouteRecord(
         episode,
@@ -124,7 +123,7 @@ def read_record(raw: object) -> RouteRecord:
 
 
 def number_of(route_id: str) -> str:
-    """Return ``1711`` of ``RouteScenario_1711_rep0``, as Bench2Drive's tools do."""
+    """Return ``1711`` for ``RouteScenario_1711_rep0``, as Bench2Drive's tools do."""
     parts = route_id.split("_")
     return parts[1] if len(parts) > 1 else route_id
 
@@ -174,7 +173,7 @@ def _ending(status: str) -> Ending:
 def _infractions(
     record: _Record,
 ) -> tuple[tuple[Infraction, ...], tuple[float, ...], tuple[str, ...]]:
-    """Return infractions, percentages of speed, and what was not understood."""
+    """Return infractions, speed percentages, and notes on what is unclear."""
     found, notes = list[Infraction](), list[str]()
     for key, messages in record.infractions.items():
         if key not in set(InfractionKind):
@@ -206,7 +205,7 @@ def _infraction(kind: InfractionKind, message: str) -> Infraction:
 
 
 def _percent(kind: InfractionKind, message: str) -> float | None:
-    """Read the share outside the lanes, or the speed over the traffic's."""
+    """Read the share outside the lanes, or the speed relative to the traffic's."""
     if kind is InfractionKind.OUTSIDE_ROUTE_LANES:
         share = _OUTSIDE.search(message) or _PERCENT.search(message)
     elif kind is InfractionKind.MIN_SPEED:
@@ -219,7 +218,7 @@ def _percent(kind: InfractionKind, message: str) -> float | None:
 
 
 def _lacking(infractions: list[Infraction]) -> Iterator[str]:
-    """Name the messages that should hold a percentage and do not."""
+    """Name the messages that lack an expected percentage."""
     kinds = (InfractionKind.OUTSIDE_ROUTE_LANES, InfractionKind.MIN_SPEED)
     for each in infractions:
         if each.kind in kinds and each.percent is None:

@@ -1,4 +1,4 @@
-"""The files below a folder of results, found by what they hold, not by their names."""
+"""Find result files and recordings below a folder by content, not by name."""
 
 import codecs
 import math
@@ -41,11 +41,9 @@ class ResultFile:
     """One results file: a worker's checkpoint, or several merged.
 
     Attributes:
-        path: Of the file.
-        records: Those that could be read, in the order of the file.
-        broken: Why others could not, by their place in the file.
-        stated: What a merged file says of itself, NaN where that is no number; empty
-            of a checkpoint.
+        broken: Why records could not be read, by their index in the file.
+        stated: Scores that a merged file states, NaN if not a number; empty for a
+            checkpoint.
     """
 
     path: Path
@@ -56,13 +54,12 @@ class ResultFile:
 
 @dataclass
 class FoundFiles:
-    """What lies below a folder.
+    """Files found below a folder, ordered by path.
 
     Attributes:
-        results: In the order of their paths.
-        recordings: Files of recorded steps, in the order of their paths.
-        decisions: Logs of decisions, in the order of their paths.
-        broken: Results files that are not whole, with the reason.
+        recordings: Files of recorded steps.
+        decisions: Logs of decisions.
+        broken: Incomplete results files, with the reason.
     """
 
     results: list[ResultFile] = field(default_factory=list)
@@ -72,7 +69,7 @@ class FoundFiles:
 
 
 def holds_records(folder: Path) -> bool:
-    """Return whether any results file of a leaderboard lies below a folder."""
+    """Return whether there is any leaderboard results file below a folder."""
     return any(kind == _CHECKPOINT for _, kind in _kinds(folder))
 
 
@@ -88,6 +85,7 @@ def find_files(folder: Path) -> FoundFiles:
     for path, kind in _kinds(folder):
         if path.name == _DECISIONS:
             found.decisions.append(path)
+        # incomplete files are reported, recordings are only listed
         if kind is None:
             continue
         if kind in _UNREADABLE:
@@ -106,7 +104,7 @@ def find_files(folder: Path) -> FoundFiles:
 
 
 def _kinds(folder: Path) -> Iterator[tuple[Path, bytes | None]]:
-    """Yield every file with what tells its kind; None of those that are neither."""
+    """Yield every file with the bytes that identify its kind, None for others."""
     if folder.is_file():
         yield folder, _kind(folder)
     seen = set[str]()
@@ -123,10 +121,11 @@ def _kinds(folder: Path) -> Iterator[tuple[Path, bytes | None]]:
 
 
 def _kind(path: Path) -> bytes | None:
-    """Look at the beginning of a file, at all of it where that does not tell."""
+    """Look at the beginning of a file, and at the rest if that is inconclusive."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES).removeprefix(codecs.BOM_UTF8)
+            # files that their name or first bytes identify
             if path.name == _RECORDING:
                 return _PARTS[0]
             if path.suffix == ".json":
@@ -136,6 +135,7 @@ def _kind(path: Path) -> bytes | None:
                     return _BEGUN
             if not head.lstrip().startswith(b"{"):
                 return None
+            # the key of a checkpoint or of recorded steps in the first 4 KiB
             if _CHECKPOINT in head:
                 return _CHECKPOINT
             if _STEP.match(head):
@@ -149,7 +149,7 @@ def _kind(path: Path) -> bytes | None:
 
 
 def _is_begun(head: bytes) -> bool:
-    """Return whether a file ends before its first key does, as a kill leaves it."""
+    """Return whether a file ends before its first key, as after a kill."""
     return b'{"_checkpoint"'.startswith(b"".join(head.split()))
 
 
@@ -194,7 +194,6 @@ class _Document(BaseModel):
     eval_num: _Stated = Field(None, alias="eval num")
 
     def stated(self) -> dict[str, float]:
-        """Return what merging wrote of the whole."""
         written = {
             "driving score": self.driving_score,
             "success rate": self.success_rate,

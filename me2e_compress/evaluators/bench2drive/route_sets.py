@@ -1,8 +1,8 @@
-"""The identities of Bench2Drive's routes, to tell what is missing and what is mixed.
+"""The ids of Bench2Drive's routes, to detect missing and mixed routes.
 
-The numbers are the ids of leaderboard/data/bench2drive220.xml (0.0.3) and of
-bench2drive_0.0.4_val.xml (0.0.4); the two sets share two of them. The ten routes of
-"dev10" are of the first.
+They are the ids of leaderboard/data/bench2drive220.xml (0.0.3) and of
+bench2drive_0.0.4_val.xml (0.0.4); the two sets share two ids. The ten routes of "dev10"
+belong to the first.
 """
 
 from collections.abc import Collection, Mapping
@@ -56,11 +56,11 @@ ROUTE_SETS: Mapping[RouteSet, frozenset[str]] = MappingProxyType(
 
 
 def likely_set(numbers: Collection[str]) -> RouteSet | None:
-    """Return the set that most of the routes are of; None if they are of neither."""
+    """Return the set that most of the routes belong to, if any."""
     best = max(ROUTE_SETS, key=lambda name: len(ROUTE_SETS[name] & set(numbers)))
     return best if ROUTE_SETS[best] & set(numbers) else None
 
 
 def by_number(number: str) -> tuple[int, str]:
-    """Return a key that sorts routes by their numbers, as people read them."""
+    """Return a sort key that orders routes by number."""
     return (int(number), "") if number.isascii() and number.isdecimal() else (0, number)

@@ -1,6 +1,6 @@
 """The 44 scenario types of Bench2Drive and the abilities that each tests.
 
-After tools/ability_benchmark.py of Bench2Drive 0.0.3 and 0.0.4, which agree in them.
+Source: tools/ability_benchmark.py of Bench2Drive 0.0.3 and 0.0.4, which agree.
 """
 
 import re
@@ -49,10 +49,10 @@ TYPES = {ability: tuple(_TYPES[ability].split()) for ability in ABILITIES}
 
 
 def type_of(scenario_name: str) -> str:
-    """Return the type of a scenario: ``ParkingCutIn`` of ``ParkingCutIn_1``."""
+    """Return the type of a scenario: ``ParkingCutIn`` for ``ParkingCutIn_1``."""
     return _NUMBER.sub("", scenario_name)
 
 
 def abilities_of(scenario_type: str) -> tuple[str, ...]:
-    """Return the abilities that a type tests, none of an unknown type."""
+    """Return the abilities that a type tests; none for an unknown type."""
     return tuple(ability for ability in ABILITIES if scenario_type in TYPES[ability])

@@ -1,8 +1,8 @@
-"""The admission gate: a route must tell a driver from a blind one.
+"""The admission gate: routes that a blind driver solves are rejected.
 
 A route is admitted if the privileged expert solves it and the blind driver, who keeps
-one speed on the route's centre, commits an infraction on it at every one of
-`blind.SPEEDS_MPS`. Timing out, standing blocked and leaving the route are none.
+one speed on the route's centre, commits an infraction at every one of
+`blind.SPEEDS_MPS`. Timing out, standing blocked and leaving the route do not count.
 """
 
 from dataclasses import dataclass
@@ -30,12 +30,10 @@ class DryRun:
     """How one drive of one route went.
 
     Attributes:
-        infractions: Kinds of infractions in order, none repeated, none of `ENDS_ONLY`.
-        ending: Why the route ended.
+        infractions: Distinct kinds of infractions in order, without `ENDS_ONLY`.
         triggered: Whether the scenario's event happened.
         actors_crashed: Whether two actors collided: a fault of the scenario.
         seconds: Simulated time at the end.
-        failure: What the policy raised, if anything.
     """
 
     infractions: tuple[InfractionKind, ...]
@@ -68,8 +66,6 @@ def dry_run(route: Route, policy: Policy) -> DryRun:
 
 
 class _WorldListener:
-    """Keeps the world that the runner drives in."""
-
     def __init__(self) -> None:
         self._world: World | None = None
 
@@ -86,9 +82,8 @@ class Admission:
     """The gate's verdict on one route.
 
     Attributes:
-        route: Which.
-        expert: How the expert drove it; None if the blind drives decided already.
-        blind: How the blind driver drove it at each speed that was tried.
+        expert: The expert's drive; None if the blind drives already rejected the route.
+        blind: The blind driver's drive at each speed that was tried.
     """
 
     route: Route

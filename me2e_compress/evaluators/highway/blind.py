@@ -1,6 +1,6 @@
 """A driver that sees nothing: constant speed along the centre of the route.
 
-A route that it solves demands nothing of a driver, so it is not admitted.
+A route that it solves tests nothing, so it is not admitted.
 """
 
 from dataclasses import dataclass, field
@@ -34,10 +34,7 @@ REENTRY_S = 1.5
 class Blind:
     """Follows the centre of the route at one speed, whatever is in the way.
 
-    It is privileged in one respect: it knows the route's centre line and its pose.
-
-    Args:
-        speed_mps: The speed.
+    It is privileged in that it knows the route's centre line and its own pose.
     """
 
     speed_mps: float = 8.0
@@ -60,11 +57,8 @@ class Blind:
 def centre_plan(ego: Ego, path: RoutePath, near_m: float, speed_mps: float) -> Plan:
     """Return waypoints [6, 2] (m, ego frame) along the centre of a route.
 
-    Args:
-        ego: The ego.
-        path: The route.
-        near_m: Where on the route the ego was last seen.
-        speed_mps: Speed to reach at 3 m/s2 and to keep.
+    ``near_m`` is where the ego was last seen on the route; ``speed_mps`` is reached at
+    3 m/s2 and kept.
     """
     s, lateral = path.project(ego.x, ego.y, near_m)
     times = (1 + np.arange(PLAN_SHAPE[0])) * (PLAN_STEP_US / 1e6)

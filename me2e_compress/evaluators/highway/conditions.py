@@ -1,6 +1,6 @@
-"""What a policy drives under: latency, step, cameras, weather.
+"""Conditions that a policy drives under: latency, step, cameras, weather.
 
-Apart from the runner, so that naming the conditions does not import highway-env.
+They are separate from the runner, so that naming them does not import highway-env.
 """
 
 from dataclasses import dataclass, field
@@ -17,16 +17,14 @@ class Conditions:
     """The conditions that a policy drives under.
 
     Args:
-        latency: What its decisions cost.
-        dt_us: Step of the world, a divisor of 50 ms; for what a finer one changes see
-            `realtime.skipped_decisions`. Frames are recorded every 50 ms all the same.
+        latency: Latency of each decision.
+        dt_us: Step of the world, a divisor of 50 ms; `realtime.skipped_decisions` tells
+            what a finer one changes. Frames are recorded every 50 ms regardless.
         image_size: Rows and columns of each camera.
-        weather: Weather and sensor faults.
-        latency_model: What a latency does: drop decisions, or delay every control.
+        latency_model: Whether a latency drops decisions or delays every control.
 
     Raises:
-        EvaluationError: 50 ms are not a multiple of the step, or a latency that names
-            no trace.
+        EvaluationError: The step does not divide 50 ms, or the latency names no trace.
     """
 
     latency: LatencySource = field(default_factory=FixedLatency)
@@ -36,7 +34,6 @@ class Conditions:
     latency_model: LatencyModel = LatencyModel.DROP
 
     def __post_init__(self) -> None:
-        """Check step and latency."""
         if self.latency.lacks_trace:
             raise EvaluationError(
                 f"latency {self.latency}: its trace names no file (trace:FILE), and "
@@ -65,7 +62,7 @@ def step_us(dt_ms: float) -> int:
     """Return a step of the world in whole microseconds.
 
     Raises:
-        EvaluationError: it is longer than a frame, or no number above 0.
+        EvaluationError: It is longer than a frame, or not above 0.
     """
     if not 0 < dt_ms <= FRAME_US / 1000:
         raise EvaluationError(

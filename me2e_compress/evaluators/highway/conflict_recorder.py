@@ -1,7 +1,7 @@
-"""Measures how close a drive came to a collision: distance, TTC, PET, and whose fault.
+"""Distance, TTC and PET of a drive, and who was at fault in a collision.
 
-The numbers are made once, when the route is over, over all its frames: about 1 % of
-the time that driving it takes.
+They are computed once, after the route, over all its frames: about 1 % of the time that
+driving it takes.
 """
 
 import math
@@ -49,7 +49,7 @@ Box = tuple[float, float, float, float, float]
 
 @dataclass
 class ConflictRecorder:
-    """Keeps where everything was, frame by frame, until the route is over."""
+    """Keeps the boxes of all frames until the route is over."""
 
     _egos: list[tuple[float, ...]] = field(default_factory=list, init=False)
     _actors: list[list[tuple[float, ...]]] = field(default_factory=list, init=False)
@@ -66,14 +66,17 @@ class ConflictRecorder:
 
     def result(self) -> ConflictRecord:
         """Return the distances, times and encounters of the frames kept so far."""
+        # rows of all actors, each with the number of its frame
         counts = [len(rows) for rows in self._actors]
         frame = np.repeat(np.arange(len(counts)), counts)
         actors = np.array([row for rows in self._actors for row in rows]).reshape(-1, 7)
         egos = np.array(self._egos).reshape(-1, 6)
+        # every actor against the ego of the same frame
         one, other = egos[frame], actors[:, :6]
         distance = gaps(one[:, :5], other[:, :5])
         velocity = _velocity(other) - _velocity(one)
         seconds = contact_times(one[:, :5], other[:, :5], velocity)
+        # the smallest value of each frame
         nearest, soonest = np.full((2, len(counts)), np.inf)
         np.minimum.at(nearest, frame, distance)
         np.minimum.at(soonest, frame, seconds)
@@ -97,10 +100,10 @@ class ConflictRecorder:
 
 
 def contact_of(ego: Ego, actor: Actor) -> Contact:
-    """Return how two that touch came together, as nuPlan's collision types.
+    """Return the type of a contact, as in nuPlan's collision types.
 
-    The source is no_ego_at_fault_collisions.py of nuplan-devkit 1.2; our one point of
-    reference is the ego's centre, nuPlan's its rear axle.
+    The source is no_ego_at_fault_collisions.py of nuplan-devkit 1.2; the reference
+    point here is the ego's centre, nuPlan's is its rear axle.
     """
     if ego.speed_mps <= STOPPED_MPS:
         return Contact.STANDING_EGO
@@ -118,8 +121,9 @@ def contact_of(ego: Ego, actor: Actor) -> Contact:
 def at_fault(contact: Contact, ego: Ego, roadmap: Roadmap) -> bool:
     """Return whether the ego could have prevented a contact, as nuPlan judges it.
 
-    It ran into something that stood, or hit with its front; or it was hit at the side
-    while it was not wholly in one lane (a lane and the one that it leads to are one).
+    It could if it ran into something that stood, or hit with its front; or if it was
+    hit at the side while not wholly in one lane (a lane and its successor count as
+    one).
     """
     if contact is Contact.SIDE:
         return not _in_one_lane(ego, roadmap.lanes)
@@ -144,12 +148,14 @@ def _same_place(
 ) -> list[tuple[int, int, float]]:
     """Return (frame of the ego, frame of the actor, angle) of the closest encounters.
 
-    At most two: one at 30 degrees or more, one below. Boxes that overlap at two times
-    hold a common place, so the fewest frames between two such times are the PET.
+    There are at most two: one at 30 degrees or more, one below. Boxes that overlap at
+    two times share a place, so the fewest frames between such times are the PET.
     """
+    # boxes farther apart than this cannot overlap
     reach = (np.hypot(*egos[0, 3:5]) + np.hypot(*actor[:, 3:5].T).max()) / 2
     best: dict[bool, tuple[int, int, int, float]] = {}
     for start in range(0, len(egos), CHUNK):
+        # candidate pairs of frames, at most LATEST apart
         near = (frame >= start - LATEST) & (frame < start + CHUNK + LATEST)
         ego, other, when = egos[start : start + CHUNK], actor[near], frame[near]
         apart = np.abs(start + np.arange(len(ego))[:, None] - when)
@@ -157,6 +163,7 @@ def _same_place(
         i, j = np.nonzero((apart <= LATEST) & (away <= reach))
         hit = overlaps(ego[i, :5], other[j, :5])
         i, j = i[hit], j[hit]
+        # the closest pair of crossing paths, and of following ones
         turn = np.abs(np.angle(np.exp(1j * (ego[i, 2] - other[j, 2]))))
         for crossing in (True, False):
             kind = np.flatnonzero((turn >= CROSSING_RAD) == crossing)
@@ -191,7 +198,7 @@ def _velocity(rows: Floats) -> Floats:
 
 
 def _known(values: Floats, most: float) -> tuple[float | None, ...]:
-    """Return values to the millimetre or millisecond, None where there is none."""
+    """Round to the millimetre or millisecond; None beyond the limit."""
     return tuple(
         round(value, 3) if math.isfinite(value) and value <= most else None
         for value in values.tolist()

@@ -1,24 +1,24 @@
 """Waypoints to acceleration and steering.
 
 A plan is tracked in the world, from the pose at which it was computed, along a smooth
-curve that leaves the ego on its course. Steering is pursuit with the circle of the
-real bicycle; speed follows from where the plan is half a second and a second from now,
-with the lag of brakes and engine.
+curve that starts on the ego's course. Steering is pursuit with the circle of the real
+bicycle model; speed follows from the plan's positions half a second and a second from
+now, corrected for the lag of brakes and engine.
 
 Three faults make waypoint trackers leave the road in roundabouts, even with perfect
-waypoints (measured on highway-env's own roundabout, 12 seeds, the same expert, same
-3 m lookahead, replanned every frame / every fifth frame):
+waypoints (measured on highway-env's own roundabout, 12 seeds, the same expert, same 3 m
+lookahead, replanned every frame / every fifth frame):
 
 * Pursuit that takes the heading for the direction of travel. In a bend the centre of
   highway-env's bicycle moves along heading + slip (7 degrees at a radius of 20 m), so
   pursuit sees every target too far inside and steers up to 2.25 times too much: 0 / 1
   of 12 routes survive. With the exact circle (`bicycle.steering_through`) 12 / 12 do.
-* Plans that start flat. A plan which returns to the centre line by a curve with zero
-  slope at the ego starts anew at every replan and never returns; a reference that is
-  re-entered along the current course does. Mean offset 0.16 m against 0.08 m.
-* A reference that no car can follow: two kinks of 46 degrees, at the entry and at the
-  exit, where the lane centres do not meet. The best tracker is 1.5 m off there. Here
-  the routes are smooth instead.
+* Plans that start flat. A plan that returns to the centre line with zero slope at the
+  ego starts anew at every replan and never returns; one that starts along the current
+  course does. Mean offset 0.16 m against 0.08 m.
+* A reference that no car can follow: two kinks of 46 degrees, at entry and exit, where
+  the lane centres do not meet. The best tracker is 1.5 m off there. Here the routes are
+  smooth instead.
 """
 
 import math
@@ -59,9 +59,9 @@ class AnchoredPlan:
 
     Args:
         time_us: When the observation was taken.
-        curve: [M, 2] metres, a smooth curve through the waypoints, a point every
-            0.25 m, with a straight end 20 m beyond the last one.
-        travel_m: [n + 1] metres along the curve at the times.
+        curve: [M, 2] metres, a smooth curve through the waypoints, sampled every 0.25
+            m, with a straight extension of 20 m.
+        travel_m: [n + 1] metres along the curve at ``times_s``.
         times_s: [n + 1] seconds, 0 and those of the waypoints.
     """
 
@@ -85,7 +85,7 @@ class AnchoredPlan:
         return cls(time_us, local @ turn + (ego.x, ego.y), travel, times)
 
     def nearest(self, x: float, y: float) -> float:
-        """Return the arc length (m) of the point of the curve nearest to a position."""
+        """Return the arc length (m) of the curve point nearest to a position."""
         start, step = self.curve[:-1], np.diff(self.curve, axis=0)
         offset = np.array([x, y]) - start
         share = np.clip(np.sum(offset * step, 1) / np.sum(step * step, 1), 0.0, 1.0)
@@ -100,9 +100,9 @@ class AnchoredPlan:
         return float(x), float(y)
 
     def travel_at(self, seconds: float) -> float:
-        """Return how far (m) the plan is some time after it was computed.
+        """Return how far (m) the plan has advanced some time after it was computed.
 
-        After the last waypoint the plan goes on at its last speed.
+        After the last waypoint the plan continues at its last speed.
         """
         times = self.times_s
         last_speed = (self.travel_m[-1] - self.travel_m[-2]) / (times[-1] - times[-2])
@@ -112,15 +112,15 @@ class AnchoredPlan:
 
 @dataclass(frozen=True)
 class Controller:
-    """Tracks an anchored plan; has no state of its own.
+    """Tracks an anchored plan; stateless.
 
-    The runner calls it once a decision, at the frame of the observation; when its
-    control acts, and for how long, the latency model says (`driving.realtime`). It does
-    not steer again between two decisions.
+    The runner calls it once per decision, at the frame of the observation; the latency
+    model says when its control acts and for how long (`driving.realtime`). It does not
+    steer between two decisions.
 
     Args:
-        lookahead_s: How far ahead the pursuit looks, in seconds of travel.
-        min_lookahead_m: The same at walking pace.
+        lookahead_s: Lookahead of the pursuit, in seconds of travel.
+        min_lookahead_m: Lookahead at walking pace.
         wheel_lag_s: Lag of the steering: pursuit starts where the ego will be then.
         thrust_lag_s: Lag of brakes and engine (`traffic.bodies`).
         acceleration_mps2: (strongest braking, strongest acceleration).
@@ -133,15 +133,12 @@ class Controller:
     acceleration_mps2: tuple[float, float] = ACCELERATION_RANGE_MPS2
 
     def control(self, plan: AnchoredPlan, ego: Ego, time_us: int) -> Control:
-        """Return the control that follows a plan from where the ego is now."""
+        """Return the control that follows a plan from the ego's present state."""
         age = (time_us - plan.time_us) / 1e6
         return Control(self._acceleration(plan, ego, age), self._steering(plan, ego))
 
     def _acceleration(self, plan: AnchoredPlan, ego: Ego, age_s: float) -> float:
-        """Return the acceleration that best meets the planned places, with lag.
-
-        Least squares over those in 0.5 s and 1 s.
-        """
+        """Return the least-squares fit to the positions in 0.5 s and 1 s, with lag."""
         here, speed = plan.nearest(ego.x, ego.y), ego.speed_mps
         asked = weight = 0.0
         for ahead in AHEAD_S:
@@ -173,10 +170,8 @@ def _advance_only(points: Floats) -> tuple[Floats, Floats]:
     """Drop the waypoints [N, 2] that do not advance.
 
     The waypoints of a plan that stops lie around one place: they must neither bend the
-    curve nor add to its length.
-
-    Returns:
-        ([K, 2] waypoints that advance, [N] metres travelled at each waypoint).
+    curve nor add to its length. Returns ([K, 2] kept waypoints, [N] metres travelled at
+    each waypoint).
     """
     knots, travel, arc = [points[0]], [0.0], 0.0
     direction = np.array([1.0, 0.0])
@@ -195,9 +190,10 @@ def _advance_only(points: Floats) -> tuple[Floats, Floats]:
 def _smooth(knots: Floats, course: float) -> Floats:
     """Return [M, 2] points every 0.25 m: cubic through the knots, then straight.
 
-    The curve leaves the first knot along ``course`` (rad, where the car really goes)
-    and has no curvature at the last.
+    The curve leaves the first knot along ``course`` (rad, the direction of travel) and
+    has no curvature at the last.
     """
+    # a spline that starts along the course and ends straight
     tangent = np.array([math.cos(course), math.sin(course)])
     curve = knots[:1]
     if len(knots) > 1:
@@ -207,5 +203,6 @@ def _smooth(knots: Floats, course: float) -> Floats:
         fine = np.append(np.arange(0.0, arc[-1], STATION_M / 2), arc[-1])
         curve, tangent = spline(fine), spline(arc[-1], 1)
         tangent = tangent / np.hypot(*tangent)
+    # the straight extension, and even spacing
     beyond = curve[-1] + np.linspace(0.0, BEYOND_M, 2)[1:, None] * tangent
     return resample(np.vstack([curve, beyond]), STATION_M)

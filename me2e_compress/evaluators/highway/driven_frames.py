@@ -1,4 +1,4 @@
-"""Calibration frames: the expert drives, and what the model would see is recorded."""
+"""Calibration frames recorded from the model's view while the expert drives."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -35,26 +35,20 @@ def driven_frames(
     done: int = 0,
     first: int = 0,
 ) -> Iterator[Frame]:
-    """Record what a model sees on fresh routes, every half second.
+    """Yield what a model sees on fresh routes, every half second.
 
-    A scene is a random stretch of one route, driven by the expert without latency. Its
-    clock, its CAN bus and (since they are left out) its recurrent inputs start anew.
-    The scenario types take turns; none of the routes is one of the shipped 220.
+    A scene is a random stretch of one route, driven by the expert without latency;
+    fewer frames than ``scene_length`` if the route ends before. Its clock, its CAN bus
+    and (since they are left out) its recurrent inputs start anew. Scenario types
+    alternate; none of the routes is one of the shipped 220. Frames are keyed by the
+    graph's input names, without the recurrent inputs; the policy defines image size,
+    normalisation, names and types.
 
-    Args:
-        policy: Decides what is seen and its layout: image size, normalisation,
-            names, types.
-        count: Frames in all.
-        seed: Of routes and stretches, 0 or more.
-        scene_length: Frames a scene, fewer where the route ends before.
-        done: Frames that are there already, in whole scenes; the others are made.
-        first: Place of the route that the first missing scene is of.
-
-    Yields:
-        Frames keyed by the graph's input names, without the recurrent inputs.
+    To resume, ``done`` is the number of frames that exist, in whole scenes, and
+    ``first`` the index of the route of the first missing scene.
 
     Raises:
-        FramesError: A count below 1, or a seed below 0.
+        FramesError: A count is below 1, or the seed below 0.
     """
     if count < 1 or scene_length < 1:
         raise FramesError(
@@ -62,6 +56,7 @@ def driven_frames(
         )
     if seed < 0:
         raise FramesError(f"seed {seed}: must be 0 or more")
+    # one scene per route, from a random moment on
     for place, route in enumerate(islice(fresh_routes(seed), first, None), first):
         random = np.random.default_rng([SEED_OFFSET + seed, place])
         spare_us = EXPERT_S[route.scenario] * 1_000_000 - scene_length * STEP_US
@@ -76,9 +71,9 @@ def driven_frames(
 
 
 def fresh_routes(seed: int) -> Iterator[Route]:
-    """Yield proposed routes without end, one type after the other, randomly ordered.
+    """Yield proposed routes endlessly, cycling through the types in random order.
 
-    Routes of the shipped 220 are skipped; the routes are not put through the gate.
+    The shipped 220 are skipped; the admission gate is not applied.
     """
     judged = {(route.scenario, route.seed) for route in load_routes()}
     types = np.random.default_rng(SEED_OFFSET + seed).permutation(sorted(EXPERT_S))
@@ -101,11 +96,13 @@ def _look(
         Controller(),
         EndingRules(),
     )
+    # the expert drives, the model looks on
     rig = CameraRig(*policy.image_size)
     texture = paint_texture(world.roadmap, world.path.points)
     cameras = Cameras(texture, rig) if policy.needs_images else None
     driver = ObservationBuilder(world, expert, rig, None)
     passenger = ObservationBuilder(world, policy, rig, cameras)
+    # record every half second, from the first moment on
     policy.reset(route)
     wanted = count
     scene = world.scene()

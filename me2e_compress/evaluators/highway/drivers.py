@@ -1,6 +1,6 @@
-"""The drivers of this evaluator: the expert, the blind one, an ONNX file.
+"""Drivers of this evaluator: the expert, the blind one, an ONNX file.
 
-What drives is imported when it is opened: naming a driver takes no simulator.
+A driver imports its simulator or runtime only when it is opened.
 """
 
 from dataclasses import dataclass
@@ -44,7 +44,6 @@ class BlindDriver(Driver):
     speed_mps: float | None = None
 
     def __post_init__(self) -> None:
-        """Check the speed."""
         if self.speed_mps is not None and not 0.0 < self.speed_mps < float("inf"):
             raise EvaluationError(f"blind: {self.speed_mps:g} is not a speed in m/s")
 
@@ -75,7 +74,6 @@ class OnnxDriver(Driver):
     host_stage: str = ""
 
     def __post_init__(self) -> None:
-        """Find the adapter that ships, where its name is given."""
         if self.adapter is not None and str(self.adapter) in shipped_adapters():
             object.__setattr__(self, "adapter", adapter_file(self.adapter))
 
@@ -83,8 +81,8 @@ class OnnxDriver(Driver):
         """Return the policy.
 
         Raises:
-            EvaluationError: No such file, or a model that cannot drive.
-            ProviderError: The provider is not there.
+            EvaluationError: There is no such file, or the model cannot drive.
+            ProviderError: The provider is not available.
         """
         from me2e_compress.driving.adapter import Adapter
         from me2e_compress.driving.onnx_policy import OnnxPolicy
@@ -102,11 +100,11 @@ class OnnxDriver(Driver):
 
     @property
     def label(self) -> str:
-        """The name of the file."""
+        """Stem of the file name."""
         return self.path.stem
 
     def fingerprint(self) -> str:
-        """Return digests of its files, wherever they lie, provider and stage."""
+        """Return the digests of its files, with provider and host stage."""
         digests = [digest_of_files(self.path)]
         if self.adapter is not None:
             from me2e_compress.driving.adapter import Adapter

@@ -1,4 +1,4 @@
-"""How long routes take, so that the long ones start first."""
+"""Typical durations of routes, so that long ones start first."""
 
 from collections.abc import Sequence
 
@@ -55,7 +55,7 @@ the order in which routes begin depends on them, never a result."""
 
 
 def longest_first(routes: Sequence[Route]) -> list[Route]:
-    """Order routes by the time their type takes, the longest first.
+    """Order routes by the typical duration of their type, longest first.
 
     A long route that starts last would keep all other workers waiting.
     """

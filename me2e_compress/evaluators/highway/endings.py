@@ -1,4 +1,4 @@
-"""When a route is over: the rules of the CARLA leaderboard as Bench2Drive sets them."""
+"""Rules that end a route: the CARLA leaderboard's, as Bench2Drive sets them."""
 
 from dataclasses import dataclass, field
 
@@ -20,8 +20,8 @@ class EndingRules:
 
     * the goal is reached, or the ego collides: the world itself ends there. CARLA
       drives on after a collision, so its driving scores multiply more penalties;
-    * deviation: 30 m from the route, or more than 30 % of its length driven at least
-      15 m away from it;
+    * deviation: 30 m from the route, or more than 30 % of its length driven at least 15
+      m away from it;
     * blocked: at most 0.1 m/s for 60 s;
     * timed out: 200 s.
     """
@@ -31,14 +31,7 @@ class EndingRules:
     _last_us: int = field(default=0, init=False)
 
     def ending(self, world: World, speed_mps: float) -> Ending | None:
-        """Return why the route is over after the world's last step, None if it is not.
-
-        Call it after every step.
-
-        Args:
-            world: After the step.
-            speed_mps: Of its ego.
-        """
+        """Return why the route is over, or None; call it after every step."""
         if world.reason is not None:
             reached = world.reason is EndReason.GOAL
             return Ending.COMPLETED if reached else Ending.COLLISION

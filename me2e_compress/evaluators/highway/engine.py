@@ -1,4 +1,4 @@
-"""Where routes are driven: processes of this machine, or a Ray cluster."""
+"""Engines that drive routes: processes of this machine, or a Ray cluster."""
 
 import queue
 import threading
@@ -20,16 +20,13 @@ class Engine(Protocol):
 
 @dataclass(frozen=True)
 class LocalEngine:
-    """Spawned processes of this machine, each watched by a thread.
-
-    Args:
-        workers: How many at a time.
-    """
+    """Spawned processes of this machine, each watched by a thread."""
 
     workers: int = 1
 
     def drive(self, job: Job, routes: Sequence[Route]) -> Iterator[Driven]:
-        """Yield each route as it finishes; ending early ends the processes."""
+        """Yield each route as it finishes; closing the iterator ends the processes."""
+        # queues between the threads and this one
         waiting: queue.SimpleQueue[Route] = queue.SimpleQueue()
         finished: queue.SimpleQueue[Driven | Exception] = queue.SimpleQueue()
         for route in routes:
@@ -42,6 +39,7 @@ class LocalEngine:
         try:
             for thread in threads:
                 thread.start()
+            # an error of any thread ends the evaluation
             for _ in routes:
                 driven = finished.get()
                 if isinstance(driven, Exception):
@@ -59,7 +57,7 @@ def _watch(
     finished: "queue.SimpleQueue[Driven | Exception]",
     stop: threading.Event,
 ) -> None:
-    """Drive what waits, in one process; errors go to the main thread."""
+    """Drive waiting routes in one process; errors go to the main thread."""
     worker = RouteWorker(job)
     try:
         while not stop.is_set():

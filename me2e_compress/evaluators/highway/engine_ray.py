@@ -1,4 +1,4 @@
-"""Routes on a Ray cluster: the same job in the same process of its own."""
+"""Routes on a Ray cluster, each driven in a separate process as usual."""
 
 import socket
 from collections.abc import Iterator, Sequence
@@ -15,12 +15,12 @@ CONNECT_TIMEOUT_S = 5.0
 
 @dataclass(frozen=True)
 class RayEngine:
-    """One Ray task a worker; model files must be readable from every node.
+    """One Ray actor per worker; model files must be readable from every node.
 
     Args:
-        workers: How many routes at a time; each takes one CPU of the cluster.
-        address: Of a running cluster; None starts one on this machine, for as long
-            as the evaluation takes.
+        workers: Number of concurrent routes; each takes one CPU of the cluster.
+        address: Address of a running cluster; None starts one on this machine for the
+            duration of the evaluation.
     """
 
     workers: int = 1
@@ -60,11 +60,7 @@ class RayEngine:
 
 
 def _check_reachable(address: str) -> None:
-    """Fail within seconds where nothing listens: Ray itself tries for minutes.
-
-    Raises:
-        OSError: Nothing listens.
-    """
+    """Fail within seconds if nothing listens: Ray itself tries for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
         socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT_S).close()

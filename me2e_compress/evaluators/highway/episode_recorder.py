@@ -1,4 +1,4 @@
-"""Records what happens in a world as the episode that is scored."""
+"""Record a drive as the episode that is scored."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -72,7 +72,7 @@ class EpisodeRecorder:
             self.conflicts.record(scene)
 
     def episode(self, ending: Ending, failure: str | None = None) -> Episode:
-        """Close the record of the world's route."""
+        """Return the episode of the world's route."""
         world = self.world
         route, goal_m = world.route, world.path.goal_m
         completed = ending is Ending.COMPLETED
@@ -93,7 +93,7 @@ class EpisodeRecorder:
 
 
 def failed_episode(route: Route, completion_percent: float, failure: str) -> Episode:
-    """Return the episode of a route whose process was lost, and the record with it."""
+    """Return the episode of a route whose process was lost with its record."""
     world = World(route)
     return Episode(
         route=route.id,
@@ -113,7 +113,7 @@ def failed_episode(route: Route, completion_percent: float, failure: str) -> Epi
 def completion_percent(world: World) -> float:
     """Return how much of the route was passed while its goal is not reached.
 
-    Two digits, as the leaderboard; only reaching the goal makes it 100.
+    It has two digits, as in the leaderboard; only reaching the goal makes it 100.
     """
     share = 100.0 * world.progress_m / world.path.goal_m
     return min(max(round(share, 2), 0.0), 99.99)
@@ -193,9 +193,9 @@ def _infraction(kind: InfractionKind, event: Event, world: World) -> Infraction:
 
 
 def _judged(collision: Infraction, event: Event, world: World) -> Infraction:
-    """Say how the two came together, and whose fault it was.
+    """Add the type of contact, and whether the ego was at fault.
 
-    The world ends at a collision, so what it holds now is what it held then.
+    The world ends at a collision, so its present state is that of the collision.
     """
     scene = world.scene()
     for actor in scene.actors:

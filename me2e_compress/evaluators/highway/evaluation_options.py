@@ -1,4 +1,4 @@
-"""An evaluation in highway-env as plain options: who drives what, and under what."""
+"""Options of an evaluation in highway-env."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -28,24 +28,24 @@ from me2e_compress.simulator.weather import Weather
 
 @dataclass(frozen=True)
 class HighwayEvaluation:
-    """Drive a policy over routes of highway-env, and go on where a run was ended.
+    """Drive a policy over routes of highway-env, resuming an interrupted run.
 
     Attributes:
         policy: A policy by name, ``blind:8``, or the path of an ONNX file.
         folder: Where the results go.
-        routes: ``all``, a number, ids parted by commas, or a file of routes.
-        latency: What decisions cost: ``none``, ``fps:10``, ``trace:FILE``.
-        latency_scale: Of a trace or a measurement.
+        routes: ``all``, a number, comma-separated ids, or a file of routes.
+        latency: Latency of decisions: ``none``, ``fps:10``, ``trace:FILE``.
+        latency_scale: Factor on a trace or a measurement.
         in_order: Replay a trace in its order.
         latency_model: ``drop`` decisions meanwhile, or ``fifo``: delay controls.
-        seed: Of the draws from a trace.
+        seed: Seed of the draws from a trace.
         adapter: TOML file that adapts a model to the policy contract.
         dt_ms: Step of the world, milliseconds.
         weather: ``fog_m=80,night=0.5,dropped=BACK``; empty for a clear day.
         frame_limit_s: Seconds until a decision counts as hung.
         workers: Routes at a time.
-        engine: Where: ``local``, processes of this machine, or ``ray``, a cluster.
-        address: Of a running Ray cluster; None starts one.
+        engine: ``local``, processes of this machine, or ``ray``, a cluster.
+        address: Address of a running Ray cluster; None starts one.
         provider: What runs the model: ``cpu``, ``tensorrt{cache=engines}``.
     """
 
@@ -71,8 +71,7 @@ class HighwayEvaluation:
         """Drive what is missing, then yield all routes in the order given.
 
         Raises:
-            EvaluationError: An option that nothing can be driven with, or see
-                `HighwayEvaluator.episodes`.
+            EvaluationError: An option is invalid, or see `HighwayEvaluator.episodes`.
         """
         yield from self.evaluator().episodes()
 
@@ -82,18 +81,14 @@ class HighwayEvaluation:
         on_warning: Callable[[str], None] = lambda line: None,
         driver: Driver | None = None,
     ) -> HighwayEvaluator:
-        """Build what drives.
-
-        Args:
-            on_progress: Called at the start and after every route.
-            on_warning: Called with one line a surprise.
-            driver: Who drives; None finds the policy by its name.
+        """Build the evaluator; without a driver, the policy is looked up by name.
 
         Raises:
-            EvaluationError: An option that nothing can be driven with.
+            EvaluationError: An option is invalid.
             MissingExtraError: The extra ``highway`` is not installed.
         """
         need_extra("highway", "driving")
+        # options become routes, driver and conditions
         picked, set_size = routes_named(self.routes)
         driver = driver or self._driver()
         latency = parse_latency(
@@ -127,10 +122,10 @@ class HighwayEvaluation:
 
 
 def routes_named(text: str) -> tuple[tuple[Route, ...], int]:
-    """Return the routes asked for, and how many the set they are from has.
+    """Return the routes asked for, and the size of the set they are from.
 
     Raises:
-        EvaluationError: No such route, or no file of routes.
+        EvaluationError: There is no such route, or no file of routes.
     """
     if text.endswith(".json"):
         routes = load_routes(Path(text))
@@ -143,7 +138,7 @@ def engine_of(name: str, workers: int, address: str | None) -> Engine:
     """Return the engine of a name.
 
     Raises:
-        EvaluationError: No such engine, or an address without a cluster.
+        EvaluationError: There is no such engine, or it takes no address.
     """
     if name == "local" and address is None:
         return LocalEngine(workers)
@@ -156,10 +151,10 @@ def engine_of(name: str, workers: int, address: str | None) -> Engine:
 
 
 def weather_of(text: str) -> Weather:
-    """Read ``option=value`` pairs; cameras that are dropped are joined by ``+``.
+    """Read ``option=value`` pairs; dropped cameras are joined by ``+``.
 
     Raises:
-        EvaluationError: No such option, or a value that it refuses.
+        EvaluationError: There is no such option, or its value is invalid.
     """
     options: dict[str, object] = {}
     for pair in filter(None, text.split(",")):

@@ -1,4 +1,4 @@
-"""A whole evaluation: routes as independent jobs, resumable, the same bytes always."""
+"""A whole evaluation: independent routes, resumable, reproducible byte by byte."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -18,13 +18,9 @@ from me2e_compress.simulator.routes import Route
 
 @dataclass(frozen=True)
 class DrivingProgress:
-    """How far an evaluation is.
+    """Progress of an evaluation; scores are means in percent, None before the first.
 
-    Attributes:
-        done: Routes finished, those of earlier runs included.
-        total: Routes of this evaluation.
-        driving_score: Mean over the finished ones, percent; None before the first.
-        success_rate: The same.
+    Routes of earlier runs count as ``done``.
     """
 
     done: int
@@ -38,14 +34,14 @@ class HighwayEvaluator:
     """Drives routes of highway-env and keeps the episodes in a folder.
 
     Running it again with the same folder drives what is missing. The files do not
-    depend on the number of workers, on the engine or on the clock, unless latency is
-    measured here and now.
+    depend on the number of workers, the engine or the clock, unless latency is measured
+    during the run.
 
     Args:
-        job: Who drives under what.
-        routes: What to drive, at least one.
+        job: Driver and conditions.
+        routes: At least one.
         folder: Where the results go.
-        set_size: How many routes the whole set has.
+        set_size: Number of routes of the whole set.
         engine: Where the routes are driven.
         on_progress: Called at the start and after every route.
         on_warning: Called with each warning, one line.
@@ -64,24 +60,20 @@ class HighwayEvaluator:
         """Drive what is missing, then yield all routes in the order given.
 
         Raises:
-            EvaluationError: The policy cannot be opened, the folder is of another
+            EvaluationError: The policy cannot be opened, the folder belongs to another
                 evaluation or cannot be written, or a process was killed.
         """
         yield from self.some(self.routes)
 
     def some(self, routes: Sequence[Route]) -> Iterator[Episode]:
-        """Drive what is missing of some of the routes, then yield these in their order.
+        """Drive what is missing of some of the evaluator's routes, then yield these.
 
-        The folder is that of all routes: the others may be driven later.
-
-        Args:
-            routes: Of the evaluator's.
-
-        Raises:
-            EvaluationError: See :meth:`episodes`.
+        The folder belongs to all routes: the others may be driven later. It raises as
+        :meth:`episodes` does.
         """
         if not routes:
             raise EvaluationError("there is no route to drive")
+        # fail early on a policy or folder that cannot be used
         opened(self.job.driver)
         made_by = fingerprint(self.job, self.routes, self.set_size)
         measured = self.job.conditions.latency.measured
@@ -89,6 +81,7 @@ class HighwayEvaluator:
         done = folder.episodes()
         for path, reason in folder.corrupt.items():
             self.on_warning(f"{path}: {reason}: driven again")
+        # drive what is missing, in the order that wastes least time
         missing = [route for route in routes if route.id not in done]
         total = len(done) + len(missing)
         self.on_progress(progress_of(tuple(done.values()), total))

@@ -1,4 +1,4 @@
-"""Fresh routes: proposed by the scenario types, admitted by the gate."""
+"""Generate routes: proposed by scenario types, admitted by the gate."""
 
 import zlib
 from collections.abc import Iterator, Sequence
@@ -20,13 +20,7 @@ MOST_TRIES = 8
 
 @dataclass(frozen=True)
 class ScenarioRoutes:
-    """The routes of one scenario type.
-
-    Attributes:
-        scenario: Which.
-        routes: The admitted routes.
-        refusals: Why the others were not, in the order they were tried.
-    """
+    """Admitted routes of one scenario type, and why others were refused."""
 
     scenario: str
     routes: tuple[Route, ...]
@@ -34,17 +28,12 @@ class ScenarioRoutes:
 
     @property
     def tried(self) -> int:
-        """Proposals that were put through the gate."""
+        """Number of proposals that were put through the gate."""
         return len(self.routes) + len(self.refusals)
 
 
 def propose(scenario: str, seed: int, name: str) -> Route:
-    """Return a route of a type, with every parameter written out.
-
-    Args:
-        scenario: One of the 44 types.
-        seed: Decides the parameters.
-        name: The route's id.
+    """Return a route of one of the 44 types, with every parameter written out.
 
     Raises:
         EvaluationError: There is no such type.
@@ -69,7 +58,7 @@ def admitted_routes(
     """Propose routes of a type until enough are admitted.
 
     Raises:
-        EvaluationError: `MOST_TRIES` proposals for each route were not enough.
+        EvaluationError: `MOST_TRIES` proposals per route were not enough.
     """
     routes, refusals = list[Route](), list[str]()
     for attempt in range(MOST_TRIES * variants):
@@ -93,14 +82,7 @@ def generate(
     variants: int = VARIANTS,
     workers: int = 1,
 ) -> Iterator[ScenarioRoutes]:
-    """Generate routes of several types, in order, for any number of workers.
-
-    Args:
-        seed: Decides everything.
-        scenarios: Types.
-        variants: Routes of each type.
-        workers: Processes; 1 stays in this one.
-    """
+    """Generate routes of several types, in order, whatever the number of workers."""
     of_type = partial(admitted_routes, seed=seed, variants=variants)
     if workers == 1:
         yield from map(of_type, scenarios)

@@ -1,4 +1,4 @@
-"""Observations: what a policy gets at each decision."""
+"""Observations that a policy gets at each decision."""
 
 import math
 from dataclasses import dataclass, field
@@ -21,9 +21,7 @@ class ObservationBuilder:
     """Builds the observations of one route.
 
     Args:
-        world: Which is observed.
-        policy: Decides what it gets.
-        rig: Gives lidar2img, also to a policy that sees no images.
+        rig: Provides lidar2img, also for a policy that sees no images.
         cameras: Render the images; None if none are needed.
     """
 
@@ -35,11 +33,10 @@ class ObservationBuilder:
     _nodes: RouteNodes = field(init=False)
 
     def __post_init__(self) -> None:
-        """Lay the nodes of the route."""
         self._nodes = RouteNodes.along(self.world.path)
 
     def observe(self, scene: Scene) -> Observation:
-        """Return what the policy sees at this scene; call it once a decision.
+        """Return what the policy sees at this scene; call it once per decision.
 
         The CAN bus counts metres and degrees since the last call.
         """
@@ -73,7 +70,7 @@ ROAD_USERS = (
 
 
 def road_users(scene: Scene) -> npt.NDArray[np.float64]:
-    """Return [N, 2], where road users are: metres in the ego frame."""
+    """Return [N, 2] positions of road users, metres in the ego frame."""
     ego = scene.ego
     found = [each for each in scene.actors if each.kind in ROAD_USERS]
     away = np.array([(each.x - ego.x, each.y - ego.y) for each in found], np.float64)
@@ -84,12 +81,8 @@ def road_users(scene: Scene) -> npt.NDArray[np.float64]:
 def scene_and_world(observation: Observation, who: str) -> tuple[Scene, World]:
     """Return the scene and the world that a privileged policy of this simulator gets.
 
-    Args:
-        observation: What it decides on.
-        who: Its name, for the message.
-
     Raises:
-        EvaluationError: It gets none, or those of another simulator.
+        EvaluationError: The observation has none, or those of another simulator.
     """
     scene, world = observation.scene, observation.world
     if isinstance(scene, Scene) and isinstance(world, World):

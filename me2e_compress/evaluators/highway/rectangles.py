@@ -1,7 +1,6 @@
-"""Oriented rectangles in the plane: the gap, an overlap, the time until they touch.
+"""Oriented rectangles in the plane: gap, overlap, time to contact.
 
-A box is a row (x, y, heading, length, width); boxes come as arrays [..., 5] that
-broadcast against each other.
+A box is a row (x, y, heading, length, width); arrays of boxes [..., 5] broadcast.
 """
 
 from typing import Any
@@ -32,7 +31,7 @@ def overlaps(one: Floats, other: Floats) -> npt.NDArray[np.bool_]:
 def gaps(one: Floats, other: Floats) -> Floats:
     """Return [...] metres between the outlines of two boxes, 0 where they overlap.
 
-    Of two convex outlines that are apart, a corner of one is the nearest point.
+    Between disjoint convex outlines, a corner of one is the nearest point.
     """
     nearest = np.minimum(_from_corners(one, other), _from_corners(other, one))
     return np.where(overlaps(one, other), 0.0, nearest)
@@ -41,19 +40,17 @@ def gaps(one: Floats, other: Floats) -> Floats:
 def contact_times(one: Floats, other: Floats, approach: Floats) -> Floats:
     """Return [...] seconds until two boxes touch, infinite if they never do.
 
-    Neither turns, and both keep their velocity; the answer is exact (the boxes touch
-    while their shadows on all four axes do).
-
-    Args:
-        one: [..., 5].
-        other: [..., 5].
-        approach: [..., 2] velocity of the other minus that of the first, m/s.
+    Both keep their heading and velocity; ``approach`` [..., 2] is the velocity of the
+    other minus that of the first, m/s. The answer is exact: the boxes touch while their
+    projections on all four axes overlap.
     """
+    # interval of contact on each axis
     apart = _along_axes(one, other, other[..., :2] - one[..., :2])
     speed, room = _along_axes(one, other, approach), _room(one, other)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         edges = np.stack([(-room - apart) / speed, (room - apart) / speed])
     begins, ends = edges.min(axis=0), edges.max(axis=0)
+    # on an axis without motion, contact is always or never
     still, inside = speed == 0.0, np.abs(apart) <= room
     begins = np.where(still, np.where(inside, -np.inf, np.inf), begins).max(axis=-1)
     ends = np.where(still, np.where(inside, np.inf, -np.inf), ends).min(axis=-1)
@@ -72,7 +69,7 @@ def _along_axes(one: Floats, other: Floats, vectors: Floats) -> Floats:
 
 
 def _room(one: Floats, other: Floats) -> Floats:
-    """Return [..., 4] how near the centres are on each axis when the boxes touch."""
+    """Return [..., 4] centre distances at contact, on each axis."""
     turn = other[..., 2] - one[..., 2]
     cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
     columns = []

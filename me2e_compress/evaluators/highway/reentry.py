@@ -1,4 +1,4 @@
-"""Re-entering a route: a smooth way from the ego to a line beside the route."""
+"""Re-entry to a route: a smooth curve from the ego to a lateral offset."""
 
 import math
 
@@ -13,7 +13,7 @@ STEEPEST = 0.6
 
 
 def slope_of(ego: Ego, path: RoutePath, s_m: float) -> float:
-    """Return the metres to the left per metre of route of the ego's course."""
+    """Return the slope of the ego's course, metres to the left per metre of route."""
     course = ego.heading + slip_of(ego.steering_rad)
     away = course - float(path.value(path.headings, s_m))
     away = math.remainder(away, 2 * math.pi)
@@ -23,21 +23,14 @@ def slope_of(ego: Ego, path: RoutePath, s_m: float) -> float:
 def reentry(
     travel_m: Floats, offset_m: float, slope: float, target_m: Floats, length_m: Floats
 ) -> Floats:
-    """Return the lateral offsets of a cubic from (offset, slope) to (target, 0).
+    """Return [K, T] lateral offsets of a cubic from (offset, slope) to (target, 0).
 
-    Planned anew at every step it is a damped feedback on offset e and slope e', since
-    it starts with curvature -6 e / L^2 - 4 e' / L (damping 0.82). Starting flat, as if
-    e' were 0, has no damping at all.
+    Replanned at every step it is a damped feedback on offset e and slope e', since it
+    starts with curvature -6 e / L^2 - 4 e' / L (damping 0.82). Starting flat, as if e'
+    were 0, has no damping at all.
 
-    Args:
-        travel_m: [K, T] metres of route since now.
-        offset_m: Where the ego is, metres left of the route.
-        slope: How it moves, see `slope_of`.
-        target_m: [K] where it is to be.
-        length_m: [K] metres of route that the change takes.
-
-    Returns:
-        [K, T] metres left of the route.
+    Metres of route since now are [K, T], targets and lengths of the change [K], offsets
+    metres left of the route.
     """
     u = np.clip(travel_m / length_m[:, None], 0.0, 1.0)
     moved = u * u * (3 - 2 * u)

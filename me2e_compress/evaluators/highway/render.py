@@ -40,16 +40,10 @@ class _Film:
 
 
 def render(job: Job, route: Route, folder: Path) -> tuple[Path, Path]:
-    """Drive a route again and draw it.
+    """Drive a route again and draw it; return an animation and a strip.
 
-    Args:
-        job: Driver and conditions.
-        route: Which route.
-        folder: Where the pictures go.
-
-    Returns:
-        An animation (six cameras, the view from above with the plan, infractions
-        marked) and a strip of four moments, the end among them.
+    The animation shows six cameras and the view from above with the plan, infractions
+    marked; the strip shows four moments including the end.
 
     Raises:
         EvaluationError: The policy cannot be opened, or a file cannot be written.

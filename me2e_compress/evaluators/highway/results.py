@@ -1,4 +1,4 @@
-"""A folder of results: one JSON a route, and what decided them."""
+"""A results folder: one JSON file per route, and a manifest."""
 
 import errno
 import hashlib
@@ -29,13 +29,7 @@ LARGEST_SET = 1_000_000
 
 
 def fingerprint(job: Job, routes: Sequence[Route], set_size: int) -> dict[str, Any]:
-    """Return everything that decides the bytes of the results.
-
-    Args:
-        job: Driver and conditions.
-        routes: What is driven.
-        set_size: How many routes the whole set has.
-    """
+    """Return everything that decides the bytes of the results."""
     definitions = json.dumps([asdict(route) for route in routes], sort_keys=True)
     return {
         "version": __version__,
@@ -56,11 +50,7 @@ def fingerprint(job: Job, routes: Sequence[Route], set_size: int) -> dict[str, A
 class ResultsFolder:
     """Results on disk; every file is complete or absent.
 
-    Attributes:
-        path: The folder.
-        made_by: The fingerprint.
-        corrupt: Files that could not be read, with the reason; their routes count as
-            not driven.
+    Routes of ``corrupt`` files, listed with the reason, count as not driven.
     """
 
     path: Path
@@ -71,18 +61,16 @@ class ResultsFolder:
     def create(
         cls, path: Path, made_by: dict[str, Any], measured: int | None = None
     ) -> Self:
-        """Make the folder, or go on with one of the same evaluation.
+        """Create the folder, or resume one of the same evaluation.
 
-        Args:
-            path: The folder.
-            made_by: The fingerprint.
-            measured: Samples of the trace that latencies are drawn from; None where
-                none are drawn.
+        ``measured`` is the number of samples of the trace that latencies are drawn
+        from; None if none are drawn.
 
         Raises:
-            EvaluationError: It holds the results of another evaluation, or something
-                else, or cannot be written.
+            EvaluationError: It holds another evaluation or other files, or cannot be
+                written.
         """
+        # claim an empty folder
         try:
             path.mkdir(parents=True, exist_ok=True)
             if not (path / MANIFEST).exists():
@@ -94,6 +82,7 @@ class ResultsFolder:
         except OSError as error:
             raise _unwritable(path, error) from error
         folder = cls.open(path)
+        # all that decides the results must agree
         both = folder.made_by, made_by
         for key in sorted({*made_by, *folder.made_by} - {MEASURED}):
             old, new = (each.get(key, BEFORE.get(key)) for each in both)
@@ -106,7 +95,7 @@ class ResultsFolder:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Read what a folder is.
+        """Open an existing folder.
 
         Raises:
             EvaluationError: It is not a results folder.
@@ -126,27 +115,27 @@ class ResultsFolder:
 
     @property
     def set_size(self) -> int:
-        """How many routes the whole set has."""
+        """Number of routes of the whole set."""
         return int(self.made_by.get("set_size", len(self.made_by["routes"])))
 
     @property
     def measured(self) -> int | None:
-        """How many samples latencies were drawn from; None where none were."""
+        """Number of samples that latencies were drawn from, if any."""
         found = self.made_by.get(MEASURED)
         return found if type(found) is int and found > 0 else None
 
     @property
     def log(self) -> Path:
-        """Where wall-clock times go: beside the folder, which must not hold any."""
+        """Log of wall-clock times, beside the folder, which must not hold any."""
         return log_beside(self.path)
 
     def episodes(self) -> dict[str, Episode]:
-        """Read every route that was driven, in the order of the evaluation."""
+        """Read every driven route, in the order of the evaluation."""
         found = {route: self._read(route) for route in self.made_by["routes"]}
         return {route: one for route, one in found.items() if one is not None}
 
     def save(self, driven: Driven) -> None:
-        """Write one route, and what it cost to the log.
+        """Write one route, and log its cost.
 
         Raises:
             EvaluationError: The disk is full, or the folder cannot be written.
@@ -167,11 +156,7 @@ class ResultsFolder:
             raise _unwritable(self.log, error) from error
 
     def keep(self, episode: Episode) -> None:
-        """Write one route.
-
-        Raises:
-            EvaluationError: The disk is full, or the folder cannot be written.
-        """
+        """Write one route; errors are those of `save`."""
         record = {"fingerprint": self._digest, "episode": episode.to_json()}
         try:
             write_json(self._file(episode.route), record)
@@ -207,13 +192,13 @@ class ResultsFolder:
 
 
 def log_beside(folder: Path) -> Path:
-    """Return where the log of a folder of results goes."""
+    """Return the path of the log of a results folder."""
     resolved = Path(os.path.realpath(folder))
     return resolved.with_name(f"{resolved.name}.log")
 
 
 def _check_manifest(path: Path, made_by: object) -> None:
-    """Check what is read of a manifest: routes, which are file names, and their set."""
+    """Check the parts that are read: routes, which are file names, and set size."""
     if not isinstance(made_by, dict) or not isinstance(made_by.get("routes"), list):
         raise EvaluationError(f"{path}: {MANIFEST} does not name its routes")
     routes = made_by["routes"]
@@ -231,7 +216,7 @@ def _check_manifest(path: Path, made_by: object) -> None:
 
 
 def _refuse_foreign(path: Path) -> None:
-    """Refuse a folder that is not ours; in ours a kill leaves no more than a draft."""
+    """Refuse a folder with foreign files; a killed run of ours leaves only drafts."""
     names = [file.name for file in path.iterdir() if not file.name.startswith(".")]
     if any(name != ROUTES for name in names):
         raise EvaluationError(f"{path}: not empty, and holds no {MANIFEST}")

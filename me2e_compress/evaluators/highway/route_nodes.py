@@ -1,4 +1,4 @@
-"""The sparse plan of a route: what a model that aims at a target point is told."""
+"""Sparse nodes of a route, for models that aim at a target point."""
 
 import itertools
 import math
@@ -21,9 +21,7 @@ takes nodes off at 4 m."""
 class RouteNodes:
     """Nodes where the command changes, every 50 m between them, and at the end.
 
-    Args:
-        stations_m: [N] arc lengths, ascending.
-        points: [N, 2] metres, x east, y north.
+    ``stations_m`` are ascending arc lengths, ``points`` are [N, 2] (x east, y north).
     """
 
     stations_m: npt.NDArray[np.float64]
@@ -31,7 +29,7 @@ class RouteNodes:
 
     @classmethod
     def along(cls, path: RoutePath) -> Self:
-        """Lay the nodes of a route."""
+        """Place the nodes of a route."""
         changes = 1 + np.flatnonzero(np.diff(path.commands))
         kept = [0, *changes.tolist(), len(path.points) - 1]
         places: list[int] = []
@@ -42,12 +40,7 @@ class RouteNodes:
         return cls(np.array(places, float), np.asarray(path.points[places], float))
 
     def ahead(self, station_m: float, ego: Ego) -> npt.NDArray[np.float32]:
-        """Return [2, 2], the next node and the one after it, in the ego frame.
-
-        Args:
-            station_m: Arc length of the ego.
-            ego: Where it is.
-        """
+        """Return [2, 2] the next two nodes from an arc length, in the ego frame."""
         last = len(self.points) - 1
         index = int(np.searchsorted(self.stations_m, station_m + REACHED_M, "right"))
         found = self.points[[min(index, last), min(index + 1, last)]]

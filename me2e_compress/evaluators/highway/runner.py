@@ -1,4 +1,4 @@
-"""Drives one route: the policy decides, the world charges, an episode results."""
+"""Drive one route: the policy decides, its latency is charged, an episode results."""
 
 import math
 import time
@@ -49,9 +49,9 @@ class Listeners:
 
     Args:
         on_query: Called with the world before the policy is called.
-        on_answer: Called when it has returned.
-        on_moment: Called at every frame with what a picture needs, the latest plan as
-            seen from the ego now, None of a policy that answers controls; makes the
+        on_answer: Called when the policy has returned.
+        on_moment: Called at every frame with the data of a picture. The plan is
+            relative to the ego now, None for a policy that answers controls. Makes the
             cameras render for any policy.
     """
 
@@ -71,25 +71,16 @@ def drive(
 ) -> Episode:
     """Drive a route to its end and return the record.
 
-    At each decision the policy plans, and the controller turns the plan and the ego's
-    state at that same frame into a control; throttle, steer and brake become one by
-    `vehicle_map`. Equation 4 (or the other latency model) says when it acts and how
-    long it is held. Before the first one acts the ego coasts straight. A policy that
-    raises, or answers neither finite waypoints nor controls in their range, ends the
-    route as failed.
-
-    Args:
-        route: What to drive.
-        policy: Who drives.
-        conditions: Latency, step, cameras.
-        listeners: Callbacks, for a watchdog or for pictures.
+    At each decision the controller turns the policy's plan and the ego's state at that
+    same frame into a control; throttle, steer and brake are converted by `vehicle_map`.
+    Equation 4 (or the other latency model) says when it acts and how long it is held.
+    Until the first one acts, the ego coasts straight. A policy that raises, or answers
+    neither finite waypoints nor valid controls, ends the route as failed.
     """
     return _Drive(route, policy, conditions, listeners).run()
 
 
 class _Drive:
-    """The state of one route while it is driven."""
-
     def __init__(
         self, route: Route, policy: Policy, conditions: Conditions, listeners: Listeners
     ) -> None:
@@ -113,11 +104,13 @@ class _Drive:
     def run(self) -> Episode:
         world, ending = self.world, None
         scene = world.scene()
+        # record, decide and step until a rule ends the route
         try:
             self.listeners.on_query(world)
             _reset(self.policy, self.route)
             self.listeners.on_answer()
             while ending is None:
+                # the last frame has no decision
                 self.recorder.record(scene)
                 if self.clock.decision_is_due:
                     self.decide(scene)
@@ -133,12 +126,14 @@ class _Drive:
 
     def decide(self, scene: Scene) -> None:
         """Query the policy at this frame; the clock says when its answer acts."""
+        # only the policy itself is timed
         observation = self.observer.observe(scene)
         self.listeners.on_query(self.world)
         begun = time.perf_counter_ns()
         answer = _ask(self.policy, observation)
         took_us = (time.perf_counter_ns() - begun) // 1_000
         self.listeners.on_answer()
+        # the latency source may use the measured time
         control = self.control_by(_checked(answer), scene)
         facts = DecisionFacts(took_us, road_users(scene), *_host_work(self.policy))
         latency_us = self.charge(facts)
@@ -146,7 +141,6 @@ class _Drive:
         self.clock.decide(control, latency_us)
 
     def control_by(self, answer: Trajectory | PedalsAndWheel, scene: Scene) -> Control:
-        """Return the control that follows, and keep the plan, if there is one."""
         if isinstance(answer, PedalsAndWheel):
             self.plan = None
             return control_of(answer, scene.ego.length)

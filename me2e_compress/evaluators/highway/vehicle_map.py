@@ -1,13 +1,13 @@
-"""Throttle, brake and steer of CARLA's cars as the control of this ego.
+"""Convert CARLA's throttle, brake and steer to the control of this ego.
 
-Pedals span what the ego's engine and brakes can do, as CARLA's span its car's: a full
-throttle is 4 m/s2, a full brake 8 m/s2, both together their difference; with neither
-the ego keeps its speed (no drag, no creeping).
+Full pedals are the limits of the ego's engine and brakes, as in CARLA: throttle 4 m/s2,
+brake 8 m/s2, both together their difference; with neither the ego keeps its speed (no
+drag, no creeping).
 
-A steer makes the ego drive the circle that it makes CARLA's car drive: the kinematic
-bicycle that World on Rails (Chen, Koltun and Kraehenbuehl 2021) fitted to CARLA, whose
-constants TransFuser and its successors use. A full steer is a circle of 3.7 m there;
-the wheels of this ego turn to one of 7.7 m, so a steer beyond 0.47 changes nothing.
+A steer gives the circle that CARLA's car would drive, by the kinematic bicycle that
+World on Rails (Chen, Koltun and Kraehenbuehl 2021) fitted to CARLA and TransFuser and
+its successors use. A full steer is a circle of 3.7 m there; the wheels of this ego turn
+to one of 7.7 m, so a steer beyond 0.47 changes nothing.
 """
 
 import math
@@ -23,12 +23,7 @@ FRONT_AXLE_M, REAR_AXLE_M = -0.090769015, 1.4178275
 
 
 def control_of(asked: PedalsAndWheel, length_m: float) -> Control:
-    """Return acceleration and front wheel angle.
-
-    Args:
-        asked: In their ranges; steer to the right is positive.
-        length_m: Of the ego.
-    """
+    """Return acceleration and front wheel angle; steer to the right is positive."""
     braking, thrust = ACCELERATION_RANGE_MPS2
     curvature = curvature_by(-asked.steer)
     sine = min(max(curvature * length_m / 2, -1.0), 1.0)

@@ -1,4 +1,4 @@
-"""A process that drives routes, and the watchdog that outlives it."""
+"""A process that drives routes, and its watchdog."""
 
 from __future__ import annotations
 
@@ -36,11 +36,7 @@ route passed."""
 class Job:
     """What all routes of an evaluation have in common.
 
-    Args:
-        driver: Who drives.
-        conditions: Under what.
-        frame_limit_s: Seconds that a decision may take before the policy counts as
-            hung.
+    A decision that takes longer than ``frame_limit_s`` makes the policy count as hung.
     """
 
     driver: Driver
@@ -50,13 +46,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Driven:
-    """An episode and what it cost here.
-
-    Attributes:
-        episode: The record.
-        seconds: Wall-clock seconds.
-        memory_bytes: Resident memory of the process that drove.
-    """
+    """An episode, the wall-clock seconds and the resident memory that it took."""
 
     episode: Episode
     seconds: float
@@ -65,11 +55,7 @@ class Driven:
 
 @dataclass
 class RouteWorker:
-    """Drives one route at a time in a process of its own, started when needed.
-
-    Args:
-        job: What to drive with.
-    """
+    """Drives one route at a time in a separate process, started when needed."""
 
     job: Job
     _process: SpawnProcess | None = field(default=None, init=False)
@@ -79,14 +65,9 @@ class RouteWorker:
     )
 
     def drive(self, route: Route, stop: threading.Event | None = None) -> Driven | None:
-        """Drive a route; a policy that hangs or takes its process down has failed.
+        """Drive a route; a policy that hangs or crashes its process has failed.
 
-        Args:
-            route: Which.
-            stop: Ends the drive when set.
-
-        Returns:
-            What was driven, None if it was stopped.
+        Returns None if ``stop`` was set meanwhile.
 
         Raises:
             EvaluationError: The process ended for another reason than the policy.
@@ -94,6 +75,7 @@ class RouteWorker:
         begun = time.perf_counter()
         process, heartbeat, line = self._started()
         line.send(route)
+        # watch the heartbeat: one call must not take too long
         asked, since = 0.0, begun
         while not _ready(line):
             if stop is not None and stop.is_set():
@@ -104,6 +86,7 @@ class RouteWorker:
             elif asked and time.perf_counter() - since > self.job.frame_limit_s:
                 limit = f"{self.job.frame_limit_s:g} s"
                 return self._lost(route, begun, f"no plan within {limit}")
+        # a closed pipe means that the process ended
         try:
             answer = line.recv()
         except (EOFError, ConnectionResetError):
@@ -126,6 +109,7 @@ class RouteWorker:
         self,
     ) -> tuple[SpawnProcess, Heartbeat, Connection[Route, Driven | Me2eError]]:
         if self._process is None or self._heartbeat is None or self._line is None:
+            # the child keeps only its own end of the pipe
             context = spawn_context()
             heartbeat = context.Array("d", 2)
             ours, theirs = context.Pipe()
@@ -165,7 +149,7 @@ def _ready(line: Connection[Route, Driven | Me2eError]) -> bool:
 def _serve(
     line: Connection[Driven | Me2eError, Route], heartbeat: Heartbeat, job: Job
 ) -> None:
-    """Answer the routes that come down the line until its other end closes."""
+    """Drive the routes received until the other end of the pipe closes."""
     end_with_parent()
     try:
         _drive_routes(line, heartbeat, job)
@@ -184,6 +168,7 @@ def _drive_routes(
     from me2e_compress.evaluators.highway.episode_recorder import completion_percent
     from me2e_compress.evaluators.highway.runner import Listeners, drive
 
+    # the heartbeat tells the parent when a call of the policy began
     asked = 0
 
     def on_query(world: World) -> None:

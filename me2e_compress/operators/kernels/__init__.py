@@ -1,7 +1,7 @@
 """Compiled kernels of fused operators, run by ordinary onnxruntime sessions.
 
-A session calls them on its own threads, in the place of the nodes that
-:data:`~me2e_compress.operators.kernels.kernel.DOMAIN` holds.
+A session calls them on its own threads for the nodes of
+:data:`~me2e_compress.operators.kernels.kernel.DOMAIN`.
 """
 
 from me2e_compress.operators.kernels.availability import why_not

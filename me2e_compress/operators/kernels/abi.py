@@ -1,6 +1,6 @@
-"""Numbers that Python, compiled kernels and onnxruntime's C interface agree on.
+"""Constants shared by Python, compiled kernels and onnxruntime's C interface.
 
-Places in ``OrtApi`` and ``OrtCustomOp`` are those of ``onnxruntime_c_api.h``, where
+Offsets in ``OrtApi`` and ``OrtCustomOp`` are those of ``onnxruntime_c_api.h``, where
 entries are only ever added at the end.
 """
 
@@ -8,7 +8,7 @@ API_VERSION = 17
 """The first with ``KernelContext_ParallelFor``: onnxruntime 1.17."""
 
 OP_VERSION = 16
-"""The first with ``KernelComputeV2``, which answers with a status."""
+"""The first with ``KernelComputeV2``, which returns a status."""
 
 CREATE_DOMAIN, ADD_OP, ADD_DOMAIN = 26, 27, 28
 
@@ -36,18 +36,18 @@ CALLED_BY_KERNELS = (
     RELEASE_INFO,
     PARALLEL_FOR,
 ) = range(len(CALLED_BY_KERNELS))
-"""Words of a kernel's state: addresses of those functions, then"""
+"""Words of a kernel's state: the addresses of those functions, then"""
 BLOCK = len(CALLED_BY_KERNELS)
-"""that of the kernel's own ``block``, which ``ParallelFor`` calls, then"""
+"""the address of the kernel's own ``block``, which ``ParallelFor`` calls, then"""
 MESSAGES = BLOCK + 1
-"""those of what it may answer where its inputs do not fit."""
+"""the addresses of its error messages."""
 STATE_WORDS = MESSAGES + 16
 
 INVALID_ARGUMENT = 2
 """``ORT_INVALID_ARGUMENT``."""
 
 FLOAT, UINT8, INT8, INT32, INT64, ANY = 1, 2, 3, 6, 7, 0
-"""``ONNXTensorElementDataType``; ``ANY`` leaves it to the kernel to look."""
+"""``ONNXTensorElementDataType``; ``ANY`` leaves the check to the kernel."""
 
 VARIADIC = (
     "GetVariadicInputMinArity",
@@ -73,4 +73,4 @@ FIELDS = (
     "CreateKernelV2",
     "KernelComputeV2",
 )
-"""Of ``OrtCustomOp``, a word each; those behind them are for later versions."""
+"""Fields of ``OrtCustomOp``, one word each; the fields after them are newer."""

@@ -1,4 +1,4 @@
-"""Whether kernels run here, and why not."""
+"""Find out whether kernels run here, and why not."""
 
 from importlib.util import find_spec
 
@@ -8,7 +8,7 @@ from me2e_compress.operators.kernels import trampoline
 def why_not() -> str | None:
     """Return why this machine runs no kernels; None if it does.
 
-    Nothing is imported to know it: Numba itself may still refuse to load.
+    Nothing is imported for this check: Numba itself may still fail to load.
     """
     if reason := trampoline.why_not():
         return reason

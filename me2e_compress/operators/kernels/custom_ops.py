@@ -1,8 +1,8 @@
-"""Compiled kernels as custom operators of an ordinary onnxruntime session.
+"""Register compiled kernels as custom operators of an onnxruntime session.
 
-Everything that onnxruntime is given here stays for as long as the process lives: a
-session calls its operators until it is gone, and Python cannot tell when that is.
-Python is called only while a session is being opened, never by one that runs or ends.
+Everything given to onnxruntime here lives as long as the process: a session calls its
+operators until it is destroyed, and Python cannot tell when that is. Python is called
+only while a session is being opened, never while one runs or ends.
 """
 
 import ctypes
@@ -23,7 +23,7 @@ _POINTER = ctypes.c_void_p
 _INT, _SIZE = ctypes.c_int, ctypes.c_size_t
 
 _asked = threading.local()
-"""What this thread is registering: onnxruntime calls back within that very call."""
+"""What this thread is registering; onnxruntime calls back within that same call."""
 
 
 def register(
@@ -31,12 +31,9 @@ def register(
     kernels: Iterable[CompiledKernel],
     begins: Callable[[], None] = lambda: None,
 ) -> None:
-    """Let sessions of these options run kernels; to be called once for them.
+    """Let sessions with these options run kernels; call it once per options object.
 
-    Args:
-        options: of the sessions.
-        kernels: which; compiled here where this machine has not seen them.
-        begins: called before each that is compiled.
+    ``begins`` is called before a kernel is compiled, if this machine has not cached it.
 
     Raises:
         OSError: no shared object can be opened; see :mod:`trampoline`.
@@ -52,19 +49,21 @@ def register(
 
 
 def register_named(options: ort.SessionOptions, names: Iterable[str]) -> None:
-    """Do what :func:`register` does for kernels by their names."""
+    """Call :func:`register` for kernels given by name."""
     known = {each.op_type: each for each in KERNELS}
     register(options, [known[name] for name in names])
 
 
 def _add(options: int, base: int) -> None:
-    """Add what was asked for; onnxruntime calls it through the trampoline."""
+    """Add the requested operators; onnxruntime calls this through the trampoline."""
+    # Create the domain
     api = _api(base)
     domain = _POINTER()
     name = ctypes.create_string_buffer(DOMAIN.encode())
     create = ctypes.CFUNCTYPE(_POINTER, _POINTER, _POINTER)(api[abi.CREATE_DOMAIN])
     add = ctypes.CFUNCTYPE(_POINTER, _POINTER, _POINTER)
     create(ctypes.addressof(name), ctypes.addressof(domain))
+    # Add the operators to it, then the domain to the options
     for kernel, code in _asked.code.items():
         operator = _operator(kernel, code["compute"], code["block"], base)
         add(api[abi.ADD_OP])(domain, ctypes.addressof(operator))
@@ -75,7 +74,7 @@ _register = ctypes.CFUNCTYPE(_POINTER, _POINTER, _POINTER)(_add)
 
 
 def _api(base: int) -> Any:
-    """Return the functions of onnxruntime's C interface, by their places."""
+    """Return the functions of onnxruntime's C interface, by offset."""
     get = ctypes.cast(base, ctypes.POINTER(_POINTER))[0]
     found = ctypes.CFUNCTYPE(_POINTER, ctypes.c_uint32)(get)(abi.API_VERSION)
     return ctypes.cast(found, ctypes.POINTER(_POINTER))
@@ -86,13 +85,14 @@ _KEPT: list[object] = []
 
 @functools.cache
 def _operator(kernel: CompiledKernel, compute: int, block: int, base: int) -> Any:
-    """Write an ``OrtCustomOp``, and behind it the state of its kernels."""
+    """Write an ``OrtCustomOp``, followed by the state of its kernels."""
     name = ctypes.create_string_buffer(kernel.op_type.encode())
     said = [
         ctypes.create_string_buffer(f"{kernel.op_type}: {each}".encode())
         for each in kernel.messages
     ]
     door = trampoline()
+    # Callbacks that describe the operator, called only on opening
     callbacks: dict[str, Any] = {
         "GetName": ctypes.CFUNCTYPE(_POINTER, _POINTER)(
             lambda _: ctypes.addressof(name)
@@ -115,6 +115,7 @@ def _operator(kernel: CompiledKernel, compute: int, block: int, base: int) -> An
         "GetInputMemoryType": _zero(),
         **{name: _one() for name in abi.VARIADIC},
     }
+    # Fill in the struct
     written = (_POINTER * (STATE_OFFSET // 8 + abi.STATE_WORDS))()
     written[0] = abi.OP_VERSION
     for field, callback in callbacks.items():
@@ -122,6 +123,7 @@ def _operator(kernel: CompiledKernel, compute: int, block: int, base: int) -> An
     for field in ("CreateKernel", "KernelDestroy"):
         written[abi.FIELDS.index(field)] = door.address(field)
     written[abi.FIELDS.index("KernelComputeV2")] = compute
+    # The state of its kernels follows the struct
     api = _api(base)
     state = [api[place] for place in abi.CALLED_BY_KERNELS]
     state += [block, *map(ctypes.addressof, said)]

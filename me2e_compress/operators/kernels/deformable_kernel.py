@@ -1,8 +1,8 @@
-"""Multi-scale deformable attention: a block of queries at a time, in vectors.
+"""The kernel of multi-scale deformable attention, vectorized per block of queries.
 
-For all points of one query the four corners' places and weights are computed first,
-side by side; then the rows are summed (:mod:`weighted_rows`). One kernel serves every
-number of levels, points, heads and channels.
+For all points of one query the positions and weights of the four corners are computed
+first; then the rows are summed (:mod:`weighted_rows`). One kernel serves any number
+of levels, points, heads and channels.
 """
 
 from collections.abc import Callable, Mapping
@@ -29,7 +29,7 @@ from me2e_compress.operators.kernels.weighted_rows import CAPACITY, weighted_row
 F = np.float32
 I32 = np.int32
 QUERIES = 128
-"""A block of work; few enough for all threads to end at about the same time."""
+"""Queries per block of work, few enough to balance the threads."""
 
 # words of one call, as `compute` hands them to every `block`
 VALUE, SHAPES, STARTS, PLACES, SHARES, SCALE, ZERO, OUT = range(8)
@@ -53,7 +53,6 @@ _slot = stack(types.int64, 1)
 
 @compiled
 def _whole(address: int, index: int, wide: int) -> Word:
-    """Read an int64 or an int32."""
     if wide:
         return words(address)[index]
     return np.int64(ints(address)[index])
@@ -61,7 +60,7 @@ def _whole(address: int, index: int, wide: int) -> Word:
 
 @compiled
 def _tables(a: Any, w: Any, o: Any, heads: int) -> None:
-    """Write what every point of a query needs to know of its level and head."""
+    """Write the constants of every point of a query: sizes and offsets of its level."""
     wide, row = a[WIDE_SHAPES], a[M] * a[D]
     for level in range(a[L]):
         height = _whole(a[SHAPES], 2 * level, wide)
@@ -84,11 +83,12 @@ def _tables(a: Any, w: Any, o: Any, heads: int) -> None:
 def _corners(w: Any, o: Any, places: Any, shares: Any, count: int, row: int) -> None:
     """Write the weights and offsets of the four corners of every point.
 
-    A place that is no number is treated as one outside. What lies outside or has no
-    weight is not read: masked cameras cost next to nothing, and a NaN there stays
-    there (in the body, 0 x NaN is NaN).
+    A position that is NaN counts as outside. Points outside or without weight are not
+    read: masked cameras cost next to nothing, and a NaN there has no effect (in the
+    body, 0 x NaN is NaN).
     """
     for j in range(count):
+        # Pixel position, clipped to just outside
         width, height = w[4 * CAPACITY + j], w[5 * CAPACITY + j]
         x = places[2 * j] * width - F(0.5)
         y = places[2 * j + 1] * height - F(0.5)
@@ -97,6 +97,7 @@ def _corners(w: Any, o: Any, places: Any, shares: Any, count: int, row: int) -> 
         y = y if y > F(-1) else F(-1)
         y = y if y < height else height
         floor_x, floor_y = np.floor(x), np.floor(y)
+        # Shares of the corners; 0 outside of the map
         right, below = x - floor_x, y - floor_y
         x0, y0 = I32(floor_x), I32(floor_y)
         last_x, last_y = o[5 * CAPACITY + j], o[6 * CAPACITY + j]
@@ -110,6 +111,7 @@ def _corners(w: Any, o: Any, places: Any, shares: Any, count: int, row: int) -> 
         w[CAPACITY + j] = right * (above * share)
         w[2 * CAPACITY + j] = left * (below * share)
         w[3 * CAPACITY + j] = right * (below * share)
+        # Offsets of the corners, clipped to the map
         column = I32(max(min(x0, last_x), I32(0)) * row)
         following = I32(max(min(I32(x0 + 1), last_x), I32(0)) * row)
         first, stride = o[4 * CAPACITY + j], o[7 * CAPACITY + j]
@@ -123,7 +125,7 @@ def _corners(w: Any, o: Any, places: Any, shares: Any, count: int, row: int) -> 
 
 @compiled
 def _to_real(a: Any, w: Any, out: int, head: int, first: int, last: int) -> None:
-    """Turn sums of whole numbers into those of what they stand for."""
+    """Convert sums of quantized numbers to real ones."""
     numbers, scales = floats(out), floats(a[SCALE])
     shares = F(0)
     for j in range(first, last):
@@ -140,7 +142,7 @@ def _to_real(a: Any, w: Any, out: int, head: int, first: int, last: int) -> None
 
 
 def _block(kind: Any) -> Callable[[int, int], Word]:
-    """Make the function that answers a block of queries, for rows of a kind."""
+    """Make the function that computes a block of queries, for an element type."""
     sum_rows = weighted_rows(kind)
     bytes_each = kind.bitwidth // 8
     quantized = bytes_each == 1
@@ -181,17 +183,15 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
 
 @compiled
 def _refused(t: Any, message: int) -> Word:
-    """Return a status that says what does not fit."""
     create, said = t[abi.CREATE_STATUS], t[abi.MESSAGES + message]
     return call(create, abi.INVALID_ARGUMENT, said, 0, 0, 0)
 
 
 @compiled
 def _read(t: Any, context: int, index: int, to: int) -> Word:
-    """Read an input into ten words: dimensions, then address and type.
+    """Read an input into ten words (dimensions, address, type) and return its rank.
 
-    Returns:
-        Its rank; of more than eight dimensions none is read.
+    The dimensions are not read if there are more than eight.
     """
     slot = _slot()
     at = address_of(slot)
@@ -211,7 +211,8 @@ def _read(t: Any, context: int, index: int, to: int) -> Word:
 
 @compiled
 def _misfit(a: Any, x: Any) -> Word:
-    """Return which message says what does not fit; -1 if everything does."""
+    """Return the index of the message for unfit inputs; -1 if they fit."""
+    # Sizes must agree between the inputs
     s, m, d, levels, points = x[1], x[2], x[3], x[10], x[34]
     same = x[30] == x[0] and x[33] == levels and x[35] == 2 and x[42] == m
     if not (same and x[11] == 2 and x[20] == levels):
@@ -225,6 +226,7 @@ def _misfit(a: Any, x: Any) -> Word:
         return TOO_LARGE
     if levels * points > CAPACITY:
         return TOO_MANY
+    # Every level must lie within the rows of value
     for k in range(levels):
         height = _whole(a[SHAPES], 2 * k, a[WIDE_SHAPES])
         width = _whole(a[SHAPES], 2 * k + 1, a[WIDE_SHAPES])
@@ -239,7 +241,7 @@ def _misfit(a: Any, x: Any) -> Word:
 
 
 def _compute(inputs: int) -> Callable[[int, int], Word]:
-    """Make the function that onnxruntime calls, for so many inputs."""
+    """Make the function that onnxruntime calls, for a number of inputs."""
 
     def compute(state: int, context: int) -> Word:
         t, x, a = words(state), _inputs(), _words()
@@ -286,7 +288,7 @@ def _compute(inputs: int) -> Callable[[int, int], Word]:
 
 
 def functions(op_type: str) -> Mapping[str, Callable[[int, int], Word]]:
-    """Return what is to be compiled for an operator of :mod:`kernel`."""
+    """Return the functions to compile for an operator of :mod:`kernel`."""
     kinds = {"Uint8": types.uint8, "Int8": types.int8}
     kind = next((kinds[each] for each in kinds if op_type.endswith(each)), None)
     if kind is None:

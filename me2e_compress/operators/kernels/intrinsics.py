@@ -1,4 +1,4 @@
-"""What Numba's language lacks: addresses, calls through them, memory on the stack."""
+"""Numba intrinsics for addresses, calls through them, and memory on the stack."""
 
 from collections.abc import Callable
 from typing import Any, TypeAlias, TypeVar, cast
@@ -25,11 +25,11 @@ OPTIONS: Any = {
     "_nrt": False,
     "forceinline": True,
 }
-"""Of every compilation: no exception where numpy has none, a product and a sum may
-become one instruction, and no counting of references: nothing here owns memory."""
+"""Options of every compilation: numpy's error model, fused multiply-add, and no
+reference counting, since nothing here owns memory."""
 
 Word: TypeAlias = Any
-"""What is an int64 to Numba; to whoever checks types, nothing is known of it."""
+"""An int64 for Numba; untyped for type checkers."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -40,7 +40,7 @@ def compiled(function: Function) -> Function:
 
 
 def _at(kind: Any) -> Any:
-    """Return the intrinsic that makes an address a pointer to numbers of a kind."""
+    """Return the intrinsic that casts an address to a pointer to numbers of a type."""
 
     def typed(context: Any, address: Any) -> tuple[Any, Callable[..., Any]]:
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -74,19 +74,19 @@ signed_bytes: Any = _at(types.int8)
 unsigned_bytes: Any = _at(types.uint8)
 
 address_of: Any = intrinsic(_address)
-"""``address_of(pointer)``: the other way round."""
+"""``address_of(pointer)``: the inverse."""
 
 call: Any = intrinsic(_call)
 """``call(address, a, b, c, d, e)``: call a C function of up to five words; one that
-takes fewer does not look at the rest. The result is a word, any for ``void``."""
+takes fewer ignores the rest. The result is a word, undefined for ``void``."""
 
 
 def stack(kind: Any, count: int) -> Any:
-    """Return an intrinsic that gives ``count`` numbers on the stack, not initialized.
+    """Return an intrinsic for ``count`` uninitialized numbers on the stack.
 
     Numba's own ``alloca_once`` fills them with zeros, by one instruction that takes
-    LLVM 12 s to compile at 12,000 numbers. The room is taken once a function, not
-    where this stands.
+    LLVM 12 s to compile at 12,000 numbers. Memory is allocated once per function call,
+    even inside loops.
     """
 
     def typed(context: Any) -> tuple[Any, Callable[..., Any]]:

@@ -1,4 +1,4 @@
-"""Which compiled kernels there are."""
+"""The list of compiled kernels."""
 
 import dataclasses
 
@@ -7,13 +7,12 @@ from me2e_compress.operators.kernels.abi import ANY, FLOAT, INT8, UINT8
 
 @dataclasses.dataclass(frozen=True)
 class CompiledKernel:
-    """A compiled operator.
+    """A compiled operator of the domain :data:`DOMAIN`.
 
     Attributes:
-        op_type: its name; the domain is :data:`DOMAIN`.
-        module: of this package, that has its code.
+        module: the module of this package that has its code.
         inputs: their element types.
-        messages: what it may answer where its inputs do not fit.
+        messages: errors for inputs that do not fit.
         output: its element type.
     """
 
@@ -25,8 +24,8 @@ class CompiledKernel:
 
 
 DOMAIN = "me2e.kernels"
-"""Nodes are moved here when a graph is opened. A domain of their own: no file has
-nodes in it, so no function body and no other library can claim them."""
+"""The domain to which nodes move when a graph is opened. No file has nodes in it, so
+no function body and no other library can claim them."""
 
 _DEFORMABLE = (
     "the inputs have not the ranks that they must: value 4, spatial_shapes 2,"
@@ -54,4 +53,4 @@ KERNELS = tuple(
         ("Uint8", (UINT8, *_INPUTS[1:], FLOAT, UINT8)),
     )
 )
-"""All of them."""
+"""All compiled kernels."""

@@ -1,8 +1,8 @@
-"""Kernels as machine code that is kept in a file and needs no Numba to load.
+"""Store kernels as machine code that needs no Numba to load.
 
-Numba compiles once a machine, 1 to 2 s a kernel; afterwards LLVM alone loads the code,
-in a third of the time that importing Numba takes. A file is named by all that it was
-made of: this package's kernels, the compilers, and the processor.
+Numba compiles once per machine, 1 to 2 s per kernel; afterwards LLVM alone loads the
+code, in a third of the time of importing Numba. A file's name depends on this package's
+kernels, the compilers, and the processor.
 """
 
 import functools
@@ -21,8 +21,8 @@ from me2e_compress.errors import GraphError
 from me2e_compress.operators.kernels.store import keep, private
 
 _FOREIGN = frozenset({"memset", "memcpy", "memmove", "floorf", "expf"})
-"""What kernels may call, of the C library. Code that calls into Python or into Numba
-would end a process into which Numba is not loaded."""
+"""C library functions that kernels may call. Code that calls into Python or Numba
+would crash a process into which Numba is not loaded."""
 
 _WRAPPER = """
 declare i32 @"{inner}"(ptr, ptr, i64, i64)
@@ -36,25 +36,21 @@ define i64 @{name}(i64 %first, i64 %second) {{
 }}
 """
 """A C function around a Numba function, whose first two arguments are pointers to the
-result and to what it raised; ``cfunc``'s own wrapper raises in Python."""
+result and to its exception; ``cfunc``'s own wrapper raises in Python."""
 
 _DIGEST = hashlib.sha256().digest_size
 _LOCK = threading.Lock()
 _ENGINES: list[Any] = []
-"""They own the code, which may be run for as long as the process lives."""
+"""Owners of the code, which may run for as long as the process lives."""
 
 
 def load_or_compile(
     op_type: str, module: str, folder: Path, begins: Callable[[], None]
 ) -> Mapping[str, int]:
-    """Return the addresses of a kernel's functions, by name.
+    """Return the addresses of a kernel's functions by name, cached in ``folder``.
 
-    Args:
-        op_type: the kernel's operator.
-        module: of this package; its ``functions(op_type)`` are Python functions of
-            two words that return a word.
-        folder: where machine code is kept.
-        begins: called before a kernel is compiled, not where its code was found.
+    The module's ``functions(op_type)`` are Python functions of two words that return a
+    word; ``begins`` is called before a kernel is compiled.
 
     Raises:
         GraphError: the functions call something that only Python or Numba has.
@@ -74,7 +70,7 @@ def load_or_compile(
 
 @functools.cache
 def _fingerprint() -> str:
-    """Name everything that machine code depends on."""
+    """Return a digest of everything that machine code depends on."""
     known = hashlib.sha256()
     for file in sorted(Path(__file__).parent.glob("*.py")):
         known.update(file.read_bytes())
@@ -85,7 +81,7 @@ def _fingerprint() -> str:
 
 
 def _read(path: Path | None) -> bytes | None:
-    """Return code that was kept; None if there is none, or a file of something else."""
+    """Return stored code; None if there is none or the file is corrupt."""
     try:
         content = b"" if path is None else path.read_bytes()
     except OSError:
@@ -95,7 +91,7 @@ def _read(path: Path | None) -> bytes | None:
 
 
 def _machine() -> Any:
-    """Return LLVM's compiler for this very processor."""
+    """Return LLVM's compiler for this processor."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     target = llvm.Target.from_default_triple()
@@ -114,11 +110,13 @@ def _compiled(functions: Mapping[str, Callable[[int, int], int]]) -> bytes:
     word = numba.types.intp
     machine = _machine()
     whole = llvm.parse_assembly("")
+    # Link all functions with C wrappers
     for name, function in functions.items():
         made = numba.cfunc(word(word, word), **intrinsics.OPTIONS)(function)
         inner = made.native_name.removeprefix("cfunc.")
         whole.link_in(llvm.parse_assembly(made.inspect_llvm()))
         whole.link_in(llvm.parse_assembly(_WRAPPER.format(inner=inner, name=name)))
+    # Only the wrappers stay visible; remove the rest if unused
     for each in (*whole.functions, *whole.global_variables):
         if not each.is_declaration and each.name not in functions:
             each.linkage = "internal"
@@ -126,6 +124,7 @@ def _compiled(functions: Mapping[str, Callable[[int, int], int]]) -> bytes:
     passes.add_global_dead_code_eliminate_pass()
     options = llvm.create_pipeline_tuning_options()
     passes.run(whole, llvm.create_pass_builder(machine, options))
+    # Refuse calls that need Numba at run time
     foreign = [
         each.name
         for each in whole.functions
@@ -137,7 +136,6 @@ def _compiled(functions: Mapping[str, Callable[[int, int], int]]) -> bytes:
 
 
 def _addresses(code: bytes) -> Mapping[str, int]:
-    """Load an object file; return where its C functions stand."""
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()

@@ -1,7 +1,7 @@
-"""The folder of compiled kernels: this user's alone, and files in it whole or absent.
+"""A private folder of compiled kernels, whose files are written atomically.
 
-What lies there is run. So a folder that others may write to, or that belongs to
-somebody else, is not used.
+Its content is executed: a folder that others may write to, or that belongs to another
+user, is not used.
 """
 
 import os
@@ -13,12 +13,12 @@ import platformdirs
 
 
 def default_folder() -> Path:
-    """Return where kernels are kept unless told otherwise."""
+    """Return the default folder of kernels."""
     return platformdirs.user_cache_path("me2e-compress") / "kernels"
 
 
 def private(folder: Path) -> Path | None:
-    """Make a folder of mode 0700, or find it; None if it is not this user's alone."""
+    """Return a folder of mode 0700, made if needed; None if others may write to it."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = folder.stat()
@@ -30,11 +30,7 @@ def private(folder: Path) -> Path | None:
 
 
 def keep(path: Path, content: bytes) -> bool:
-    """Write a file all or nothing, unless it stands there already.
-
-    Returns:
-        Whether the file holds this content now.
-    """
+    """Write a file atomically, unless unchanged; return whether it has the content."""
     try:
         if path.read_bytes() == content:
             return True

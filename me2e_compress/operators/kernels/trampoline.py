@@ -1,11 +1,11 @@
-"""The shared object by which onnxruntime finds our operators, written at first use.
+"""Write the shared object through which onnxruntime finds our operators.
 
 ``SessionOptions.register_custom_ops_library`` opens a shared object and calls its
-function ``RegisterCustomOps``; that is the only door that onnxruntime's Python package
-has. So a shared object of three functions of one or two instructions is written as
-bytes: no compiler is needed on the user's machine, no binary of a platform need be
-shipped or trusted, and it is 4 kB (64 kB where memory comes in larger pages). Each
-process puts the address of its own callback into the object's ``slot``.
+function ``RegisterCustomOps``; onnxruntime's Python package has no other way. So a
+shared object of three functions of one or two instructions is written as bytes: it
+needs no compiler on the user's machine and no shipped binary, and has 4 kB (64 kB where
+memory pages are larger). Each process puts the address of its own callback into the
+object's ``slot``.
 """
 
 import ctypes
@@ -21,8 +21,8 @@ from pathlib import Path
 from me2e_compress.operators.kernels.store import default_folder, keep, private
 
 STATE_OFFSET = 0x180
-"""Bytes from an operator's description to the state of its kernels, which stands right
-behind it: ``CreateKernel`` is one addition then, and needs no Python."""
+"""Bytes from an operator's description to the state of its kernels, which follows it:
+``CreateKernel`` is one addition then, and needs no Python."""
 
 _CODE, _SYMBOLS, _HASH, _NAMES = 0x200, 0x280, 0x380, 0x3C0
 _FUNCTIONS = ("RegisterCustomOps", "CreateKernel", "KernelDestroy")
@@ -31,14 +31,9 @@ _STEP = 16  # bytes a function takes
 
 @dataclasses.dataclass(frozen=True)
 class _Machine:
-    """What differs between processors.
+    """Constants of a processor: ELF ``e_machine``, largest memory page, and code.
 
-    Attributes:
-        number: ``e_machine`` of an ELF header.
-        page: the largest page that memory may come in.
-        jump: code that jumps to the address in the slot, so far away.
-        add: code that returns its first argument plus :data:`STATE_OFFSET`.
-        nothing: code that returns.
+    ``add`` returns the first argument plus :data:`STATE_OFFSET`; ``nothing`` returns.
     """
 
     number: int
@@ -47,7 +42,7 @@ class _Machine:
     nothing: bytes
 
     def jump(self, distance: int) -> bytes:
-        """Return code that jumps to the address in the slot, so far behind it."""
+        """Return code that jumps to the address in the slot at this distance."""
         if self.number == 62:  # jmp *slot(%rip)
             return b"\xff\x25" + struct.pack("<i", distance - 6)
         # ldr x16, slot; br x16
@@ -81,13 +76,10 @@ def why_not() -> str | None:
 
 
 def shared_object(machine: str) -> bytes:
-    """Write the shared object: an ELF file of code, a slot and their names.
-
-    Args:
-        machine: ``x86_64`` or ``aarch64``.
-    """
+    """Return the shared object for ``x86_64`` or ``aarch64``: an ELF file."""
     kind = _MACHINES[machine]
     dynamic, slot = kind.page, kind.page + 0x100
+    # Functions and their names
     code = [kind.jump(slot - _CODE), kind.add, kind.nothing]
     names = b"\0" + b"".join(f"{name}\0".encode() for name in (*_FUNCTIONS, "slot"))
     places = [names.index(f"{name}\0".encode()) for name in (*_FUNCTIONS, "slot")]
@@ -97,9 +89,11 @@ def shared_object(machine: str) -> bytes:
         symbols += struct.pack("<IBBHQQ", place, 0x12, 0, 1, at, len(body))
     symbols += struct.pack("<IBBHQQ", places[3], 0x11, 0, 1, slot, 8)
     # one bucket, five symbols, each the next one's predecessor
+    # The hash table and the dynamic section
     table = struct.pack("<8I", 1, 5, 1, 0, 2, 3, 4, 0)
     entries = ((4, _HASH), (5, _NAMES), (6, _SYMBOLS), (10, len(names)), (11, 24))
     tags = b"".join(struct.pack("<qQ", *entry) for entry in (*entries, (0, 0)))
+    # Put the pieces at their offsets
     file = bytearray(slot + 8)
     pieces = {
         0: _header(kind, dynamic, len(tags)),
@@ -115,7 +109,7 @@ def shared_object(machine: str) -> bytes:
 
 
 def _header(kind: _Machine, dynamic: int, tags: int) -> bytes:
-    """Write the ELF header, and what is loaded where."""
+    """Return the ELF header and the program headers."""
     ident = b"\x7fELF\2\1\1".ljust(16, b"\0")
     sizes = (64, 56, 4, 0, 0, 0)
     head = struct.pack(
@@ -134,35 +128,29 @@ def _header(kind: _Machine, dynamic: int, tags: int) -> bytes:
 
 @dataclasses.dataclass(frozen=True)
 class Trampoline:
-    """The shared object, open in this process.
-
-    Attributes:
-        path: what onnxruntime is told to open.
-        library: the same, open.
-    """
+    """The shared object, open in this process; ``path`` is what onnxruntime opens."""
 
     path: str
     library: ctypes.CDLL
 
     def address(self, name: str) -> int:
-        """Return where a function stands."""
+        """Return the address of a function."""
         found = ctypes.cast(getattr(self.library, name), ctypes.c_void_p).value
         assert found is not None
         return found
 
     def fill(self, callback: int) -> None:
-        """Put an address into the slot that ``RegisterCustomOps`` jumps to."""
+        """Set the address that ``RegisterCustomOps`` jumps to."""
         ctypes.c_void_p.in_dll(self.library, "slot").value = callback
 
 
 def load(folder: Path) -> Trampoline:
     """Open the shared object from a private folder or, where that fails, from memory.
 
-    A folder that cannot be written to, or from which nothing may run (``noexec``),
-    is passed over.
+    A folder that is not writable, or mounted ``noexec``, is skipped.
 
     Raises:
-        OSError: not even memory can be run.
+        OSError: it cannot be executed from memory either.
     """
     content = shared_object(platform.machine())
     if place := private(folder):
@@ -180,9 +168,5 @@ def load(folder: Path) -> Trampoline:
 
 @functools.cache
 def trampoline() -> Trampoline:
-    """Open the shared object once a process.
-
-    Raises:
-        OSError: it can be opened neither from the cache folder nor from memory.
-    """
+    """Open the shared object once per process, or raise an OSError."""
     return load(default_folder())

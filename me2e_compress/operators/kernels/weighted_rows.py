@@ -1,7 +1,7 @@
-"""The inner loop of every deformable operator, in vectors: a weighted sum of rows.
+"""The inner loop of every deformable operator: a vectorized weighted sum of rows.
 
-Written as LLVM instructions: so the sums stay in registers for every head size, which
-Numba's loops over arrays leave to chance.
+It is written as LLVM instructions so that the sums stay in registers for every head
+size, which Numba's loops over arrays do not guarantee.
 """
 
 from collections.abc import Callable
@@ -15,11 +15,11 @@ from numba.extending import intrinsic
 from me2e_compress.operators.kernels.intrinsics import ELEMENTS, FLOAT, INT, WORD
 
 CAPACITY = 1024
-"""Points at a time; the four arrays of offsets, and of weights, stand so far apart."""
+"""Points at a time, and the distance of the four arrays of offsets and weights."""
 
 CORNERS = 4
 WIDTHS = (32, 16, 8, 4, 1)
-"""Channels at a time: the widest that fits first."""
+"""Channels at a time, the widest first."""
 
 
 def weighted_rows(kind: Any) -> Any:
@@ -27,10 +27,7 @@ def weighted_rows(kind: Any) -> Any:
 
     It writes ``size`` float32 numbers to the address ``out``: the sum over the points
     ``first`` to ``last`` of four rows each, times their weights. A point whose first
-    offset is negative is left out.
-
-    Args:
-        kind: of the rows: float32, int8 or uint8.
+    offset is negative is skipped. Rows of ``kind`` are float32, int8 or uint8.
     """
 
     def typed(
@@ -54,7 +51,7 @@ def weighted_rows(kind: Any) -> Any:
 
 
 class _Loops:
-    """The instructions: for each width a loop over channels, in it one over points."""
+    """Writes a loop over channels for each width, and inside it one over points."""
 
     def __init__(
         self,
@@ -83,6 +80,7 @@ class _Loops:
                 builder.append_basic_block(f"{part}{width}")
                 for part in ("head", "body", "after")
             )
+            # Loop while this width fits into the rest
             builder.branch(head)
             builder.position_at_end(head)
             at = builder.load(done)
@@ -97,7 +95,7 @@ class _Loops:
             builder.position_at_end(after)
 
     def _sum(self, rows: Any, width: int) -> Any:
-        """Write the loop over points for ``width`` channels; return the sums."""
+        """Write the loop over points for ``width`` channels and return the sums."""
         builder, kind = self.builder, ir.VectorType(FLOAT, width)
         nothing = kind([0.0] * width)
         before = builder.block
@@ -108,6 +106,7 @@ class _Loops:
         some = builder.icmp_signed("<", self.first, self.last)
         builder.cbranch(some, loop, end)
 
+        # Skip points whose first offset is negative
         builder.position_at_end(loop)
         point, sums = builder.phi(WORD), builder.phi(kind)
         point.add_incoming(self.first, before)
@@ -116,6 +115,7 @@ class _Loops:
         builder.cbranch(builder.icmp_signed(">=", offset, INT(0)), inside, ahead)
 
         builder.position_at_end(inside)
+        # Add the four corners
         more = sums
         for corner in range(CORNERS):
             place = builder.add(point, WORD(corner * CAPACITY))
@@ -126,6 +126,7 @@ class _Loops:
             more = builder.fadd(more, part, flags=("contract",))
         builder.branch(ahead)
 
+        # Go on with the next point
         builder.position_at_end(ahead)
         kept = builder.phi(kind)
         kept.add_incoming(sums, loop)
@@ -143,7 +144,6 @@ class _Loops:
         return total
 
     def _row(self, place: Any, width: int) -> Any:
-        """Load a row as float."""
         element = ELEMENTS[self.kind]
         builder = self.builder
         row = builder.load(
@@ -158,7 +158,6 @@ class _Loops:
         return self.builder.bitcast(place, ir.VectorType(element, width).as_pointer())
 
     def _spread(self, number: Any, width: int) -> Any:
-        """Write a number into every lane."""
         blank = ir.VectorType(FLOAT, width)(ir.Undefined)
         first = self.builder.insert_element(blank, number, INT(0))
         lanes = ir.VectorType(INT, width)([0] * width)

@@ -1,4 +1,4 @@
-"""Float16 where it is as good as float32."""
+"""Convert a graph to float16 where that is as good as float32."""
 
 import dataclasses
 from collections import Counter
@@ -27,22 +27,23 @@ SCALES_SINCE = 19
 
 @dataclasses.dataclass(frozen=True)
 class ConvertFloat16(Pass):
-    """Compute in float16 what loses nothing by it; explicit Casts at the borders.
+    """Compute in float16 where nothing is lost, with Casts at the borders.
 
     Given:   y = Conv(x, w, b)
              z = ReduceSum(y)
+
     Result:  y = Conv(Cast<float16>(x), w_half, b_half)
              z = ReduceSum(Cast<float>(y))
 
-    In float32 stay: plugins, and whatever has a body; sums, squares and exponentials;
-    softmax over more than 1,024 elements; choices and comparisons; positions and all
-    that they are computed with; constants that float16 does not hold, masks of -1e9 and
-    epsilons of 1e-12 among them; with frames, what reads or makes numbers beyond half
-    of 65504. What only moves elements between two of these stays too.
-    A LayerNormalization sums in float32 inside. Every operator gets operands of one
-    type, as TensorRT's strongly typed networks want it.
+    These stay in float32: plugins and nodes with bodies; sums, squares and
+    exponentials; softmax over more than 1,024 elements; choices and comparisons;
+    positions and the arithmetic on them; constants that float16 cannot hold (masks of
+    -1e9, epsilons of 1e-12); nodes that only move elements between two of these; and,
+    with frames, nodes that read or make numbers beyond half of 65504.
 
-    An int8 graph becomes int8 and float16: its scales are float16 then, from opset 19.
+    LayerNormalization sums in float32 internally. All operands of an operator have one
+    type, as TensorRT's strongly typed networks require. An int8 graph becomes int8 and
+    float16: its scales become float16, which needs opset 19.
 
     Attributes:
         keep_io: whether inputs, outputs and recurrent state stay in float32; else they
@@ -65,10 +66,10 @@ class ConvertFloat16(Pass):
         return not self.keep_io
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Decide node by node, then retype.
+        """Choose the nodes, then change their type.
 
         Raises:
-            ModuleMapError: no such module.
+            ModuleMapError: the map has no such module.
             PreconditionError: the graph is int8, of an opset without float16 scales.
             FramesError: the frames do not fit the graph.
         """
@@ -79,11 +80,13 @@ class ConvertFloat16(Pass):
                 f"the int8 graph is of opset {opset_of(model)}: float16 scales need"
                 f" {SCALES_SINCE}, export the model so"
             )
+        # Collect the nodes that must stay in float32
         types = ElementTypes(model, FLOAT, HALF)
         wide = matching(model, self.keep_ops, self.keep_modules, self.keep_nodes)
         frames, io = context.frames, self.keep_io
         found = wide_nodes(model, types, frames, keep_io=io, provider=context.provider)
         wide = found | wide
+        # Everything else that can be float16 becomes float16
         narrow = [n for n in model.graph if n not in wide and types.inputs(n)]
         retyping = Retyping(model, types, self.name)
         retyping.run(narrow, keep_io=self.keep_io)

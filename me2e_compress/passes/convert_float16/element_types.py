@@ -1,4 +1,4 @@
-"""Change the element type that nodes compute in, with as few Casts as that takes."""
+"""Change the element type of nodes with as few Casts as possible."""
 
 from collections.abc import Collection, Iterable
 
@@ -12,25 +12,19 @@ from me2e_compress.graph import has_subgraph, is_standard, opset_of, provenance
 FLOAT, HALF = ir.DataType.FLOAT, ir.DataType.FLOAT16
 _ONNX = {FLOAT: "tensor(float)", HALF: "tensor(float16)"}
 _FIRST_ONLY = {"Resize": 1}
-"""Operators whose later inputs are scales and regions: how many inputs hold data."""
+"""How many inputs hold data, where later ones are scales and regions."""
 _BY_TYPE = frozenset(
     {
         "Bernoulli", "BitCast", "Cast", "CastLike", "EyeLike", "Optional",
         "OptionalGetElement", "RandomNormalLike", "RandomUniformLike",
     }
 )  # fmt: skip
-"""Operators that mean something else in another type, or whose schema omits one: what
-is drawn like an input is of its type where no attribute names another."""
+"""Operators whose meaning depends on the type, or whose schema omits one: a random
+tensor has the type of its input where no attribute names another."""
 
 
 class ElementTypes:
-    """Which inputs and outputs of a node may be of which element type.
-
-    Args:
-        model: the graph; its opset decides.
-        source: the type that is given up.
-        wanted: the type that takes its place.
-    """
+    """Which inputs and outputs of a node can change between two element types."""
 
     def __init__(
         self, model: ir.Model, source: ir.DataType, wanted: ir.DataType
@@ -39,9 +33,9 @@ class ElementTypes:
         self._opset = opset_of(model)
 
     def inputs(self, node: ir.Node) -> tuple[int, ...]:
-        """Return the inputs of the source type that can be of the wanted one.
+        """Return the inputs of the source type that can have the wanted one.
 
-        Of a Cast: where that is the wider type. Else it would round before it casts.
+        The input of a Cast changes only to the wider type: else it would round first.
         """
         if node.op_type == "Cast":
             read = None if node.inputs[0] is None else node.inputs[0].dtype
@@ -57,7 +51,7 @@ class ElementTypes:
     def outputs(self, node: ir.Node) -> tuple[int, ...]:
         """Return the outputs that change type when those inputs do.
 
-        A Cast to the source type casts to the wanted one then.
+        A Cast to the source type then casts to the wanted one.
         """
         if node.op_type == "Cast" and node.outputs[0].dtype == self.source:
             return (0,)
@@ -75,7 +69,7 @@ class ElementTypes:
         )
 
     def _variable(self, node: ir.Node, index: int) -> str | None:
-        """Return the type variable of an input that may be of the wanted type."""
+        """Return the type variable of an input that may have the wanted type."""
         schema = self._schema(node)
         if schema is None or index >= _FIRST_ONLY.get(node.op_type, index + 1):
             return None
@@ -109,16 +103,7 @@ def _formal(
 
 
 class Retyping:
-    """Gives nodes of a graph another element type, and puts Casts at the borders.
-
-    Args:
-        model: the graph, types inferred; it is changed in place.
-        types: from which type to which.
-        by: the pass's name.
-
-    Attributes:
-        changed: how many nodes changed type, and Casts were added.
-    """
+    """Changes the element type of nodes in place, with Casts at the borders."""
 
     def __init__(self, model: ir.Model, types: ElementTypes, by: str) -> None:
         self._graph = model.graph
@@ -129,12 +114,8 @@ class Retyping:
         self.changed = 0
 
     def run(self, nodes: Collection[ir.Node], *, keep_io: bool) -> None:
-        """Retype these nodes, and the constants that only they read.
-
-        Args:
-            nodes: of the main graph.
-            keep_io: whether inputs and outputs of the graph keep their types.
-        """
+        """Retype nodes of the main graph and the constants that only they read."""
+        # Choose the inputs and results that change type
         types = self._types
         chosen = {node: types.inputs(node) for node in nodes}
         results = {
@@ -146,6 +127,7 @@ class Retyping:
             given = [v for v in self._graph.inputs if _is_read_as(v, wanted)]
             results.update(given)
             self.changed += len(given)
+        # Record the readers before types and inputs change
         uses = {
             value: [(node, index) for node, index in value.uses()]
             for value in self._float_values(results)
@@ -154,6 +136,7 @@ class Retyping:
             value.type = ir.TensorType(types.wanted)  # clones share the old one
             if value.is_initializer():  # an input and its default are of one type
                 self._convert(value)
+        # Update Casts and provenance of the retyped nodes
         for node in nodes:
             if node.op_type == "Cast" and node.outputs[0] in results:
                 node.attributes["to"] = ir.AttrInt64("to", types.wanted.value)
@@ -161,6 +144,7 @@ class Retyping:
             if reads or any(each in results for each in node.outputs):
                 provenance.inherit(node, [node], by=self._by)
                 self.changed += 1
+        # Insert Casts for the readers, then for the graph outputs
         for value, users in uses.items():
             self._serve(value, users, wanted)
         self._outputs(results, keep_io=keep_io)
@@ -171,9 +155,9 @@ class Retyping:
         results: set[ir.Value],
         wanted: set[tuple[ir.Node, int]],
     ) -> None:
-        """Leave the Casts out that another type would only put one more Cast beside.
+        """Skip Casts whose retyping would only require another Cast next to them.
 
-        They make what nobody wants in the other type, or read what stays as it is.
+        Nobody wants their result in the other type, or their input keeps its type.
         """
         casts = [node for node in nodes if node.op_type == "Cast"]
         for node in casts:
@@ -186,7 +170,6 @@ class Retyping:
                 wanted.discard((node, 0))
 
     def _float_values(self, results: Iterable[ir.Value]) -> list[ir.Value]:
-        """List inputs, constants and results of the source type, in graph order."""
         made = (value for node in self._graph for value in node.outputs)
         every = (*self._graph.inputs, *self._graph.initializers.values(), *made)
         return [v for v in dict.fromkeys(every) if v.dtype == self._types.source]
@@ -197,7 +180,6 @@ class Retyping:
         users: list[tuple[ir.Node, int]],
         wanted: Collection[tuple[ir.Node, int]],
     ) -> None:
-        """Let every reader of a value read it in the type that it takes."""
         types = self._types
         inside = [use for use in users if use in wanted]
         alone = bool(inside) and len(inside) == len(users)
@@ -210,7 +192,7 @@ class Retyping:
                 node.replace_input_with(index, self._as(value, kind, node))
 
     def _as(self, value: ir.Value, kind: ir.DataType, reader: ir.Node) -> ir.Value:
-        """Return a value in another type; equal wishes share one Cast."""
+        """Return a value in another type; equal requests share one Cast."""
         if (value, kind) not in self._casts:
             if self._is_constant(value):
                 array = _converted(value, kind)
@@ -238,7 +220,7 @@ class Retyping:
         return result
 
     def _outputs(self, results: Collection[ir.Value], *, keep_io: bool) -> None:
-        """Give outputs that changed type back in theirs, under their names."""
+        """Cast retyped graph outputs back to their old type, under their old names."""
         for index, value in enumerate(self._graph.outputs):
             producer = value.producer()
             if not keep_io or value not in results or producer is None:
@@ -260,7 +242,6 @@ class Retyping:
 
 
 def _is_read_as(value: ir.Value, wanted: Collection[tuple[ir.Node, int]]) -> bool:
-    """Return whether every reader of an input wants it in the other type."""
     uses = [(node, index) for node, index in value.uses()]
     return bool(uses) and all(use in wanted for use in uses)
 

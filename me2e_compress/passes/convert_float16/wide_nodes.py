@@ -1,4 +1,4 @@
-"""Which nodes stay in float32 when a graph becomes float16, and why."""
+"""Find the nodes that stay in float32 when a graph becomes float16, and why."""
 
 import fnmatch
 import itertools
@@ -20,7 +20,7 @@ LARGEST = float(np.finfo(np.float16).max)
 """65504."""
 
 HEADROOM = 2.0
-"""How far other frames may go beyond what was measured."""
+"""Factor by which other frames may exceed the measured range."""
 
 LONGEST_SUM = 1024
 """A half has 11 bits: a sum of more than 2,048 equal numbers stops growing. A kernel
@@ -44,7 +44,7 @@ _CHOICES = frozenset(
         "NonMaxSuppression", "NonZero", "TopK", "Ceil", "Floor", "Round",
     }
 )  # fmt: skip
-"""What turns numbers into choices: nearly equal ones would become equal."""
+"""Operators that choose between numbers: nearly equal ones would become equal."""
 
 _PLACES = frozenset({"DeformConv", "Det", "GridSample", "Range", "RoiAlign"})
 """Operators that take coordinates beside their data."""
@@ -69,13 +69,10 @@ def wide_nodes(
 ) -> dict[ir.Node, str]:
     """Map the nodes of the main graph that must stay in float32 to the reason.
 
-    Args:
-        model: the graph, shapes and types inferred.
-        types: which inputs of a node can be float16 at all.
-        frames: measured for values that float16 does not hold; None measures none.
-        keep_io: whether inputs and outputs of the graph stay in float32.
-        provider: what runs the graph over the frames.
+    Shapes and types must be inferred. Without ``frames`` no ranges are measured;
+    ``keep_io`` keeps inputs and outputs of the graph in float32.
     """
+    # Operators, constants and positions decide without running the graph
     places = position_arithmetic(model, constant_values(model))
     found: dict[ir.Node, str] = {}
     for node in model.graph:
@@ -84,6 +81,7 @@ def wide_nodes(
             reason = "positions: a half is right to 1/2048"
         if reason is not None:
             found[node] = reason
+    # Measured ranges and the nodes in between come last
     if frames is not None:
         found |= _by_ranges(model, types, found, frames, provider)
     return found | _between(model, found, keep_io=keep_io)
@@ -95,7 +93,7 @@ def matching(
     modules: Collection[str],
     globs: Iterable[str],
 ) -> dict[ir.Node, str]:
-    """Map the nodes that the user wants in float32."""
+    """Map the nodes that the user keeps in float32 to the reason."""
     patterns = tuple(globs)
     return {
         node: "the options keep it"
@@ -139,8 +137,8 @@ def _by_constants(node: ir.Node, types: ElementTypes) -> str | None:
 def _fits(numbers: Numbers) -> bool:
     """Return whether constants are the same in float16.
 
-    Of a few numbers (epsilons, factors, bounds) each must be; of a weight, the large
-    elements, beside which an element that becomes 0 is nothing.
+    Of up to 16 numbers (epsilons, factors, bounds) each must be; of a weight only the
+    large elements, next to which an element that becomes 0 does not matter.
     """
     size = np.abs(numbers)
     if numbers.size == 0 or not np.isfinite(size).all():
@@ -159,7 +157,7 @@ def _by_ranges(
     frames: Recording,
     provider: Provider,
 ) -> dict[ir.Node, str]:
-    """Find the nodes that read or make numbers that float16 does not hold."""
+    # Map the measured values to the nodes that touch them
     touched: dict[str, list[ir.Node]] = {}
     constants = constant_values(model)
     for node in model.graph:
@@ -174,6 +172,7 @@ def _by_ranges(
         return {}
     calibrator = Calibrator(provider=provider)
     ranges = calibrator.run(model, tuple(touched), frames).tensors
+    # Keep a factor of headroom for frames that were not measured
     large = {
         name: max(-low, high)
         for name, (low, high) in ranges.items()
@@ -189,11 +188,7 @@ def _by_ranges(
 def _between(
     model: ir.Model, wide: Mapping[ir.Node, str], *, keep_io: bool
 ) -> dict[ir.Node, str]:
-    """Find what only moves elements between nodes in float32, inputs and outputs.
-
-    Of all that moves elements, what reads or is read by a node in float16 is struck
-    out, forth and back through the graph until nothing more is.
-    """
+    """Find nodes that only move elements between float32 nodes, inputs and outputs."""
     moves = {node: None for node in model.graph if node.op_type in _MOVES}
 
     def from_wide(node: ir.Node) -> bool:
@@ -211,6 +206,7 @@ def _between(
             each in wide or each in moves for each in readers
         )
 
+    # Strike out moves next to float16 nodes until nothing changes
     before = -1
     while len(moves) != before:
         before = len(moves)

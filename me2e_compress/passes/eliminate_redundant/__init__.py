@@ -1,4 +1,4 @@
-"""Remove what does nothing, or is there twice."""
+"""Remove what does nothing or is there twice."""
 
 import dataclasses
 import hashlib
@@ -47,12 +47,12 @@ EDGE_BYTES = 64
 
 
 def share_nodes(graph: ir.Graph, by: str, *, across_modules: bool) -> int:
-    """Merge equal nodes into the first of them; count those that went.
+    """Merge equal nodes into the first of them and count the removed ones.
 
-    Nodes are equal if operator, attributes and inputs are; those of different
-    modules are told apart unless ``across_modules``, so that a module can still be
-    taken out later.
+    Nodes are equal if operator, attributes and inputs are. Nodes of different modules
+    stay apart unless ``across_modules``, so that a module can still be removed later.
     """
+    # Find equal nodes and bypass all but the first
     first: dict[object, ir.Node] = {}
     merged: dict[ir.Node, list[ir.Node]] = {}
     for node in graph:
@@ -67,6 +67,7 @@ def share_nodes(graph: ir.Graph, by: str, *, across_modules: bool) -> int:
             for old, new in pairs:
                 bypass(old, new)
             merged.setdefault(known, [known]).append(node)
+    # Remove the duplicates; the first inherits their provenance
     for known, nodes in merged.items():
         provenance.inherit(known, nodes, by=by)
         graph.remove(nodes[1:], safe=True)
@@ -88,7 +89,8 @@ def _key(node: ir.Node, module: str) -> object:
 
 
 def share_initializers(graph: ir.Graph) -> int:
-    """Merge equal initializers into the first; count those that went."""
+    """Merge equal initializers into the first and count the removed ones."""
+    # Group by type, shape and edges; hash only within a group
     groups: dict[object, list[ir.Value]] = {}
     for value in graph.initializers.values():
         if value.const_value is not None and not value.is_graph_input():
@@ -131,7 +133,7 @@ ROUNDS = 32
 
 @dataclasses.dataclass(frozen=True)
 class EliminateRedundant(Pass):
-    """Remove nodes that change nothing, merge pairs, share what is equal.
+    """Remove nodes that change nothing, merge pairs, and share equal ones.
 
     Given:   x -> Identity -> Transpose -> Transpose -> y;  Add(a, b), Add(b, a)
     Result:  x -> y;  one Add
@@ -149,9 +151,10 @@ class EliminateRedundant(Pass):
     across_modules: bool = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Apply the rules until none applies, then drop what nothing reads."""
+        """Apply the rules until none applies, then drop unread nodes."""
         tally: Counter[str] = Counter()
         tally["unread"] += remove_dead(model.graph)
+        # Repeat: each round enables rules for the next
         for _ in range(ROUNDS):
             before, branches = tally.total(), tally["branches"]
             outputs = list(model.graph.outputs)
@@ -162,6 +165,7 @@ class EliminateRedundant(Pass):
             tally["unread"] += remove_dead(model.graph)
             if tally.total() == before:
                 break
+        # Remove functions and opsets that are no longer used
         tally["functions and opsets"] += _remove_unused(model)
         return PassResult(model, tally.total(), _notes(tally))
 
@@ -182,7 +186,8 @@ class EliminateRedundant(Pass):
     def _visit(
         self, node: ir.Node, site: MergeSite, tally: Counter[str]
     ) -> list[ir.Node]:
-        """Try the rules on one node; give the nodes to look at again."""
+        """Try the rules on one node and return the nodes to look at again."""
+        # Unread nodes go first
         if not any(is_read(value) for value in node.outputs):
             makers = list(node.predecessors())
             remove_node(node)
@@ -192,6 +197,7 @@ class EliminateRedundant(Pass):
         if inlined is not None:
             tally["branches"] += 1
             return inlined
+        # A node that repeats its input is bypassed
         same = identity_of(node, site.opset)
         if same is not None and bypass(node.outputs[0], same):
             remove_node(node)
@@ -225,18 +231,16 @@ def _notes(tally: Counter[str]) -> tuple[str, ...]:
 def _inline_branch(
     node: ir.Node, opsets: Mapping[str, int], by: str
 ) -> list[ir.Node] | None:
-    """Put the branch of an If whose condition is known in its place.
+    """Replace an If whose condition is known by the nodes of its branch.
 
-    The If stays where its branch passes a value from outside on as a graph output, and
-    where a reader would refuse the branch's shape, which the If had kept from it.
-
-    Returns:
-        The nodes of the branch; None if the If stays.
+    The If stays (None) where its branch passes an outer value on as a graph output, or
+    where a reader would refuse the branch's shape, which the If had hidden from it.
     """
     graph = node.graph
     chosen = array_of(node.inputs[0]) if node.inputs else None
     if node.op_type != "If" or chosen is None or not isinstance(graph, ir.Graph):
         return None
+    # Choose the branch and check that it can take the place
     branch = node.attributes[
         "then_branch" if chosen.reshape(-1)[0] else "else_branch"
     ].as_graph()
@@ -251,6 +255,7 @@ def _inline_branch(
             return None
     if not branch_fits(node, branch, opsets):
         return None
+    # Move the nodes out and rewire their readers
     nodes = list(branch)
     _move(branch, node, graph, by)
     for old, new in zip(node.outputs, results, strict=True):

@@ -30,7 +30,7 @@ def identity_of(node: ir.Node, opset: int) -> ir.Value | None:
 
 
 def same_shape(one: ir.Value | None, other: ir.Value | None) -> bool:
-    """Return whether two values surely have the same shape."""
+    """Return whether two values certainly have the same shape."""
     shape = static_shape(one)
     return shape is not None and shape == static_shape(other)
 
@@ -116,7 +116,7 @@ def _clip(node: ir.Node, opset: int) -> ir.Value | None:
 
 
 def _repeats(node: ir.Node, opset: int) -> ir.Value | None:
-    """Relu of Relu, Abs of Abs, ...: what is done twice is done."""
+    """Relu of Relu, Abs of Abs, ...: idempotent operators."""
     source = node.inputs[0]
     inner = None if source is None else source.producer()
     if inner is None or inner.op_type != node.op_type or inner.domain != node.domain:
@@ -131,7 +131,7 @@ def _attributes(node: ir.Node) -> list[tuple[str, object]]:
 
 
 def _undoes(node: ir.Node, opset: int) -> ir.Value | None:
-    """Not of Not, Neg of Neg: what is undone was not done."""
+    """Not of Not, Neg of Neg: self-inverse operators."""
     source = node.inputs[0]
     inner = None if source is None else source.producer()
     if inner is None or inner.op_type != node.op_type or inner.domain != node.domain:
@@ -140,7 +140,6 @@ def _undoes(node: ir.Node, opset: int) -> ir.Value | None:
 
 
 def _neutral(test: Callable[[Array], bool], *, either: bool) -> Rule:
-    """Build the rule of a binary operator with a neutral element."""
 
     def rule(node: ir.Node, opset: int) -> ir.Value | None:
         for kept, other in ((0, 1), (1, 0))[: 2 if either else 1]:
@@ -156,7 +155,7 @@ def _neutral(test: Callable[[Array], bool], *, either: bool) -> Rule:
 
 
 def _spreads(source: ir.Value, array: Array, node: ir.Node) -> bool:
-    """Return whether broadcasting the array leaves the other operand's shape."""
+    """Return whether broadcasting the array keeps the other operand's shape."""
     if same_shape(source, node.outputs[0]):
         return True
     return (

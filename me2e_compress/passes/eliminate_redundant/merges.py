@@ -1,4 +1,4 @@
-"""Merge two nodes in a row into one that does the same, exactly.
+"""Merge two consecutive nodes into one that does exactly the same.
 
 Each rule rewrites the graph around a node and returns the node to look at again (the
 node itself, now unread, where nothing is left of it), or None where it does not apply.
@@ -59,7 +59,7 @@ WIDENS: dict[ir.DataType, str] = {
 
 @dataclasses.dataclass
 class MergeSite:
-    """Where rules work: a graph, and constants made for it so far."""
+    """A graph that is being rewritten, and the constants made for it so far."""
 
     graph: ir.Graph
     opsets: Mapping[str, int]
@@ -69,13 +69,13 @@ class MergeSite:
 
     @property
     def opset(self) -> int:
-        """The version of ONNX's own operators."""
+        """The version of the standard operators."""
         return self.opsets.get("", self.opsets.get("ai.onnx", 0))
 
     def shape(self, sizes: tuple[int, ...], reader: ir.Node) -> ir.Value:
-        """Return the initializer that holds a shape; one for every equal shape.
+        """Return the initializer that holds a shape, one per distinct shape.
 
-        It is named after its first reader: value names are unique in the whole
+        It is named after its first reader, since value names are unique in the whole
         model, subgraphs included.
         """
         value = self.shapes.get(sizes)
@@ -105,7 +105,6 @@ def merge(node: ir.Node, site: MergeSite) -> ir.Node | None:
 
 
 def _before(node: ir.Node, index: int = 0) -> ir.Node | None:
-    """Return the standard node that makes an input, in the same graph."""
     value = node.inputs[index]
     inner = None if value is None else value.producer()
     if inner is None or not is_standard(inner) or inner.graph is not node.graph:
@@ -120,7 +119,7 @@ def _is_view(node: ir.Node) -> bool:
 
 
 def _views(node: ir.Node, site: MergeSite) -> ir.Node | None:
-    """Reshape, Flatten, Squeeze and Unsqueeze in a row are one Reshape, or nothing."""
+    """Merge consecutive Reshape, Flatten, Squeeze and Unsqueeze into one or none."""
     inner, sizes = _before(node), static_shape(node.outputs[0])
     if inner is None or sizes is None or 0 in sizes or site.opset < 5:
         return None
@@ -192,7 +191,6 @@ def _casts(node: ir.Node, site: MergeSite) -> ir.Node | None:
 
 
 def _slices(node: ir.Node, site: MergeSite) -> ir.Node | None:
-    """Slices of different axes are one Slice."""
     inner = _before(node)
     if inner is None or inner.op_type != "Slice" or site.opset < 10:
         return None
@@ -201,6 +199,7 @@ def _slices(node: ir.Node, site: MergeSite) -> ir.Node | None:
     first, second = _window(inner), _window(node)
     if first is None or second is None or set(first[2]) & set(second[2]):
         return None
+    # Concatenate starts, ends, axes and steps; drop steps of 1
     name = node.outputs[0].name or ""
     inputs = [
         add_constant(site.graph, np.array([*one, *two], np.int64), f"{name}_{part}")
@@ -259,7 +258,7 @@ def _concats(node: ir.Node, site: MergeSite) -> ir.Node | None:
 
 
 def _drop_expand(node: ir.Node, site: MergeSite) -> ir.Node | None:
-    """An Expand (or a Tile that only repeats) before what broadcasts anyway."""
+    """Drop an Expand, or a Tile that only repeats, before a broadcasting operator."""
     target = static_shape(node.outputs[0])
     if target is None or site.opset < 8:
         return None
@@ -271,6 +270,7 @@ def _drop_expand(node: ir.Node, site: MergeSite) -> ir.Node | None:
         small, large = static_shape(source), static_shape(value)
         if small is None or large is None or not _broadcasts(small, large):
             continue
+        # The other operands must still broadcast to the same shape
         others = [static_shape(other) for other in node.inputs]
         others[index] = small
         shapes = [shape for shape in others if shape is not None]

@@ -50,19 +50,21 @@ class _Tally:
 
 @dataclasses.dataclass(frozen=True)
 class FoldConstants(Pass):
-    """Replace what depends on weights and static shapes alone by its value.
+    """Replace values that depend only on weights and static shapes by constants.
 
     Given:   Shape(x) -> Gather(1) -> Concat -> Reshape;  Transpose(weight) -> MatMul
+
     Result:  Reshape and MatMul read initializers
 
     Attributes:
-        bytes_per_node: how many bytes a removed node may cost, more if it works long
-            in every frame (:mod:`me2e_compress.passes.work`). A fold that shrinks
-            the weights is always taken, one that grows them only up to this price,
-            so that a position table repeated for every token stays computed and an
+        bytes_per_node: how many bytes of new weights the removal of a node may cost,
+            scaled by the node's work per frame (:mod:`me2e_compress.passes.work`). A
+            fold that shrinks the weights is always done; one that grows them only up to
+            this
+            price: a position table repeated for every token stays computed, an
             attention between constants does not.
-        through_compute: fold through products, convolutions and softmax too (by the
-            same price); False keeps every named layer, e.g. to ablate it later.
+        through_compute: fold through products, convolutions and softmax too, at the
+            same price; False keeps every named layer, e.g. to ablate it later.
     """
 
     name: ClassVar[str] = "fold-constants"
@@ -72,10 +74,12 @@ class FoldConstants(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Infer shapes, then fold every graph of the model, outermost first."""
+        # Normalize first: Constant nodes and bounds of Range
         tally = _Tally(lifted=lift_constants(model))
         declared = [value.shape for value in model.graph.outputs]
         for body in graphs_of(model.graph):
             tally.seated += _seat_ranges(body, model.opset_imports, self.name)
+        # Fold until nothing changes
         before = -1
         while tally.changes > before:
             before = tally.changes
@@ -83,6 +87,7 @@ class FoldConstants(Pass):
             tally.kept = 0
             for body in list(graphs_of(model.graph)):
                 self._fold(body, model.opset_imports, tally, trust=body is model.graph)
+        # Shapes of graph outputs may have become known
         found = [value.shape for value in model.graph.outputs]
         refined = sum(a is not b for a, b in zip(declared, found, strict=True))
         return PassResult(model, tally.changes + refined, _notes(tally))
@@ -93,6 +98,7 @@ class FoldConstants(Pass):
         refused: set[ir.Node] = set()
         fresh: set[ir.Value] = set()
         while True:
+            # Collect constant expressions and choose what to store
             known = Sweep(
                 opsets,
                 refused,
@@ -101,12 +107,14 @@ class FoldConstants(Pass):
                 trust_shapes=trust,
             ).run(body)
             choice = choose(known, self.bytes_per_node)
+            # Evaluate the choice; start over if it taught new shapes or failed
             asked = [value for value in choice.values if value not in known.arrays]
             found, failed = evaluation.evaluate(asked, known, opsets)
             tally.refused.update(node.op_type for node in failed)
             refused.update(failed)
             if failed or _learn(asked, found):
                 continue
+            # Write the chosen values into the graph
             known.arrays.update(found)
             if not choice.gone:
                 tally.kept += choice.kept
@@ -118,7 +126,7 @@ class FoldConstants(Pass):
 
 
 def _learn(asked: list[ir.Value], found: dict[ir.Value, Array]) -> bool:
-    """Record shapes that only evaluation could tell; True if there were any."""
+    """Record shapes known only from evaluation; return whether there were any."""
     learnt = False
     for value in asked:
         if graphs.static_shape(value) is None and not value.is_graph_output():
@@ -147,14 +155,12 @@ def _notes(tally: _Tally) -> tuple[str, ...]:
 def _commit(
     graph: ir.Graph, choice: FoldChoice, arrays: dict[ir.Value, Array], name: str
 ) -> list[ir.Value]:
-    """Put initializers in the place of the chosen values and drop their makers.
+    """Replace the chosen values by initializers and return these.
 
-    A folded tensor takes the name of the value it replaces. A graph output cannot be
-    an initializer for every runtime: an Identity passes it on.
-
-    Returns:
-        The initializers.
+    An initializer takes the name of the value it replaces. Not every runtime allows an
+    initializer as a graph output: an Identity passes it on.
     """
+    # Names of the removed nodes are free again
     leave = {
         value.name for one in choice.gone for n in one.nodes for value in n.outputs
     }
@@ -164,6 +170,7 @@ def _commit(
         for one in choice.gone
         for index, value in enumerate(one.nodes[0].outputs)
     }
+    # Store each value once for all nodes that compute it
     for value in choice.values:
         one, index = place[value]
         answers = any(node.outputs[index].is_graph_output() for node in one.nodes)
@@ -175,13 +182,13 @@ def _commit(
                 _answer(graph, node, equal, weight, name)
             else:
                 equal.replace_all_uses_with(weight)
+    # Remove the nodes, readers first
     for one in reversed(choice.gone):
         graph.remove([node for node in one.nodes if node.graph is graph], safe=True)
     return list(stored.known.values())
 
 
 class _Store:
-    """Registers one initializer for equal arrays."""
 
     def __init__(self, graph: ir.Graph, names: set[str]) -> None:
         self.graph = graph
@@ -213,13 +220,14 @@ def _answer(
 
 
 def _seat_ranges(graph: ir.Graph, opsets: Mapping[str, int], by: str) -> int:
-    """Make scalars of bounds of a Range that an If passes on as vectors; count them.
+    """Reshape vectors that an If passes to a Range to scalars, and count them.
 
     ONNX's own function bodies pass a vector of one element through an If to a Range,
     which takes scalars. Runtimes accept it while the If hides the shape; folding
-    would show it.
+    would reveal it.
 
     Given:   If -> n of shape [1] -> Range(0, n, 1)
+
     Result:  If -> n -> Reshape to a scalar -> Range(0, n, 1)
     """
     choices = [node for node in graph if node.op_type == "If"]

@@ -1,12 +1,11 @@
-"""Where to cut: which constant values become weights, and which stay computed.
+"""Choose which constant values become weights and which stay computed.
 
-Folding removes nodes and may add bytes: a table repeated for every token is one node
-and megabytes. A node is worth so many bytes, and more where it works long in every
-frame: an attention between constants may take more time than its result takes bytes.
-What a choice costs is the worth of the nodes that stay, the bytes of the values that
-are stored, and those of the weights that are still read. The cheapest choice is a
-minimum cut (Picard, "Maximal closure of a graph and applications to combinatorial
-problems", 1976): each node is on the side of what goes or of what stays.
+Folding removes nodes but may add bytes: a table repeated for every token is one node
+and megabytes. The price of a node is in bytes and grows with its work per frame. The
+cost of a choice is the price of the nodes that stay, plus the bytes of the stored
+values and of the weights that are still read. The cheapest choice is a minimum cut
+(Picard, "Maximal closure of a graph and applications to combinatorial problems",
+1976).
 """
 
 import dataclasses
@@ -21,18 +20,18 @@ from me2e_compress.passes.fold_constants.min_cut import FlowNetwork
 from me2e_compress.passes.work import work
 
 ENTRY_BYTES = 64
-"""What an initializer takes in the file beside its data: name, shape, type."""
+"""Bytes of an initializer in the file besides its data: name, shape, type."""
 
 
 @dataclasses.dataclass
 class FoldChoice:
-    """What to fold.
+    """Which values to fold.
 
     Attributes:
         values: the values that become initializers, in graph order.
         gone: the expressions whose nodes are no longer needed.
-        kept: how many nodes go on computing constants because they are cheaper.
-        growth_bytes: by how much the weights grow; negative if they shrink.
+        kept: number of nodes that go on computing constants because that is cheaper.
+        growth_bytes: growth of the weights; negative if they shrink.
     """
 
     values: list[ir.Value]
@@ -42,14 +41,16 @@ class FoldChoice:
 
 
 def choose(known: Knowledge, bytes_per_node: int) -> FoldChoice:
-    """Decide for every constant value whether it is stored or computed.
+    """Choose for every constant value whether it is stored or computed.
 
-    A lot that shrinks the weights, or leaves them as they are, goes as a whole.
+    A connected group that does not grow the weights is folded as a whole.
     """
+    # Solve each group of connected expressions on its own
     market = _Market(known, bytes_per_node)
     gone: set[Expression] = set()
     for lot in market.lots():
         gone.update(lot if market.growth(lot) <= 0 else market.cheapest(lot))
+    # Store what remaining nodes still read
     values = [
         value
         for one in known.expressions
@@ -87,25 +88,21 @@ class _Market:
         }
 
     def growth(self, lot: Iterable[Expression]) -> float:
-        """Return by how much the weights grow if a whole lot goes."""
         gone = set(lot)
         made = (value for one in gone for value in one.nodes[0].outputs)
         stored = sum(self.value_bytes(value) for value in made if value in self.outside)
         return stored - self.freed(gone)
 
     def freed(self, gone: set[Expression]) -> float:
-        """Return the bytes of the weights that nobody reads any more."""
         read = {value for one in gone for value in one.inputs if value in self.weights}
         return sum(
             self.weights[value] for value in read if self.readers[value].keys() <= gone
         )
 
     def is_wanted(self, value: ir.Value, gone: set[Expression]) -> bool:
-        """Return whether what stays reads a value."""
         return value in self.outside or not self.readers.get(value, {}).keys() <= gone
 
     def value_bytes(self, value: ir.Value) -> float:
-        """Return what a value takes as an initializer."""
         if isinstance(value.type, ir.SequenceType | ir.OptionalType):
             return math.inf
         array = self.known.arrays.get(value)
@@ -117,9 +114,10 @@ class _Market:
         return math.prod(shape) * value.dtype.itemsize + ENTRY_BYTES
 
     def cheapest(self, lot: list[Expression]) -> list[Expression]:
-        """Return what goes of a lot where that costs least: the source's side."""
+        """Return the part of a group whose folding costs least, by a minimum cut."""
         network = FlowNetwork()
         source, sink = network.vertex(), network.vertex()
+        # Edges for nodes that stay and for values that are stored
         place = {one: network.vertex() for one in lot}
         for one in lot:  # one that stays is paid for in every frame
             price = self.rate * sum(map(work, one.nodes))
@@ -132,6 +130,7 @@ class _Market:
                     network.edge(place[one], stored, self.value_bytes(value))
                     for reader in self.readers[value]:
                         network.edge(stored, place[reader])
+        # A weight stays while any of its readers stays
         read = [value for one in lot for value in one.inputs if value in self.weights]
         for value in dict.fromkeys(read):  # a weight that somebody reads stays
             weight = network.vertex()
@@ -142,7 +141,6 @@ class _Market:
         return [one for one in lot if place[one] in side]
 
     def lots(self) -> list[list[Expression]]:
-        """Group the expressions that share values or weights."""
         parent = {one: one for one in self.known.expressions}
 
         def root(one: Expression) -> Expression:
@@ -176,7 +174,7 @@ class _Market:
         return self.known.maker.get(node.outputs[0]) if node.outputs else None
 
     def _dies(self, value: ir.Value) -> bool:
-        """Return whether a weight is read by constant nodes alone."""
+        """Return whether only constant nodes read a weight."""
         return (
             value.is_initializer()
             and not value.is_graph_output()

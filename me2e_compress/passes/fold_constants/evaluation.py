@@ -1,4 +1,4 @@
-"""Compute constant expressions with onnxruntime: all at once, or one by one."""
+"""Evaluate constant expressions with onnxruntime: all at once, or one by one."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,16 +14,16 @@ from me2e_compress.rewrite import Array
 from me2e_compress.runtime.opening import REFUSALS
 
 SILENT = 4
-"""onnxruntime's log level "fatal": what cannot be evaluated is said in the notes."""
+"""onnxruntime's log level "fatal": the notes report what cannot be evaluated."""
 
 
 def evaluate(
     values: Sequence[ir.Value], known: Knowledge, opsets: Mapping[str, int]
 ) -> tuple[dict[ir.Value, Array], list[ir.Node]]:
-    """Compute values; return them, and the nodes that the runtime would not run.
+    """Return the computed values, and the nodes that the runtime refused.
 
-    One session over everything that leads to the values; where that fails, a session
-    a node, so that one unsupported operator does not spoil the rest.
+    One session runs everything that the values need; if that fails, one session per
+    node, so that one unsupported operator does not spoil the rest.
     """
     needed = _needed(values, known)
     if not needed:
@@ -77,6 +77,7 @@ def _run(
     names: dict[ir.Value, str] = {}
     feeds: dict[str, Any] = {}
     nodes = [_node(one, names, feeds, arrays) for one in expressions]
+    # Write the expressions as a model of their own
     model = onnx.helper.make_model(
         onnx.helper.make_graph(
             nodes,
@@ -87,6 +88,7 @@ def _run(
         opset_imports=[onnx.helper.make_opsetid(*item) for item in opsets.items()],
         ir_version=8,
     )
+    # No optimization: run exactly the nodes as written
     options = onnxruntime.SessionOptions()
     options.graph_optimization_level = (
         onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
@@ -108,7 +110,6 @@ def _node(
     feeds: dict[str, Any],
     arrays: Mapping[ir.Value, Any],
 ) -> onnx.NodeProto:
-    """Write one expression's node, with names of its own; note what must be fed."""
     proto = ir.serde.serialize_node(one.nodes[0])
     del proto.input[:], proto.output[:], proto.metadata_props[:]
     for value in one.inputs:

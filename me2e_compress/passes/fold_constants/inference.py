@@ -1,4 +1,4 @@
-"""Shape inference of single nodes, with the data that folding has learnt."""
+"""Shape inference of single nodes, given the data that folding has found."""
 
 from collections.abc import Mapping
 
@@ -17,16 +17,10 @@ def infer_node(
     *,
     trust_shapes: bool = True,
 ) -> bool:
-    """Ask ONNX for the shapes of a node's outputs; True if more is known than before.
+    """Infer the shapes of a node's outputs; return whether more is known than before.
 
-    What is recorded already stays: only outputs without a static shape are written.
-
-    Args:
-        node: the node.
-        known: the values that are known as arrays.
-        opsets: the model's.
-        trust_shapes: False inside bodies: what a loop answers may have another shape
-            every round.
+    Only outputs without a static shape are written. Pass ``trust_shapes=False`` inside
+    bodies: the outputs of a loop may change shape from round to round.
     """
     try:
         found = _ask(node, known, {}, opsets)
@@ -38,8 +32,9 @@ def infer_node(
 def branch_fits(node: ir.Node, branch: ir.Graph, opsets: Mapping[str, int]) -> bool:
     """Return whether an If's readers would be valid if they read a branch directly.
 
-    They may not: an If keeps the shapes of its branches from its readers, and one that
-    only ever runs by luck (a Range up to a vector of one element) is refused without.
+    They may not: an If hides the shapes of its branches from its readers, and a reader
+    that works only by luck (a Range up to a vector of one element) is refused without
+    it.
     """
     instead = dict(zip(node.outputs, branch.outputs, strict=True))
     readers = dict.fromkeys(use.node for value in instead for use in value.uses())
@@ -63,7 +58,6 @@ def _accepts(
 
 
 def _origin(value: ir.Value) -> ir.Value:
-    """Look through Identity nodes."""
     maker = value.producer()
     while maker is not None and maker.op_type == "Identity" and maker.inputs[0]:
         value = maker.inputs[0]

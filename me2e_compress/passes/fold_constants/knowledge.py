@@ -1,4 +1,4 @@
-"""One forward sweep: which values of a graph are known before it runs."""
+"""A forward sweep that finds the values of a graph that are known before it runs."""
 
 import dataclasses
 import math
@@ -14,10 +14,10 @@ from me2e_compress.passes.fold_constants.table import NATIVE
 from me2e_compress.rewrite import Array, has_subgraph, is_standard
 
 SMALL = 1024
-"""Arrays up to so many elements are computed at once: shapes and indices are."""
+"""Arrays of up to this many elements (shapes, indices) are computed immediately."""
 
 LARGEST = 1 << 30
-"""Bytes of a value that is computed here, at most: a chain of Concats claims any."""
+"""Limit in bytes of a computed value: a chain of Concats may claim any size."""
 
 NEVER = frozenset(
     {
@@ -33,7 +33,7 @@ NEVER = frozenset(
         "RandomUniformLike",
     }
 )
-"""Random operators, and quantization, which says how to run and not what to compute."""
+"""Random operators, and quantization, which is an instruction to the runtime."""
 
 COMPUTE = frozenset(
     {"Conv", "ConvTranspose", "Einsum", "Gemm", "GridSample", "MatMul", "Softmax"}
@@ -43,11 +43,9 @@ COMPUTE = frozenset(
 
 @dataclasses.dataclass(eq=False)
 class Expression:
-    """Equal nodes that read nothing but constants; the first speaks for all.
+    """Equal nodes that read only constants; the first represents all.
 
-    Attributes:
-        nodes: the nodes, in graph order.
-        inputs: what the first reads, each value replaced by its first equal.
+    ``inputs`` are those of the first, each value replaced by its first equal.
     """
 
     nodes: list[ir.Node]
@@ -59,10 +57,10 @@ class Knowledge:
     """What is known about the values of one graph.
 
     Attributes:
-        arrays: the values that are known as arrays, initializers included.
+        arrays: values known as arrays, initializers included.
         expressions: the constant nodes, in graph order, equal ones together.
         maker: the expression that makes a value.
-        first: for a value made twice, the first that equals it.
+        first: for a value computed twice, the first value that equals it.
     """
 
     arrays: dict[ir.Value, Array]
@@ -76,7 +74,7 @@ class Knowledge:
 
 
 class Sweep:
-    """Walks one graph in order and gathers its constant expressions."""
+    """Walks one graph in order and collects its constant expressions."""
 
     def __init__(
         self,
@@ -87,12 +85,12 @@ class Sweep:
         through_compute: bool,
         trust_shapes: bool,
     ) -> None:
-        """Set up.
+        """Set up a sweep.
 
         Args:
-            opsets: the model's.
-            refused: nodes that nobody here can evaluate.
-            fresh: initializers that ONNX's own inference has not seen yet.
+            opsets: of the model.
+            refused: nodes that onnxruntime could not evaluate.
+            fresh: initializers that ONNX's shape inference has not seen yet.
             through_compute: whether convolutions, products, ... may be constant.
             trust_shapes: False inside loops, where a shape may change every round.
         """
@@ -172,10 +170,10 @@ class Sweep:
             self.learnt.update(outputs)
 
     def _add(self, node: ir.Node) -> None:
-        """Enter a constant node, beside its equals if it has any."""
         named = [value for value in node.outputs if value.name]
         if not all(_is_native(each) and _bytes(each) <= LARGEST for each in named):
             return
+        # Group nodes of equal operator, inputs and attributes
         small = self._evaluate(node)
         inputs = tuple(
             None if value is None else self.known.canonical(value)
@@ -188,6 +186,7 @@ class Sweep:
             self.keys[key] = equal
             self.known.expressions.append(equal)
         equal.nodes.append(node)
+        # Enter its outputs, with their arrays if they are small
         for first, value in zip(equal.nodes[0].outputs, node.outputs, strict=True):
             self.known.maker[value] = equal
             if value is not first:

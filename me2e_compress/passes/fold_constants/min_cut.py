@@ -1,11 +1,11 @@
-"""Minimum cuts of networks, by Dinic's algorithm (1970): what to pay at the least."""
+"""Minimum cuts of flow networks, by Dinic's algorithm (1970)."""
 
 import math
 from collections import deque
 
 
 class FlowNetwork:
-    """Vertices, numbered from 0, and edges between them, each with a capacity."""
+    """A flow network of vertices, numbered from 0, and edges with capacities."""
 
     def __init__(self) -> None:
         self.edges: list[list[int]] = []
@@ -13,12 +13,12 @@ class FlowNetwork:
         self.left: list[float] = []
 
     def vertex(self) -> int:
-        """Add a vertex."""
+        """Add a vertex and return its number."""
         self.edges.append([])
         return len(self.edges) - 1
 
     def edge(self, tail: int, head: int, capacity: float = math.inf) -> None:
-        """Add an edge; edge ``n ^ 1`` is the way back along edge ``n``."""
+        """Add an edge; edge ``n ^ 1`` is the reverse of edge ``n``."""
         for start, end, amount in ((tail, head, capacity), (head, tail, 0.0)):
             self.edges[start].append(len(self.head))
             self.head.append(end)
@@ -27,10 +27,12 @@ class FlowNetwork:
     def cut(self, source: int, sink: int) -> set[int]:
         """Return the source's side of the cheapest cut; of equal ones the largest side.
 
-        No path of endless capacity may lead from source to sink.
+        No path of infinite capacity may lead from source to sink.
         """
+        # Augment along shortest paths until none is left
         while (levels := self._levels(source))[sink] >= 0:
             self._block(source, sink, levels)
+        # Everything that cannot reach the sink is on the source's side
         reaching, waiting = {sink}, [sink]
         while waiting:
             for edge in self.edges[waiting.pop()]:
@@ -40,7 +42,7 @@ class FlowNetwork:
         return set(range(len(self.edges))) - reaching
 
     def _levels(self, source: int) -> list[int]:
-        """Return how many edges with capacity left lead to each vertex; -1: none do."""
+        """Return each vertex's distance over edges with capacity left, or -1."""
         levels = [-1] * len(self.edges)
         levels[source] = 0
         waiting = deque([source])
@@ -54,7 +56,6 @@ class FlowNetwork:
         return levels
 
     def _block(self, source: int, sink: int, levels: list[int]) -> None:
-        """Fill every shortest way from source to sink."""
         untried = [iter(edges) for edges in self.edges]
         path: list[int] = []
         vertex = source
@@ -78,7 +79,7 @@ class FlowNetwork:
                 vertex = self.head[path.pop() ^ 1]
 
     def _fill(self, path: list[int]) -> list[int]:
-        """Send along a path what fits; return the part before the first full edge."""
+        """Saturate a path; return the part before the first full edge."""
         amount = min(self.left[edge] for edge in path)
         for edge in path:
             self.left[edge] -= amount

@@ -1,8 +1,7 @@
-"""ONNX's small integer and shape arithmetic, in numpy.
+"""ONNX's small integer and shape arithmetic in numpy.
 
-Each rule reads a call (the node, its inputs as arrays, the opset) and returns the
-first output, or None where it would not be sure of ONNX's meaning; the runtime is
-asked then.
+Each rule takes a call (the node, its inputs as arrays, the opset) and returns the
+first output, or None where ONNX's meaning is not certain; onnxruntime computes it then.
 """
 
 import dataclasses
@@ -26,25 +25,25 @@ NATIVE = frozenset(
 """The element types that numpy itself computes with."""
 
 MOST_ELEMENTS = 1 << 20
-"""Of what a rule makes of numbers, whatever shape the file claims."""
+"""Limit of a rule's result, in elements, whatever shape the file claims."""
 OLDEST_OPSET = 7
-"""Broadcasting followed other rules before."""
+"""Broadcasting followed other rules before this opset."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Call:
-    """One node with its inputs known."""
+    """One node with known inputs."""
 
     node: ir.Node
     inputs: Sequence[Array | None]
     opset: int
 
     def array(self, index: int) -> Any:
-        """Return an input; None where it is left out."""
+        """Return an input; None where it is omitted."""
         return self.inputs[index] if index < len(self.inputs) else None
 
     def ints(self, name: str, index: int | None = None) -> list[int] | None:
-        """Read a list that older opsets keep in an attribute, newer in an input."""
+        """Read a list that newer opsets moved from an attribute to an input."""
         given = self.array(index) if index is not None else None
         if given is not None:
             return [int(entry) for entry in given.reshape(-1)]
@@ -63,11 +62,12 @@ Rule = Callable[[Call], Any]
 
 
 def evaluate(node: ir.Node, inputs: Sequence[Array | None], opset: int) -> Array | None:
-    """Compute a node's only output; None where the table has no sure answer."""
+    """Compute a node's only output; None where the table has no certain answer."""
     rule = RULES.get(node.op_type)
     if rule is None or opset < OLDEST_OPSET or len(node.outputs) != 1:
         return None
     expected = node.outputs[0].dtype
+    # A rule that fails leaves the answer to onnxruntime
     with np.errstate(all="ignore"):
         try:
             result = rule(Call(node, inputs, opset))
@@ -149,6 +149,7 @@ def _slice(call: Call) -> Any:
         return None
     axes = call.ints("axes", 3) or list(range(len(starts)))
     steps = call.ints("steps", 4) or [1] * len(starts)
+    # Build one slice per axis; a negative step may run past the front
     window = [slice(None)] * data.ndim
     for axis, start, end, step in zip(axes, starts, ends, steps, strict=True):
         size = data.shape[axis]

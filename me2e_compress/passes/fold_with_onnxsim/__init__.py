@@ -1,4 +1,4 @@
-"""onnxsim as an optional folding engine, in a process of its own."""
+"""Fold constants with onnxsim, in a separate process."""
 
 import dataclasses
 import subprocess
@@ -25,14 +25,15 @@ _WORKER = Path(__file__).with_name("onnxsim_main.py")
 
 @dataclasses.dataclass(frozen=True)
 class FoldWithOnnxsim(Pass):
-    """Fold constants with onnxsim (its optimizer off) in a process of its own.
+    """Fold constants with onnxsim (its optimizer off) in a separate process.
 
-    onnxsim is native code: a crash or an endless loop there ends that process and not
-    this one. Modules, origins and names, which it drops, come back; its own entries
-    in the model's metadata do not.
+    onnxsim is native code: a crash or an endless loop ends only that process. Modules,
+    origins and names, which it drops, are restored; its own entries in the model's
+    metadata are removed.
 
     Given:
         s = Shape(w)  ;  y = Reshape(x, s)      with w a weight
+
     Result:
         y = Reshape(x, [2, 3])
 
@@ -40,7 +41,7 @@ class FoldWithOnnxsim(Pass):
         timeout_s: seconds that onnxsim may take.
 
     Raises:
-        RecipeError: it is no finite number above 0.
+        RecipeError: it is not a finite number above 0.
     """
 
     name: ClassVar[str] = "fold-with-onnxsim"
@@ -49,24 +50,26 @@ class FoldWithOnnxsim(Pass):
     timeout_s: float = 600.0
 
     def __post_init__(self) -> None:
-        """Check the time."""
+        """Check the time limit."""
         if not 0.0 < self.timeout_s < float("inf"):
             raise RecipeError(
                 f"{self.name}: timeout_s {self.timeout_s:g} is not a positive time"
             )
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Fold a copy.
+        """Fold a copy of the model.
 
         Raises:
             PassError: onnxsim crashed, refused the model, or took too long.
         """
+        # Exchange the model through files
         with tempfile.TemporaryDirectory(prefix="me2e-onnxsim-") as folder:
             given, folded = Path(folder, "given.onnx"), Path(folder, "folded.onnx")
             save(model, given)
             _simplify(given, folded, self.timeout_s)
             result = load(folded)
             _own_weights(result, model)
+        # Restore what onnxsim drops and remove what it adds
         for key in [key for key in result.metadata_props if _OWN_METADATA in key]:
             del result.metadata_props[key]
         restore(result, model, by=self.name, node_names=True)
@@ -97,7 +100,7 @@ def _end_of(error: subprocess.CalledProcessError) -> str:
 
 
 def _own_weights(result: ir.Model, model: ir.Model) -> None:
-    """Share what is unchanged with the model; take the rest out of the files."""
+    """Share unchanged weights with the model, and load the others from the files."""
     ours = model.graph.initializers
     for graph in (result.graph, *result.graph.subgraphs()):
         for name, value in graph.initializers.items():

@@ -1,4 +1,4 @@
-"""What runs in the process of its own: ``python worker.py GIVEN.onnx FOLDED.onnx``."""
+"""The script of the separate process: ``python worker.py GIVEN.onnx FOLDED.onnx``."""
 
 import sys
 
@@ -7,7 +7,7 @@ import onnxsim
 
 
 def fold(given: str, folded: str) -> None:
-    """Fold a file's constants with onnxsim; weights go to a data file beside it."""
+    """Fold a file's constants with onnxsim; weights go to a data file next to it."""
     model, _ = onnxsim.simplify(given, perform_optimization=False)
     onnx.save(model, folded, save_as_external_data=True, location="folded.data")
 

@@ -1,4 +1,4 @@
-"""Fuse what standard operators can say in one."""
+"""Fuse patterns that one standard operator can express."""
 
 import dataclasses
 from typing import ClassVar
@@ -18,10 +18,11 @@ class FuseBasic(Pass):
     """Fuse patterns of standard operators into fewer standard operators.
 
     Given:   Conv -> BatchNormalization -> Relu;  x * 0.5 * (1 + Erf(x / sqrt 2))
+
     Result:  Conv -> Relu;  Gelu(x) where the opset has it
 
-    Equal up to rounding. A residual Conv + Add stays, in the shape that TensorRT and
-    onnxruntime fuse with the activation behind it.
+    Outputs are equal up to rounding. A residual Conv + Add stays, in the form that
+    TensorRT and onnxruntime fuse with the next activation.
 
     Attributes:
         swish: write x * Sigmoid(x) as Swish where the opset has it (24); off, since
@@ -39,7 +40,7 @@ class FuseBasic(Pass):
         return PassResult(model, found.changes, (*found.notes(), *_left(residual)))
 
     def fusions(self) -> tuple[Fusion, ...]:
-        """List the fusions, those that are tried first first."""
+        """Return the fusions in the order in which they are tried."""
         return (
             affine.FUSION,
             linear.SCALE,

@@ -1,4 +1,4 @@
-"""Decomposed activations that ONNX has a name for.
+"""Fuse decomposed activations into ONNX's operators.
 
 Given:   x * 0.5 * (1 + Erf(x / sqrt 2))
 Result:  Gelu(x)
@@ -40,7 +40,7 @@ TANH_CUBE = 0.044715
 """The cubic term of the tanh form of Gelu."""
 
 TANH_ROOT = math.sqrt(2 / math.pi)
-"""What stands before the bracket there."""
+"""The factor before the bracket of that form."""
 
 CLIP_SINCE = 12
 """The opset from which Clip takes its bounds as inputs, for all types."""
@@ -48,7 +48,7 @@ CLIP_SINCE = 12
 LAYERS = frozenset(
     {"Conv", "ConvTranspose", "Einsum", "Gemm", "LayerNormalization", "Softmax"}
 )
-"""What mixes a value with others: behind them its last digits are lost anyway."""
+"""Operators that mix a value with others, after which its last digits do not matter."""
 
 KINDS = (ir.DataType.FLOAT, ir.DataType.FLOAT16)
 
@@ -73,7 +73,7 @@ RELU = op("Relu", X)
 
 
 def fusions(*, swish: bool) -> tuple[Fusion, ...]:
-    """Build the fusions; Swish is refused unless it is asked for."""
+    """Build the fusions; Swish is refused unless allowed."""
     gelu = product(X, op("Add", ERF, ONE), scale=0.5)
     tanh_gelu = product(X, op("Add", TANH, ONE), scale=0.5)
     gated = product(X, op("HardSigmoid", X, where=_is_sixth))
@@ -120,10 +120,10 @@ def _sigmoid() -> Fusion:
 
 
 def _stays_a_part(match: Match, facts: Facts) -> str | None:
-    """Refuse where a Log follows before a layer does: an inverse sigmoid.
+    """Refuse a sigmoid whose Log follows before any layer: an inverse sigmoid.
 
-    onnxruntime's Sigmoid is exact to 8e-8 whatever it returns. Beside 1e-5, where
-    detectors' inverse sigmoids end, that moves the logit by 8e-3.
+    onnxruntime's Sigmoid has an absolute error of 8e-8. Near 1e-5, where detectors clip
+    inverse sigmoids, that moves the logit by 8e-3.
     """
     ahead, seen = deque(match.root.outputs), set(match.root.outputs)
     while ahead:
@@ -148,7 +148,7 @@ def _is_float(match: Match, facts: Facts) -> bool:
 
 
 def _keeps_rank(match: Match) -> bool:
-    """Return whether no constant has more axes than x: then the result has them too."""
+    """Return whether no constant has more axes than x."""
     rank = rank_of(match[X])
     return rank is not None and rank == rank_of(match.root.outputs[0])
 
@@ -191,7 +191,6 @@ def _hard_sigmoid() -> Fusion:
 
 
 def _clip() -> Fusion:
-    """Min and Max with constants in a row are one Clip."""
     raised = either(op("Max", X, LOW), RELU)
     return Fusion(
         "Clip",
@@ -203,7 +202,6 @@ def _clip() -> Fusion:
 
 
 def _bounds(match: Match) -> list[Array]:
-    """Return the lower and the upper bound, each of shape ()."""
     high = match.array(HIGH).reshape(())
     if LOW not in match:  # a Relu
         return [np.zeros((), high.dtype), high]

@@ -1,15 +1,16 @@
-"""What scales and shifts channels, folded into the layer before it.
+"""Fold scales and shifts of channels into the preceding layer.
 
 Given:   Conv (ConvTranspose, Gemm) -> BatchNormalization, or a constant Add, Mul, ...
+
 Result:  one Conv with other weights
 
 With y = k x + d per output channel: weight' = k weight, bias' = k bias + d, computed
 in float64 (Ioffe, Szegedy 2015 for the k and d of a normalization).
 
-A weight that several layers share is scaled once for each different k: layers that are
-followed by the same numbers go on sharing. The copies may grow the file by what the
-nodes that go are worth (:mod:`me2e_compress.passes.work`); a shared weight that costs
-more stays as it is, and so does what follows its layers.
+A weight that several layers share is scaled once for each different k, so that layers
+followed by the same numbers still share it. The copies may grow the file by the price
+of the removed nodes (:mod:`me2e_compress.passes.work`); if they cost more, the weight
+and the nodes after its layers stay unchanged.
 """
 
 import dataclasses
@@ -54,7 +55,7 @@ PATTERN = either(
 
 @dataclasses.dataclass(frozen=True)
 class _Affine:
-    """``y = scale * x + shift``, one number a channel."""
+    """``y = scale * x + shift``, one number per channel."""
 
     scale: Numbers
     shift: Numbers
@@ -75,7 +76,6 @@ def _affine(match: Match) -> _Affine | None:
 
 
 def _normalization(match: Match) -> _Affine:
-    """Read an inference-time BatchNormalization."""
     gamma, beta, mean, variance = (match.numbers(part) for part in STATISTICS)
     epsilon = match.root.attributes.get_float("epsilon", 1e-5)
     scale = gamma / np.sqrt(variance + epsilon)
@@ -83,7 +83,7 @@ def _normalization(match: Match) -> _Affine:
 
 
 def _arithmetic(match: Match) -> _Affine | None:
-    """Read a constant operand; None if it is not the same for a whole channel."""
+    """Return the scale and shift of an operand; None if they vary in a channel."""
     if not _is_per_channel(match):
         return None
     node, numbers = match.root, match.numbers(NUMBERS).reshape(-1)
@@ -101,7 +101,7 @@ def _arithmetic(match: Match) -> _Affine | None:
 
 
 def _is_per_channel(match: Match) -> bool:
-    """Return whether a constant differs along axis 1 at most."""
+    """Return whether a constant varies along axis 1 at most."""
     source, given = match[LAYER], match.array(NUMBERS).shape
     shape = static_shape(source)
     rank = len(source.shape) if source.shape is not None else 0
@@ -121,12 +121,14 @@ def _rewrite(found: Match, kit: Kit) -> str | None:
     bias, what = _bias(layer), layer.op_type
     if affine is None or bias is None or not holds_numbers(found[WEIGHT]):
         return f"{what} whose weights are computed"
+    # Compute the new weight and bias in float64
     stored = found.array(WEIGHT)
     scale = _scale(layer, affine)
     weight = _scaled(layer, found.numbers(WEIGHT), scale)
     bias = np.broadcast_to(bias * scale + affine.shift, scale.shape)
     if overflow(weight, stored) or overflow(bias, stored):
         return f"{what} whose weights would overflow"
+    # Store them, unless copies of a shared weight cost too much
     name = found[WEIGHT].name or layer.name or "layer"
     if not _give(layer, found[WEIGHT], weight.astype(stored.dtype), scale, kit):
         return f"{what} that shares its weights"
@@ -145,6 +147,7 @@ def _give(
     """Give a layer its scaled weight; False if the copy would cost too much."""
     if (scale == 1).all():
         return True
+    # Reuse the copy of a layer with the same scale
     name = _copy_name(layer, shared, scale)
     copy = kit.graph.initializers.get(name)
     if copy is not None and not _holds(copy, weight):
@@ -152,6 +155,7 @@ def _give(
     if copy is None and sole_reader(shared) is layer:
         kit.refill(layer, 1, weight, shared.name or name)
         return True
+    # Else make a copy if the removed nodes are worth it
     if copy is None:
         if not _is_worth_copies(shared):
             return False
@@ -161,7 +165,6 @@ def _give(
 
 
 def _holds(copy: ir.Value, weight: Array) -> bool:
-    """Return whether a copy that has the right name holds the right numbers."""
     tensor = copy.const_value
     return tensor is not None and np.array_equal(tensor.numpy(), weight)
 
@@ -175,9 +178,9 @@ def _copy_name(layer: ir.Node, shared: ir.Value, scale: Numbers) -> str:
 
 
 def _is_worth_copies(shared: ir.Value) -> bool:
-    """Weigh the copies of a shared weight against the nodes that go if they are made.
+    """Return whether the removed nodes are worth the copies of a shared weight.
 
-    Copies that other layers were given before are made already.
+    Copies made for other layers before cost nothing.
     """
     copies, stays, worth = set[str](), shared.is_graph_output(), 0.0
     for use in shared.uses():
@@ -194,7 +197,6 @@ def _is_worth_copies(shared: ir.Value) -> bool:
 
 
 def _behind(layer: ir.Node) -> Match | None:
-    """Return the match of a layer and what follows it."""
     reader = sole_reader(layer.outputs[0])
     if reader is None:
         return None
@@ -205,7 +207,6 @@ def _behind(layer: ir.Node) -> Match | None:
 
 
 def _scale(layer: ir.Node, affine: _Affine) -> Numbers:
-    """Return one factor for each output channel of a layer."""
     shape = static_shape(layer.inputs[1]) or (1, 1)
     groups = 1
     if layer.op_type == "ConvTranspose":
@@ -214,7 +215,7 @@ def _scale(layer: ir.Node, affine: _Affine) -> Numbers:
 
 
 def _bias(layer: ir.Node) -> Numbers | None:
-    """Return the bias as a vector (zero if there is none); None if it is not one."""
+    """Return the bias as a vector (zero if none); None if it is not a vector."""
     if bias_of(layer) is None:
         return np.zeros(1)
     bias = numbers_of(bias_of(layer))
@@ -225,7 +226,6 @@ def _bias(layer: ir.Node) -> Numbers | None:
 
 
 def _scaled(layer: ir.Node, weight: Numbers, scale: Numbers) -> Numbers:
-    """Multiply a weight by a factor for each output channel."""
     if layer.op_type == "Gemm":
         flip = layer.attributes.get_int("transB", 0)
         return weight * (scale[:, None] if flip else scale)

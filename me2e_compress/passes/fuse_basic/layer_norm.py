@@ -1,4 +1,4 @@
-"""The decomposed layer normalization (Ba, Kiros, Hinton 2016).
+"""Fuse decomposed layer normalization (Ba, Kiros, Hinton 2016).
 
 Given:   d = x - ReduceMean(x);  d / Sqrt(ReduceMean(d * d) + eps) * scale + bias
 Result:  LayerNormalization(x, scale, bias)
@@ -39,7 +39,7 @@ NORMALIZED = op("Div", CENTRED, op("Sqrt", op("Add", VARIANCE, EPSILON)))
 
 
 def _is_over_last_axes(match: Match, facts: Facts) -> bool:
-    """Return whether all three means are over the same axes, the last ones."""
+    """Return whether all three means are over the same last axes."""
     rank = rank_of(match[X]) or 0
     first, *others = [_axes(match.node(mean)) for mean in (VARIANCE, *MEANS)]
     if not rank or not first or others != [first, first]:
@@ -71,6 +71,7 @@ def _rewrite(match: Match, kit: Kit) -> None:
     source, root = match[X], match.root
     shape, axes = static_shape(source) or (), _axes(match.node(VARIANCE)) or []
     normal = shape[len(shape) - len(axes) :]
+    # Take in the scale and bias that follow
     multiplied, scale = _following(root, "Mul", normal)
     end = root if multiplied is None else multiplied
     added, bias = _following(end, "Add", normal)
@@ -89,7 +90,7 @@ def _rewrite(match: Match, kit: Kit) -> None:
 def _following(
     node: ir.Node, op_type: str, shape: tuple[int, ...]
 ) -> tuple[ir.Node | None, ir.Value | None]:
-    """Return the Mul (Add) that scales (shifts) what was normalized, and by what."""
+    """Return the Mul (or Add) that scales (or shifts) a result, and its constant."""
     reader = sole_reader(node.outputs[0])
     if reader is None or reader.op_type != op_type or reader.graph is not node.graph:
         return None, None

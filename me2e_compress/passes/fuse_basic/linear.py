@@ -1,6 +1,7 @@
-"""Matrix products and constant chains.
+"""Fuse matrix products with constants, and chains of constants.
 
 Given:   MatMul(x, weight) + bias, x of rank 2;  MatMul(x, weight) * c;  (x * c) * d
+
 Result:  Gemm;  MatMul(x, c weight);  x * (c d)
 
 At rank 3 MatMul + Add stays: Reshape, Gemm, Reshape would hide the product from
@@ -28,7 +29,7 @@ from me2e_compress.rewrite import (
 )
 
 CANCELLATION = 1e3
-"""Constants that cancel more than three decimal digits are not added up ahead."""
+"""Constants that cancel more than three decimal digits are not added in advance."""
 
 X = var("x")
 WEIGHT, BIAS, FACTOR = constant(), constant(), constant()
@@ -85,7 +86,7 @@ PLUS = op("Add", INNER, OFFSET)
 
 
 def _is_of_matrices(match: Match, facts: Facts) -> bool:
-    """Return whether the product is of matrices, and the offset one a column."""
+    """Return whether the product has rank 2 and the offset varies only by column."""
     inner = match.node(INNER)
     if facts.opset < 7 or match.root.outputs[0].dtype not in FLOATS:
         return False
@@ -110,9 +111,10 @@ CHAINS = {
 
 
 def _chain(match: Match, kit: Kit) -> str | None:
-    """Multiply (add) two constants in a row ahead of time."""
+    """Multiply (or add) two consecutive constants in advance."""
     first, second = match.numbers(FIRST), match.numbers(SECOND)
     op_type, output = match.root.op_type, match.root.outputs[0]
+    # Combine in float64, unless digits would be lost
     if op_type == "Mul":
         together = second * first
     else:

@@ -1,4 +1,4 @@
-"""Put fused operators in the place of what exporters decompose them into."""
+"""Fuse decomposed operators into the fused operators of the toolkit."""
 
 import contextlib
 import dataclasses
@@ -32,32 +32,32 @@ __all__ = ["FuseOperators"]
 
 @dataclasses.dataclass(frozen=True)
 class FuseOperators(Pass):
-    """Make decomposed multi-scale deformable attention one node again.
+    """Fuse decomposed multi-scale deformable attention into one node.
 
     Given:   g_l = 2 * locations[level l] - 1;  s_l = GridSample(value[level l], g_l);
              y = ReduceSum(Concat(s_0, s_1, ...) * weights, axes=[-1])
+
     Result:  y = me2e::MultiScaleDeformableAttention(
                  value, spatial_shapes, level_start_index, locations, weights)
 
-    A correctness fix for TensorRT before it is one of speed: deformable attention that
-    is decomposed into GridSample is reported silently wrong from TensorRT 10.14 to 11.1
-    (NVIDIA/TensorRT issue 4813); ``translate-plugins`` makes the plugin's node of the
-    one that this pass writes.
+    This is first a correctness fix for TensorRT: deformable attention decomposed into
+    GridSample is reported silently wrong from TensorRT 10.14 to 11.1 (NVIDIA/TensorRT
+    issue 4813). ``translate-plugins`` turns the fused node into the plugin's node.
 
-    It is found by what the nodes compute, whatever the exporter and the names: from
-    each GridSample (bilinear, zeros outside, corners not aligned) back and forth over
-    operators that only move elements, with one level or several, with heads in the
-    batch or apart. Each find is proven: the nodes and the fused node's body run on the
-    same random numbers, positions outside of the feature maps among them, and if they
-    differ the nodes stay. The notes name every GridSample that stays, and why.
+    Matches are found by what nodes compute, whatever the exporter and the names: from
+    each GridSample (bilinear, zeros outside, corners not aligned) through operators
+    that only move elements, with one level or several, with heads in the batch or
+    separate. Each match is verified: the nodes and the fused node's body run on the
+    same random numbers, including positions outside the feature maps; if they differ
+    the nodes stay. The notes name every GridSample that stays, and why.
 
     Attributes:
-        tolerance: how far both may differ, as a part of the largest result (1e-4: what
-            sums of float32 in another order, and positions rounded on the way to -1..1
-            and back, cost).
-        merge_images: take in the sum, or mean, over cameras or frames that follows, and
-            the mask before it: each image is one more level then, and what is computed
-            for each image alone is never stored (BEVFormer's and VAD's encoders).
+        tolerance: largest allowed difference, relative to the largest result (1e-4: the
+            cost of summing float32 in another order, and of rounding positions on the
+            way to -1..1 and back).
+        merge_images: include the sum, or mean, over cameras or frames that follows, and
+            the mask before it: each image is then one more level, and the results of
+            single images are never stored (BEVFormer's and VAD's encoders).
     """
 
     name: ClassVar[str] = "fuse-operators"
@@ -73,7 +73,7 @@ class FuseOperators(Pass):
             )
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Look at every GridSample that is read, of the graph and its bodies."""
+        """Try every GridSample that is read, in the graph and its bodies."""
         if not any(map(_is_sampler, nodes_in(model.graph))):
             return PassResult(model, 0)
         opset, unread = opset_of(model), remove_dead(model.graph)
@@ -94,7 +94,6 @@ def _is_sampler(node: ir.Node) -> bool:
 
 
 class _Run:
-    """What stays the same while a model is fused, and what was done so far."""
 
     def __init__(
         self, current: FuseOperators, opset: int, names: set[str], proofs: Proofs
@@ -105,7 +104,6 @@ class _Run:
         self.left: list[str] = []
 
     def notes(self) -> tuple[str, ...]:
-        """Return sentences for the report."""
         fused = (
             f"fused: {self.done} deformable attentions of {self.samplers} GridSample,"
             f" {self.worst:.1g} apart at most"
@@ -113,7 +111,6 @@ class _Run:
         return (*([fused] if self.done else ()), *self.left)
 
     def attempt(self, body: ir.Graph, node: ir.Node) -> None:
-        """Fuse what a GridSample is a part of, or note why not."""
         try:
             found = decomposed.find(node)
             self._replace(body, self._plan(found))
@@ -124,7 +121,7 @@ class _Run:
         self.samplers += len(found.levels)
 
     def _plan(self, found: decomposed.Decomposed) -> fused_form.Plan:
-        """Plan with the sum over images that follows, if that can be taken in."""
+        """Plan with the following sum over images, if that can be included."""
         if self.current.merge_images:
             with contextlib.suppress(PreconditionError):
                 return fused_form.plan(decomposed.with_images(found))
@@ -137,14 +134,17 @@ class _Run:
             raise PreconditionError(f"nothing makes {old.name}")
         inputs = [view.value for view in plan.inputs]
         matched = nodes_between(old, inputs)
+        # Write the fused node next to the old nodes
         call = FusedCall(root, opset=self.opset, by=self.current.name, names=self.names)
         new = fused_form.write(plan, call)
         made = nodes_between(new, inputs)
+        # Keep it only if both compute the same
         try:
             self._prove(old, new, plan)
         except (PreconditionError, GraphError):
             _take_back(body, made, known)
             raise
+        # Replace the old result and clean up
         for each in made:
             inherit(each, [root, *matched], by=self.current.name)
         replace_value(old, new)
@@ -152,11 +152,6 @@ class _Run:
         _drop_dead([*matched, *made])
 
     def _prove(self, old: ir.Value, new: ir.Value, plan: fused_form.Plan) -> None:
-        """Compare both on random numbers.
-
-        Raises:
-            PreconditionError: they differ.
-        """
         error = self.proofs.error(old, new, plan.inputs)
         if not error <= self.current.tolerance:
             raise PreconditionError(
@@ -166,7 +161,6 @@ class _Run:
         self.worst = max(self.worst, error)
 
     def _fold(self, body: ir.Graph, new: ir.Value, plan: fused_form.Plan) -> None:
-        """Compute the operands of the fused node that come from constants alone."""
         views = [view.value for view in plan.inputs]
         node = next(
             each for each in nodes_between(new, views) if each.domain == OWN_DOMAIN
@@ -187,14 +181,13 @@ class _Run:
 
 
 def _take_back(body: ir.Graph, made: Sequence[ir.Node], known: set[str]) -> None:
-    """Remove what was written in vain."""
     body.remove(reversed(made), safe=True)
     for name in [name for name in body.initializers if name not in known]:
         del body.initializers[name]
 
 
 def _drop_dead(nodes: Sequence[ir.Node]) -> None:
-    """Remove the nodes that nothing reads any more; these are in order."""
+    """Remove the nodes that nothing reads any more; they must be in graph order."""
     for node in reversed(nodes):
         if node.graph is not None and not any(is_read(each) for each in node.outputs):
             node.graph.remove(node, safe=True)

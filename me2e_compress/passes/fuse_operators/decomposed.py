@@ -1,7 +1,7 @@
-"""The search for a deformable attention that standard operators spell out.
+"""Find deformable attention that is written in standard operators.
 
-Zhu et al., Deformable DETR, 2021, equation 3, as exporters write it: GridSample of
-every level's feature map, the levels joined, a product with the attention weights, a
+Zhu et al., Deformable DETR, 2021, equation 3, as exporters write it: a GridSample of
+each level's feature map, the levels joined, a product with the attention weights, and a
 sum over points and levels.
 """
 
@@ -28,7 +28,7 @@ from me2e_compress.passes.fuse_operators.views import (
 
 BATCH, CHANNEL, LEVEL, PIXEL, XY = "batch", "channel", "level", "pixel", "xy"
 ROW, COLUMN = "row", "column"
-"""The axes of what is sampled: rows and columns are those of GridSample's output."""
+"""The axes of the samples; rows and columns are those of GridSample's output."""
 
 SAMPLING = {
     "mode": ("bilinear", "linear"),  # from opset 20 on it is called linear
@@ -42,8 +42,8 @@ class Level:
 
     Attributes:
         node: the GridSample.
-        image: of batch and heads, channels, pixels.
-        grid: of batch and heads, rows, columns, x and y; -1 and 1 are the edges.
+        image: [batch * heads, channels, height, width].
+        grid: [batch * heads, rows, columns, 2], where -1 and 1 are the edges.
         size: height and width.
     """
 
@@ -54,7 +54,7 @@ class Level:
 
     @property
     def pixels(self) -> int:
-        """How many pixels the feature map has."""
+        """The number of pixels of the feature map."""
         return math.prod(self.size)
 
 
@@ -64,16 +64,17 @@ class Decomposed:
 
     Attributes:
         levels: its feature maps, in the order in which they are joined.
-        weights: what the samples are multiplied by.
-        results: the sum, and where layout operators take it; each may be replaced.
-        queries: the digits of what is left of rows and columns.
-        points: the digits of what is summed over, the level apart.
+        weights: the attention weights.
+        results: the sum, and the results of layout operators after it; each of them may
+            be replaced.
+        queries: the digits of rows and columns that remain after the sum.
+        points: the digits of rows and columns that are summed over, without the level.
         batch: images times heads.
         channels: of one head.
-        mask: what the results of each image are multiplied by before they are added up;
-            None if by nothing.
-        images: the digits of the batch that are added up then, cameras or frames.
-        scale: what that sum is multiplied by: a mean divides.
+        mask: factor of the results of each image before they are added; None: no
+            factor.
+        images: the digits of the batch that are then added up: cameras or frames.
+        scale: factor of that sum, 1 / count for a mean.
     """
 
     levels: tuple[Level, ...]
@@ -89,15 +90,17 @@ class Decomposed:
 
 
 def find(node: ir.Node) -> Decomposed:
-    """Look for the deformable attention that a GridSample is a part of.
+    """Find the deformable attention that a GridSample is part of.
 
     Raises:
-        PreconditionError: it is a part of none; the message says what differs.
+        PreconditionError: there is none; the message says what differs.
     """
+    # Follow samples, weights and sum
     levels, samples = _levels(node)
     product, weights = _weighted(samples)
     total, _ = _total(list(results(product))[-1], ("ReduceSum",))
     left, before = flat(total.layout), flat(product.layout)
+    # Only rows, columns and levels may be summed over
     gone = _difference(before, left)
     if any(digit.axis in (BATCH, CHANNEL) for digit in gone):
         raise PreconditionError("the sum is over channels or heads too")
@@ -115,12 +118,13 @@ def find(node: ir.Node) -> Decomposed:
 
 
 def with_images(found: Decomposed) -> Decomposed:
-    """Take in the sum, or mean, over images that follows, masked or not; if one does.
+    """Include a sum or mean over images that follows, masked or not, if there is one.
 
     A sum over images of sums over points is a sum over both: each image is one more
     level. BEVFormer (Li et al., 2022) adds up the cameras that see a pillar and takes
     the mean over this frame and the last.
     """
+    # An optional mask, then the sum or mean
     end, mask = found.results[-1], None
     node = sole_reader(end.value)
     try:
@@ -130,6 +134,7 @@ def with_images(found: Decomposed) -> Decomposed:
         total, mean = _total(end, ("ReduceSum", "ReduceMean"))
     except PreconditionError:
         return found
+    # Only axes of the batch may be summed over
     gone = _difference(flat(end.layout), flat(total.layout))
     if not gone or any(digit.axis != BATCH for digit in gone):
         return found
@@ -148,13 +153,13 @@ def _difference(digits: Digits, others: Digits) -> Digits:
 
 
 def _level(node: ir.Node) -> tuple[Level, View]:
-    """Return what a GridSample samples, and the view of what it gives."""
     for name, allowed in SAMPLING.items():
         found = node.attributes.get_string(name, allowed[0])
         if found not in allowed:
             raise PreconditionError(f"it samples with {name}={found}")
     if node.attributes.get_int("align_corners", 0):
         raise PreconditionError("it samples with align_corners=1")
+    # Shapes and types must be known and supported
     image, grid = node.inputs[0], node.inputs[1]
     shape, places = static_shape(image), static_shape(grid)
     if image is None or grid is None or shape is None or places is None:
@@ -165,6 +170,7 @@ def _level(node: ir.Node) -> tuple[Level, View]:
         raise PreconditionError("it samples in three dimensions")
     if image.dtype != ir.DataType.FLOAT or grid.dtype != ir.DataType.FLOAT:
         raise PreconditionError("it samples in another type than float32")
+    # Describe both operands by their digits
     batch, channels, height, width = shape
     pixels = (
         (Digit(PIXEL, width, height),) if height > 1 else (),
@@ -186,12 +192,13 @@ def _level(node: ir.Node) -> tuple[Level, View]:
 
 
 def _levels(node: ir.Node) -> tuple[tuple[Level, ...], View]:
-    """Return all levels that are sampled alike and joined, and what they make."""
+    """Return all levels that are sampled and joined alike, and their result."""
     level, sampled = _level(node)
     end = list(results(sampled))[-1]
     concat = sole_reader(end.value)
     if concat is None or concat.op_type != "Concat" or not is_standard(concat):
         return (level,), end
+    # Every operand of the Concat must be a GridSample of equal layout
     levels: list[Level] = []
     for value in concat.inputs:
         sampler = _sampler(value)
@@ -212,7 +219,7 @@ def _levels(node: ir.Node) -> tuple[tuple[Level, ...], View]:
 
 
 def _sampler(value: ir.Value | None) -> ir.Node | None:
-    """Return the GridSample that layout operators take a value from."""
+    """Return the GridSample that a value comes from through layout operators."""
     node = producer_of(value)
     while node is not None and is_standard(node) and node.op_type in LAYOUT_OPERATORS:
         node = producer_of(node.inputs[0])
@@ -220,7 +227,6 @@ def _sampler(value: ir.Value | None) -> ir.Node | None:
 
 
 def _weighted(samples: View) -> tuple[View, View]:
-    """Return the product of the samples with their weights, and the weights."""
     node = sole_reader(samples.value)
     if node is None or node.op_type != "Mul" or not is_standard(node):
         raise PreconditionError("what it samples is not multiplied by weights")
@@ -236,7 +242,6 @@ def _weighted(samples: View) -> tuple[View, View]:
 
 
 def _total(product: View, kinds: tuple[str, ...]) -> tuple[View, bool]:
-    """Return the sum over some axes, and whether it is a mean."""
     node = sole_reader(product.value)
     if node is None or node.op_type not in kinds or not is_standard(node):
         raise PreconditionError("the weighted samples are not summed")

@@ -1,8 +1,8 @@
-"""Indices in mixed radix: what Reshape and Transpose do to the dimensions of a tensor.
+"""Mixed-radix indices: what Reshape and Transpose do to the dimensions of a tensor.
 
 A dimension of 16 that holds 2 images of 8 heads has the digits image and head. Reshape
-groups digits anew and Transpose reorders dimensions; neither moves anything else. So
-where every dimension's digits are known, the layout of a tensor is.
+regroups digits and Transpose reorders dimensions; neither moves anything else. So the
+digits of every dimension determine the layout of a tensor.
 """
 
 import dataclasses
@@ -14,13 +14,7 @@ from typing import TypeAlias
 
 @dataclasses.dataclass(frozen=True)
 class Digit:
-    """One digit of an index: ``index // stride % size``.
-
-    Attributes:
-        axis: the index that it is a part of.
-        stride: what one step of it counts in that index.
-        size: how many values it takes.
-    """
+    """One digit ``index // stride % size`` of the index named ``axis``."""
 
     axis: str
     stride: int
@@ -28,7 +22,7 @@ class Digit:
 
     @property
     def end(self) -> int:
-        """What one step of the next digit counts."""
+        """The stride of the next digit."""
         return self.stride * self.size
 
 
@@ -38,12 +32,12 @@ Layout: TypeAlias = tuple[Digits, ...]
 
 
 def whole(axis: str, size: int) -> Digits:
-    """Return an index as its only digit; nothing where it takes one value."""
+    """Return an index as its only digit; nothing where its size is 1."""
     return (Digit(axis, 1, size),) if size > 1 else ()
 
 
 def flat(layout: Layout) -> Digits:
-    """Return the digits of all dimensions in a row."""
+    """Return the digits of all dimensions in sequence."""
     return tuple(digit for digits in layout for digit in digits)
 
 
@@ -53,7 +47,7 @@ def sizes(layout: Layout) -> tuple[int, ...]:
 
 
 def regrouped(layout: Layout, shape: Sequence[int]) -> Layout | None:
-    """Return what a Reshape makes of a layout; None if it breaks digits up.
+    """Return the layout after a Reshape; None if it breaks digits up.
 
     ``[16] -> [2, 8]`` splits a digit in two; ``[4, 3] -> [6, 2]`` has no digits.
     """
@@ -61,6 +55,7 @@ def regrouped(layout: Layout, shape: Sequence[int]) -> Layout | None:
     found: list[Digits] = []
     for size in shape:
         taken: list[Digit] = []
+        # Take digits from the front, and split the last if it divides
         while size > 1:
             if not rest:
                 return None
@@ -80,7 +75,7 @@ def regrouped(layout: Layout, shape: Sequence[int]) -> Layout | None:
 
 
 def merged(digits: Iterable[Digit]) -> Digits:
-    """Return digits with those that follow each other in one index made one."""
+    """Return digits with consecutive digits of the same index merged."""
     found: list[Digit] = []
     for digit in digits:
         last = found[-1] if found else None
@@ -113,14 +108,10 @@ def split_like(digits: Digits, others: Iterable[Digit]) -> Digits:
 
 
 def runs(source: Digits, wanted: Digits) -> tuple[list[Digits], list[int]]:
-    """Split digits into runs that stay together on the way to another order.
+    """Split digits into runs that stay together when reordered.
 
-    Args:
-        source: digits in the order that they have.
-        wanted: some or all of them, none split, in the order that they are to have.
-
-    Returns:
-        The runs in the order of the source, and that of the wanted, as positions.
+    ``wanted`` holds some or all of the digits, none split, in the new order. Returns
+    the runs in the order of the source, and the wanted order as positions in these.
     """
     places = [source.index(digit) for digit in wanted]
     starts = [

@@ -1,4 +1,4 @@
-"""The fused node in the place of a deformable attention: its operands laid out."""
+"""Write the fused node of a deformable attention and lay out its operands."""
 
 import dataclasses
 import math
@@ -45,15 +45,8 @@ OP_TYPE = "MultiScaleDeformableAttention"
 class Plan:
     """How a deformable attention becomes one node.
 
-    Attributes:
-        found: what it was.
-        heads: how many the batch is split into.
-        value: where the feature maps come from.
-        locations: where the positions come from.
-        weights: where the weights come from.
-        mask: what they are multiplied by; None if by nothing.
-        result: what is replaced.
-        cost: bytes that are written to lay operands out.
+    ``mask`` is a factor of the weights; ``cost`` counts the bytes written to lay
+    operands out.
     """
 
     found: Decomposed
@@ -67,7 +60,7 @@ class Plan:
 
     @property
     def inputs(self) -> tuple[View, ...]:
-        """Every view that the fused node is fed from."""
+        """Every view that the fused node reads."""
         mask = () if self.mask is None else (self.mask,)
         sources = (self.value, self.locations, self.weights)
         return (*(view for each in sources for view in each.views), *mask)
@@ -77,8 +70,9 @@ def plan(found: Decomposed) -> Plan:
     """Choose where to read and what to replace, so that the least data is moved.
 
     Raises:
-        PreconditionError: images are added up, and levels do not lie behind each other.
+        PreconditionError: images are added up but levels are not contiguous in memory.
     """
+    # List where each operand can be read
     value = options_of([level.image for level in found.levels], join_pixels)
     plain = options_of([level.grid for level in found.levels], join_levels)
     # of equals the last one is taken: sums are the last resort
@@ -91,6 +85,7 @@ def plan(found: Decomposed) -> Plan:
     weights = [Source((view,)) for view in whole_views(found.weights)]
     masks = [] if found.mask is None else whole_views(found.mask)
     known = [view for each in (*value, *locations, *weights) for view in each.views]
+    # Price every number of heads with the best source of each operand
     plans = []
     for heads in _head_counts(found, [*known, *masks, *found.results]):
         form = _Form(found, heads)
@@ -116,15 +111,14 @@ def plan(found: Decomposed) -> Plan:
 
 
 def write(chosen: Plan, call: FusedCall) -> ir.Value:
-    """Write the fused node and what lays out its operands; return what it gives.
+    """Write the fused node and the layout of its operands; return its result.
 
-    Args:
-        chosen: how.
-        call: where: in front of the node that makes what is replaced.
+    The nodes go in front of the node whose result is replaced.
     """
     found = chosen.found
     form = _Form(found, chosen.heads)
     images = math.prod(digit.size for digit in found.images)
+    # Each image is one more set of levels
     shapes = np.array([level.size for level in found.levels] * images, np.int64)
     areas = shapes.prod(axis=1)
     made = call.add(
@@ -138,13 +132,13 @@ def write(chosen: Plan, call: FusedCall) -> ir.Value:
         ],
         domain=OWN_DOMAIN,
     )
+    # Bring the result to the layout of the replaced value
     made.dtype = ir.DataType.FLOAT
     made.shape = ir.Shape(sizes(form.result))
     return laid_out(call, View(made, form.result), chosen.result.layout)
 
 
 def _weights(call: FusedCall, chosen: Plan, form: "_Form") -> ir.Value:
-    """Write the weights, times the mask and the scale of what is added up behind."""
     factors = [*chosen.weights.views, *([chosen.mask] if chosen.mask else [])]
     value = combined(call, "Mul", factors, form.weights(None))
     scale = chosen.found.scale
@@ -193,10 +187,7 @@ class _Form:
 
 
 def _head_counts(found: Decomposed, views: Sequence[View]) -> list[int]:
-    """List the numbers of heads that the layouts suggest, the most first.
-
-    The images that are added up are none of them.
-    """
+    """Return the numbers of heads that the layouts suggest, largest first."""
     counts = {1, found.batch}
     for view in views:
         for digit in flat(view.layout):

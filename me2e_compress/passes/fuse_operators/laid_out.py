@@ -1,4 +1,4 @@
-"""The operators that take views of values to the layout that an operand has."""
+"""Write the operators that bring views of values to the layout of an operand."""
 
 from collections.abc import Sequence
 
@@ -18,27 +18,27 @@ from me2e_compress.passes.fuse_operators.views import View
 
 
 def laid_out(call: FusedCall, view: View, form: Layout) -> ir.Value:
-    """Write the operators that take a view to a layout; none where it has it.
+    """Write the operators that bring a view to a layout; none where it has it.
 
-    Args:
-        call: where to write.
-        view: the value; where it lacks digits it is repeated.
-        form: the layout.
+    Where the view lacks digits it is repeated.
     """
     value, (scale, shift) = view.value, scaling(view)
     if scale != 1.0:
         value = call.add("Mul", [value, call.numbers(scale, value)])
     if shift != 0.0:
         value = call.add("Add", [value, call.numbers(shift, value)])
+    # Split digits on both sides so that they match
     have, wanted = flat(view.layout), flat(form)
     have, wanted = split_like(have, wanted), split_like(wanted, have)
     present = tuple(digit for digit in wanted if digit in have)
     shape = sizes(view.layout)
     if present != have:
+        # Reorder runs of digits by one Transpose
         pieces, order = runs(have, present)
         value = call.transpose(_shaped(call, value, shape, sizes(tuple(pieces))), order)
         shape = tuple(sizes(tuple(pieces))[place] for place in order)
     if len(present) < len(wanted):
+        # Repeat along the missing digits
         ones = [digit.size if digit in have else 1 for digit in wanted]
         value = _shaped(call, value, shape, ones)
         return _expanded(call, value, ones, wanted, form)
@@ -50,24 +50,23 @@ def combined(
 ) -> ir.Value:
     """Write a sum or product of views in a layout, each repeated by broadcasting alone.
 
-    Args:
-        call: where to write.
-        op_type: Add or Mul.
-        views: each with some of the layout's digits.
-        form: the layout.
+    ``op_type`` is Add or Mul; each view has some of the layout's digits.
     """
     if len(views) == 1:
         return laid_out(call, views[0], form)
+    # Group the digits so that a view has or lacks each group as a whole
     digits = [digit for view in views for digit in flat(view.layout)]
     every = split_like(flat(form), digits)
     have = [set(split_like(flat(view.layout), every)) for view in views]
     groups = _groups(form, digits, have)
+    # Combine the views by broadcasting
     value: ir.Value | None = None
     for view, mine in zip(views, have, strict=True):
         own = tuple(run if run[0] in mine else () for run in groups)
         part = laid_out(call, view, own)
         value = part if value is None else call.add(op_type, [value, part])
     assert value is not None
+    # Expand along digits that no view has
     found = [run if any(run[0] in each for each in have) else () for run in groups]
     shape = sizes(tuple(found))
     if shape != sizes(tuple(groups)):
@@ -83,7 +82,7 @@ def combined(
 def _groups(
     form: Layout, digits: Sequence[Digit], have: Sequence[set[Digit]]
 ) -> list[tuple[Digit, ...]]:
-    """Split each dimension into stretches that every view has or lacks as a whole."""
+    """Split each dimension into runs that every view has or lacks as a whole."""
     groups: list[tuple[Digit, ...]] = []
     for dimension in form:
         last: tuple[bool, ...] | None = None

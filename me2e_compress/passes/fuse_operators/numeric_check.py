@@ -1,4 +1,4 @@
-"""The proof of a fusion: what was matched, against the fused node's body."""
+"""Compare matched nodes with the fused node's body on random numbers."""
 
 from collections.abc import Sequence
 
@@ -16,14 +16,14 @@ from me2e_compress.passes.fuse_operators.views import View
 from me2e_compress.runtime.session import Session
 
 OUTSIDE = 0.25
-"""How far beyond a feature map's edges positions are tried, as a part of its size."""
+"""How far beyond a feature map's edges positions are drawn, relative to its size."""
 
 IR_VERSION = 8
 """Old enough for every onnxruntime that has GridSample."""
 
 
 def nodes_between(output: ir.Value, inputs: Sequence[ir.Value]) -> list[ir.Node]:
-    """List the nodes that make a value of others, and of constants, in order."""
+    """Return the nodes that compute a value from others and constants, in order."""
     known: dict[ir.Node, None] = {}
     stops, stack = set(inputs), [(output.producer(), False)]
     while stack:
@@ -45,10 +45,11 @@ def nodes_between(output: ir.Value, inputs: Sequence[ir.Value]) -> list[ir.Node]
 def piece_of(
     output: ir.Value, inputs: Sequence[ir.Value], opset: int
 ) -> onnx.ModelProto:
-    """Write what makes a value of others as a model of its own, its names by number."""
+    """Write the nodes between values as a model of its own, with numbered names."""
     names = {value: f"in{index}" for index, value in enumerate(inputs)}
     weights: list[onnx.TensorProto] = []
     nodes: list[onnx.NodeProto] = []
+    # Copy the nodes under new names; constants become weights
     for node in nodes_between(output, inputs):
         written = ir.serde.serialize_node(node)
         del written.input[:], written.output[:], written.metadata_props[:]
@@ -65,6 +66,7 @@ def piece_of(
             names[value] = f"v{len(names)}"
             written.output.append(names[value])
         nodes.append(written)
+    # Declare inputs and shapes
     ports = [_port(names[value], value) for value in inputs]
     shapes = [
         _port(name, value) for value, name in names.items() if name.startswith("v")
@@ -80,7 +82,7 @@ def piece_of(
 
 
 def run_piece(piece: onnx.ModelProto, feeds: Sequence[Array]) -> Array:
-    """Run a piece of a graph, its fused nodes as their bodies, nodes as they stand."""
+    """Run a piece of a graph, with fused nodes expanded to their bodies."""
     model = ir.from_proto(piece)
     opset = opset_of(model)
     for node in list(model.graph):
@@ -92,12 +94,12 @@ def run_piece(piece: onnx.ModelProto, feeds: Sequence[Array]) -> Array:
 
 
 DRAWS = 8
-"""How often numbers are drawn until something comes out: one lone position lies outside
-of the feature map in a third of all draws."""
+"""Number of draws until a result is not zero: a single position lies outside the
+feature map in a third of all draws."""
 
 
 class Proofs:
-    """Compares pieces of a graph on fresh random numbers; equal pairs but once."""
+    """Compares pieces of a graph on fresh random numbers, and caches equal pairs."""
 
     def __init__(self, opset: int, seed: int) -> None:
         self._opset, self._seed = opset, seed
@@ -106,15 +108,12 @@ class Proofs:
     def error(self, before: ir.Value, after: ir.Value, views: Sequence[View]) -> float:
         """Return max|a-b|/max|a| of two values that are computed from the same views.
 
-        Args:
-            before: what was matched.
-            after: what the fused node gives.
-            views: what both read: fed with normal numbers, and positions with those
-                of which a third lies outside of the feature maps.
+        Views are fed with normal numbers; a third of the positions lie outside the
+        feature maps.
 
         Raises:
-            PreconditionError: one of them reads something else besides, or the first
-                gives nothing but zeros.
+            PreconditionError: one of them reads another value too, or the first returns
+                only zeros.
             GraphError: onnxruntime cannot run it.
         """
         inputs = list(dict.fromkeys(view.value for view in views))
@@ -141,7 +140,6 @@ class Proofs:
 
 
 def _draw(view: View, random: np.random.Generator) -> Array:
-    """Draw what a view holds: normal numbers, or positions inside and outside."""
     shape = sizes(view.layout)
     if not any(digit.axis == XY for digit in flat(view.layout)):
         return random.standard_normal(shape).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Where an operand of the fused node may be read, and what laying it out costs."""
+"""Find where an operand of the fused node can be read, and what its layout costs."""
 
 import dataclasses
 import math
@@ -28,8 +28,8 @@ class Source:
     """Where an operand comes from.
 
     Attributes:
-        views: one of the whole operand; or one of every level; or two that add up.
-        total: whether they add up.
+        views: one for the whole operand, or one per level, or two that are added.
+        total: whether they are added.
     """
 
     views: tuple[View, ...]
@@ -57,7 +57,8 @@ def join_levels(selections: Sequence[Selection]) -> View | None:
 def options_of(
     views: Sequence[View], join: Callable[[Sequence[Selection]], View | None]
 ) -> list[Source]:
-    """List where an operand may be read: of every level, then of all together."""
+    """Return where an operand can be read: per level, then from all levels together."""
+    # Walk back from each level
     walks = [list(sources(view)) for view in views]
     ends = [walk[-1] for walk in walks]
     options = [
@@ -67,6 +68,7 @@ def options_of(
             strict=False,  # a level may be read from further away than another
         )
     ]
+    # Where all levels are selections of one value, read that
     selections = [each for each in ends if isinstance(each, Selection)]
     if len(selections) < len(ends):
         return options
@@ -80,16 +82,16 @@ def options_of(
 
 
 def whole_views(view: View) -> list[View]:
-    """List where a value may be read as a whole, and unscaled."""
+    """Return where a value can be read as a whole and unscaled."""
     found = (each for each in sources(view) if isinstance(each, View))
     return [each for each in found if _same(each, view)]
 
 
 def sums_of(option: Source) -> list[Source]:
-    """List where the two may be read that an operand is the sum of.
+    """Return where the two terms can be read that an operand is the sum of.
 
-    Positions are often the sum of a few reference points and of offsets: what is moved
-    before that is smaller. Only where the sum itself needs no scale.
+    Positions are often the sum of few reference points and offsets: moving data before
+    the sum is cheaper. Only where the sum itself needs no scale.
     """
     if len(option.views) != 1 or scaling(option.views[0]) != (1.0, 0.0):
         return []
@@ -112,12 +114,10 @@ def cheapest(
     form: Callable[[int | None], Layout],
     covered: tuple[Digit, ...] = (),
 ) -> tuple[float, Source]:
-    """Return the source that costs least to lay out; of equals the last one.
+    """Return the lowest cost of laying out a source, and that source.
 
-    Args:
-        options: to choose from.
-        form: the layout, by level.
-        covered: digits that something else repeats the operand over anyway.
+    Of equal sources the last is taken. ``form`` gives the layout by level (None: all);
+    ``covered`` are digits that another operator repeats the operand over anyway.
     """
 
     def cost(option: Source) -> float:
@@ -143,14 +143,11 @@ def cost_of(
     covered: tuple[Digit, ...] = (),
     part: bool = False,
 ) -> float:
-    """Count the bytes that are written to lay a view out.
+    """Return the bytes written to bring a view to a layout.
 
-    Args:
-        view: what is laid out.
-        form: how.
-        covered: digits that it need not be repeated over.
-        part: whether it is one of several that are added or multiplied: such are
-            repeated by that, and scaled wherever they are read.
+    The view need not be repeated over the ``covered`` digits. ``part`` says that it is
+    one of several that are added or multiplied: that repeats it, and it is scaled
+    wherever it is read.
     """
     have, wanted = flat(view.layout), flat(form)
     have, wanted = split_like(have, wanted), split_like(wanted, have)
@@ -165,9 +162,9 @@ def cost_of(
 
 
 def scaling(view: View) -> tuple[float, float]:
-    """Return what a view's elements are multiplied by, and what is added then.
+    """Return the factor and then the summand of a view's elements.
 
-    A grid's are taken from -1..1, between the outer edges, to 0..1.
+    Those of a grid are taken from -1..1, between the outer edges, to 0..1.
     """
     if not any(digit.axis == XY for digit in flat(view.layout)):
         return view.scale, view.shift

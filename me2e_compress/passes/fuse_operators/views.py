@@ -1,4 +1,4 @@
-"""Values that hold the same elements in other places: walks over layout operators."""
+"""Views of values under layout operators, and walks along them."""
 
 import dataclasses
 import math
@@ -23,7 +23,7 @@ class View:
 
     Attributes:
         value: the value.
-        layout: which digits of the other's indices its dimensions are made of.
+        layout: the digits of the other's indices that its dimensions are made of.
         scale: the other's elements are ``scale`` times this one's ...
         shift: ... plus ``shift``.
     """
@@ -36,13 +36,13 @@ class View:
 
 @dataclasses.dataclass(frozen=True)
 class Selection:
-    """A view of which one dimension is only a stretch of the value's.
+    """A view of a contiguous part of one dimension.
 
     Attributes:
-        view: the value before the selection; its layout is that of the stretch.
+        view: the value before the selection; its layout is that of the part.
         axis: the dimension.
         start: the first index.
-        size: how many.
+        size: number of indices.
     """
 
     view: View
@@ -52,15 +52,16 @@ class Selection:
 
     @property
     def length(self) -> int:
-        """How large the dimension is as a whole."""
+        """The size of the whole dimension."""
         shape = static_shape(self.view.value) or ()
         return shape[self.axis]
 
 
 def sources(view: View) -> Iterator[View | Selection]:
-    """Walk from a value to where its elements come from; the value itself first.
+    """Walk from a value, itself first, back to where its elements come from.
 
-    Ends at what is no layout operator; a selection, if it meets one, is the last.
+    The walk ends before the first operator that does more than move elements; a
+    selection, if it meets one, is the last.
     """
     while True:
         yield view
@@ -73,9 +74,10 @@ def sources(view: View) -> Iterator[View | Selection]:
 
 
 def results(view: View) -> Iterator[View]:
-    """Walk from a value to where layout operators take it; the value itself first.
+    """Walk from a value, itself first, forward through layout operators.
 
-    Ends where several nodes read a value, or one that does more than move elements.
+    The walk ends where several nodes read a value, or where one does more than move
+    elements.
     """
     while True:
         yield view
@@ -87,14 +89,13 @@ def results(view: View) -> Iterator[View]:
 
 
 def joined(selections: Sequence[Selection], digits: Digits) -> View | None:
-    """Return the view that stretches make up together, in order; None if they do not.
+    """Return the view that consecutive parts make up together; None if they do not.
 
-    Args:
-        selections: the stretches.
-        digits: those of the dimension as a whole.
+    ``digits`` are those of the whole dimension.
     """
     first = selections[0]
     start = 0
+    # The parts must be adjacent and equal in all other respects
     for each in selections:
         alike = dataclasses.replace(each.view, layout=()) == dataclasses.replace(
             first.view, layout=()
@@ -113,7 +114,7 @@ def joined(selections: Sequence[Selection], digits: Digits) -> View | None:
 
 
 def terms(view: View) -> tuple[View, View] | None:
-    """Return the two that a value is the sum of; None if it is not, or read besides."""
+    """Return the two terms of a sum that is read once; None if there are none."""
     node = producer_of(view.value)
     if node is None or node.op_type != "Add" or not is_standard(node):
         return None
@@ -129,7 +130,7 @@ def terms(view: View) -> tuple[View, View] | None:
 
 
 def aligned(layout: Layout, shape: Sequence[int]) -> Layout:
-    """Return the layout of what is repeated to one: no digits where its size is 1."""
+    """Return the layout of a broadcast operand: no digits where its size is 1."""
     last = layout[len(layout) - len(shape) :]
     return tuple(
         digits if size > 1 else () for digits, size in zip(last, shape, strict=True)
@@ -141,10 +142,10 @@ def _without(layout: Layout, axis: int) -> Layout:
 
 
 def _before(view: View) -> View | Selection | None:
-    """Return the view of what the maker of a value reads."""
     node = producer_of(view.value)
     if node is None or not is_standard(node) or not node.inputs:
         return None
+    # Selections and scales are handled apart
     if node.op_type in ("Gather", "Slice", "Split"):
         return _selected(node, view)
     if node.op_type in ("Add", "Div", "Mul", "Sub"):
@@ -153,6 +154,7 @@ def _before(view: View) -> View | Selection | None:
     shape = static_shape(source)
     if source is None or shape is None:
         return None
+    # Move the digits back through the operator
     layout: Layout | None = None
     if node.op_type in REGROUPING:
         layout = regrouped(view.layout, shape)
@@ -169,7 +171,6 @@ def _before(view: View) -> View | Selection | None:
 
 
 def _after(node: ir.Node, view: View) -> View | None:
-    """Return the view that a layout operator makes of a value."""
     if not is_standard(node) or node.inputs[0] is not view.value:
         return None
     result = node.outputs[0]
@@ -194,7 +195,7 @@ def _order(node: ir.Node, rank: int) -> list[int]:
 
 
 def _unscaled(node: ir.Node, view: View) -> View | None:
-    """Undo a sum or product with a constant, the same for all elements."""
+    """Undo a sum or product with one constant for all elements."""
     left, right = node.inputs[0], node.inputs[1]
     constant, source = _number(right), left
     if constant is None and node.op_type in ("Add", "Mul"):
@@ -214,7 +215,6 @@ def _unscaled(node: ir.Node, view: View) -> View | None:
 
 
 def _number(value: ir.Value | None) -> float | None:
-    """Return the number that a constant is made of; None if it holds several."""
     numbers = numbers_of(value)
     if numbers is None or numbers.size == 0 or np.ptp(numbers) != 0.0:
         return None
@@ -222,7 +222,7 @@ def _number(value: ir.Value | None) -> float | None:
 
 
 def _selected(node: ir.Node, view: View) -> Selection | None:
-    """Return the stretch of one dimension that a node takes; None if it is none."""
+    """Return the part of one dimension that a node selects; None if it does not."""
     source = node.inputs[0]
     shape = static_shape(source)
     if source is None or shape is None:

@@ -1,4 +1,4 @@
-"""Multiply fewer rows: move products in front of what repeats or adds up their rows."""
+"""Multiply fewer rows: move products before nodes that repeat or add up rows."""
 
 import dataclasses
 from typing import ClassVar
@@ -20,10 +20,10 @@ from me2e_compress.rewrite import graphs_of, remove_dead, value_names
 __all__ = ["HoistLinear"]
 
 OLDEST_OPSET = 8
-"""Broadcasting and Expand are what they are since."""
+"""Earlier opsets broadcast differently and have no Expand."""
 
 ROUNDS = 8
-"""What one round moves, the next may move further: real graphs need two."""
+"""A round may move further what the last one moved: real graphs need two."""
 
 
 @dataclasses.dataclass
@@ -58,27 +58,26 @@ class _Tally:
 
 @dataclasses.dataclass(frozen=True)
 class HoistLinear(Pass):
-    """Multiply before rows are repeated, not after: the same products, fewer of them.
+    """Multiply before rows are repeated, not after: the same products, but fewer.
 
     Given:   Tile(x) -> MatMul;  x + (p P + c) -> MatMul;  Expand(x) -> Relu -> MatMul
+
     Result:  MatMul(x) -> Tile;  x W + p (P W) + c W;  x -> Relu -> MatMul -> Expand
 
-    A product moves in front of what only rearranges or repeats rows (Tile, Expand,
-    Gather, Concat, Slice, Reshape and Transpose that leave the last axis); it is
-    distributed over a sum, or over columns side by side, of which a part is small or
-    repeated; and two linear layers in a row become one. Each is done only where the
-    multiply-accumulates become fewer and the whole cheaper: nodes, what they move, and
-    new weights (:mod:`me2e_compress.passes.work`). Whatever else is done to every row
-    alike (a bias, LayerNorm, Relu) moves in front of their repetition too. Sizes must
-    be known.
-
-    Equal up to rounding.
+    A product moves in front of nodes that only rearrange or repeat rows (Tile, Expand,
+    Gather, Concat; Slice, Reshape and Transpose that keep the last axis). It is
+    distributed over a sum, or over concatenated columns, of which a part is small or
+    repeated. Two consecutive linear layers become one. Each rewrite is done only where
+    it needs fewer multiply-accumulates and is cheaper in total: nodes, memory traffic
+    and new weights (:mod:`me2e_compress.passes.work`). Other row-wise operators (a
+    bias, LayerNorm, Relu) also move in front of repetitions. Sizes must be known.
+    Outputs are equal up to rounding.
 
     Attributes:
         bytes_per_node: how many bytes of new weights the work of one node may cost.
         merge_shared: merge the layers of a module that read the same value (queries,
-            keys and values) into one and split what it gives; off, since onnxruntime
-            is slower so from 300 rows on, and int8 would have one range for all.
+            keys and values) into one and split the result; off, since onnxruntime is
+            slower that way from 300 rows on, and int8 would share one range.
     """
 
     name: ClassVar[str] = "hoist-linear"
@@ -87,15 +86,17 @@ class HoistLinear(Pass):
     merge_shared: bool = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Ask for every node whether there is a cheaper way, until there is none."""
+        """Rewrite every node that has a cheaper form, until none has."""
         tally, opset = _Tally(), opset_of(model)
         if opset < OLDEST_OPSET:
             return PassResult(model, 0)
+        # Unread nodes would hold on to their inputs
         tally.unread = remove_dead(model.graph)  # it would hold on to what it reads
         names = value_names(model.graph)
         rewriters = [
             Rewriter(each, names, self.name) for each in graphs_of(model.graph)
         ]
+        # Merge layers only when nothing else moves
         for _ in range(ROUNDS):
             before = tally.changes
             for rewriter in rewriters:
@@ -114,6 +115,7 @@ class HoistLinear(Pass):
             if node.graph is not body:
                 continue
             before = tally.changes
+            # Try products first, then row-wise nodes, then attention operands
             layer = layer_at(node)
             found = None if layer is None else prices.saving(layer)
             if layer is not None and found is not None:

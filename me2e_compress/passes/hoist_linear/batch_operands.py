@@ -1,10 +1,11 @@
-"""Attention over keys, or values, that are partly the same for every batch.
+"""Attention over keys or values that are partly the same for every batch.
 
 Given:   keys = A + p P, A the same for every batch;  MatMul(q, heads of keys)
+
 Result:  MatMul(q, heads of A) + MatMul(MatMul(q, heads of P), p)
 
-What is repeated for the batch need not be written out then, and what has few columns
-(positions: two) is multiplied by the queries before it is made wide.
+Terms shared by the batch need not be repeated, and a term of few columns (positions:
+two) is multiplied by the queries before it becomes wide.
 """
 
 import dataclasses
@@ -24,13 +25,10 @@ from me2e_compress.rewrite import Array, maker, sole_reader
 
 @dataclasses.dataclass(frozen=True)
 class BatchOperand:
-    """The right operand of a batched product, taken apart.
+    """The right operand of a batched product, split into terms.
 
-    Attributes:
-        layout: which of its axes are batch, heads, tokens and channels.
-        shared: the terms that are the same for every batch.
-        narrow: the terms that are linear layers of few columns.
-        nodes: what made it, and nothing else reads.
+    ``shared`` terms are the same for every batch, ``narrow`` ones are layers of few
+    columns; nothing else reads the ``nodes`` that make it.
     """
 
     layout: HeadLayout
@@ -40,14 +38,14 @@ class BatchOperand:
 
 
 def split_operand(product: ir.Node, rewriter: Rewriter) -> int | None:
-    """Multiply by the terms of a batched product's operand apart.
+    """Multiply by the terms of a batched product's operand separately.
 
-    Returns:
-        How many MACs that saves; None if it does not pay, or is no such product.
+    Returns the saved MACs; None if it does not pay, or if there is no such product.
     """
     found = _operand(product)
     if found is None or product.inputs[0] is None:
         return None
+    # Write the alternative, then compare the work of both
     writer = _Writer(product, found, rewriter)
     new = writer.result()
     before = sum(map(work, (product, *found.nodes)))
@@ -64,6 +62,7 @@ def split_operand(product: ir.Node, rewriter: Rewriter) -> int | None:
 def _operand(product: ir.Node) -> BatchOperand | None:
     if product.op_type != "MatMul" or product.domain not in ("", "ai.onnx"):
         return None
+    # The batch axes of both operands must agree
     right = product.inputs[1]
     layout = None if right is None else layout_of(right)
     left = static_shape(product.inputs[0])
@@ -76,6 +75,7 @@ def _operand(product: ir.Node) -> BatchOperand | None:
         return None
     shared, narrow = [], []
     nodes = [*layout.nodes, *terms[1]]
+    # Every term must be shared by the batch, or narrow
     for value in terms[0]:
         layer = layer_behind(value)
         if layout.is_shared(static_shape(value)):
@@ -93,7 +93,7 @@ def _operand(product: ir.Node) -> BatchOperand | None:
 
 
 def _terms(value: ir.Value) -> tuple[list[ir.Value], list[ir.Node]] | None:
-    """List the terms of a sum, or what is repeated, and the nodes in between."""
+    """Return the terms of a sum or repetition, and the nodes in between."""
     if sole_reader(value) is None:
         return None
     node, source = value.producer(), without_repeats(value)
@@ -115,7 +115,7 @@ def _terms(value: ir.Value) -> tuple[list[ir.Value], list[ir.Node]] | None:
 
 
 class _Writer:
-    """Writes the products of the terms before the product of their sum."""
+    """Writes the products of the terms and their sum."""
 
     def __init__(
         self, product: ir.Node, found: BatchOperand, rewriter: Rewriter
@@ -124,16 +124,17 @@ class _Writer:
         self.values: list[ir.Value] = []
 
     def result(self) -> ir.Value:
-        """Write the sum of the products; return what takes the product's place."""
         layout, out = self.found.layout, self.product.outputs[0]
         left = self.product.inputs[0]
         assert left is not None
+        # Give the queries axes of batch and heads, and their scale
         matrix = (static_shape(left) or ())[-2:]
         left = self._shape(left, (layout.batch, layout.heads, *matrix))
         if layout.scale != 1.0:
             factor = self._constant(np.array(layout.scale), "scale")
             left = self._write("Mul", [left, factor], static_shape(left) or ())
         total: ir.Value | None = None
+        # Biases are added to one shared term
         biases = [layer.bias() for layer in self.found.narrow]
         for value in self.found.shared:
             for bias in biases:
@@ -149,7 +150,7 @@ class _Writer:
         return self._shape(total, static_shape(out) or ())
 
     def _narrow(self, left: ir.Value, layer: LinearLayer) -> ir.Value:
-        """Multiply by a layer: by its matrix and its source, the smaller first."""
+        """Multiply by a layer's matrix and its source, the smaller first."""
         layout = self.found.layout
         matrix = layer.matrix().reshape(-1, layout.heads, layout.channels)
         source = self._tokens(layer.source)
@@ -160,7 +161,7 @@ class _Writer:
         return self._multiply(self._multiply(left, source), heads)
 
     def _heads(self, value: ir.Value) -> ir.Value:
-        """Take a value apart into heads: [1, H, J, D], or [1, H, D, J] if turned."""
+        """Split a value into heads: [1, H, J, D], or [1, H, D, J] if turned."""
         layout = self.found.layout
         ends = (layout.heads, layout.channels)
         tokens = (layout.tokens, 1) if layout.batch_axis else (1, layout.tokens)

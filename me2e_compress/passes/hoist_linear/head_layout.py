@@ -1,8 +1,8 @@
-"""Which axes of a batched product's operand are batch, heads, tokens and channels.
+"""Find the axes of batch, heads, tokens and channels of a batched product's operand.
 
-The heads of attention are cut out of rows by views: [B, J, H D] is reshaped to
-[B, J, H, D] and transposed to [B, H, J, D], or to [B, H, D, J] to be multiplied by
-from the left; other code has [J, B, H D], or one axis for batch and heads together.
+Attention cuts heads out of rows by views: [B, J, H D] is reshaped to [B, J, H, D] and
+transposed to [B, H, J, D], or to [B, H, D, J] for a product from the left; other code
+has [J, B, H D], or one axis for batch and heads together.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from me2e_compress.passes.hoist_linear.row_moves import VIEWS
 from me2e_compress.rewrite import is_standard, scalar_of, sole_maker
 
 Atom = tuple[int, int, int]
-"""A piece of an axis of the rows: which axis, how many steps, how long each."""
+"""A piece of an axis of the rows: axis, number of steps, length of a step."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,8 +23,8 @@ class HeadLayout:
 
     Attributes:
         value: the rows: [B, J, H D], or [J, B, H D].
-        nodes: the views between, and what scales them; the last one first.
-        scale: by what they are scaled.
+        nodes: the views and scalings in between, the last one first.
+        scale: product of the scalings.
         batch_axis: 0 or 1, of the rows.
         batch: B.
         heads: H.
@@ -48,7 +48,7 @@ class HeadLayout:
         return shape is not None and shape == self._rows(1, self.heads * self.channels)
 
     def is_whole(self, shape: tuple[int, ...] | None) -> bool:
-        """Return whether there are such rows for every batch, of fewer columns."""
+        """Return whether every batch has such rows, of fewer columns."""
         if not shape or shape[-1] >= self.channels:
             return False
         return shape == self._rows(self.batch, shape[-1])
@@ -59,7 +59,8 @@ class HeadLayout:
 
 
 def layout_of(operand: ir.Value) -> HeadLayout | None:
-    """Read how an operand is cut out of rows, by nodes that nothing else reads."""
+    """Return how an operand is cut out of rows by nodes that nothing else reads."""
+    # Walk back over views and scalings
     value, scale = operand, 1.0
     nodes: list[ir.Node] = []
     while (node := sole_maker(value, "Transpose", "Mul", "Div", *VIEWS)) is not None:
@@ -73,6 +74,7 @@ def layout_of(operand: ir.Value) -> HeadLayout | None:
     shape = static_shape(value)
     if not nodes or shape is None or len(shape) != 3:
         return None
+    # Then apply the views to the axes of the rows
     axes = [[(axis, size, 1)] if size > 1 else [] for axis, size in enumerate(shape)]
     for node in reversed(nodes):
         moved = _view(axes, node)
@@ -83,7 +85,7 @@ def layout_of(operand: ir.Value) -> HeadLayout | None:
 
 
 def _factor(node: ir.Node) -> float | None:
-    """Return by what a node scales, 1 for a view; None if it is neither."""
+    """Return the factor of a scaling, 1 for a view; None for other nodes."""
     if node.op_type not in ("Mul", "Div"):
         return 1.0
     left, right = map(scalar_of, node.inputs)
@@ -101,7 +103,6 @@ def _view(axes: list[list[Atom]], node: ir.Node) -> list[list[Atom]] | None:
 
 
 def _regroup(axes: list[list[Atom]], shape: tuple[int, ...]) -> list[list[Atom]] | None:
-    """Cut the same atoms into axes of other sizes."""
     atoms = [atom for axis in axes for atom in axis][::-1]
     found: list[list[Atom]] = []
     for size in shape:
@@ -133,10 +134,12 @@ def _read(
 ) -> HeadLayout | None:
     if len(axes) < 2 or len(axes[-1]) != 1 or len(axes[-2]) != 1:
         return None
+    # The last two axes must be tokens and channels
     turned = axes[-2][0][0] == 2
     channels, tokens = axes[-2 if turned else -1][0], axes[-1 if turned else -2][0]
     heads = shape[2] // channels[1]
     batch_axis = 1 - tokens[0]
+    # The axes before them must be batch and heads
     lead = [(batch_axis, shape[batch_axis], 1)]
     if heads > 1:
         lead.append((2, heads, channels[1]))

@@ -1,11 +1,10 @@
-"""The cheapest way to multiply a value by a matrix, by the algebra of rows.
+"""The cheapest way to multiply a value by a matrix.
 
-A product of rows that are rearranged or repeated is the product, rearranged or
-repeated; a product of a sum (or of columns side by side) is the sum of products; a
-product of a linear layer is one with the product of both matrices; a product of
-constants is one.
-Each way is priced as in :mod:`me2e_compress.passes.work`: what it computes in every
-frame, what it moves, and what new weights take in the file.
+The product of rearranged or repeated rows is the rearranged or repeated product; the
+product of a sum (or of concatenated columns) is a sum of products; two linear layers
+are one with the product of their matrices; a product of constants is a constant. Each
+way is priced as in :mod:`me2e_compress.passes.work`: work per frame, memory traffic,
+and new weights in the file.
 """
 
 import dataclasses
@@ -37,18 +36,12 @@ from me2e_compress.passes.work import MACS_PER_NODE, MOVED_BYTES_PER_NODE
 from me2e_compress.rewrite import holds_numbers, is_standard, sole_reader
 
 DEEPEST = 32
-"""How many nodes before a product are looked at, in a row."""
+"""Largest number of consecutive nodes examined before a product."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Price:
-    """What a way costs.
-
-    Attributes:
-        way: the way.
-        work: what it costs a frame, in starts of a node; bytes of the file included.
-        macs: multiply-accumulates.
-    """
+    """The cost of a way: work per frame in node starts, with file bytes, and MACs."""
 
     way: Way
     work: float
@@ -57,14 +50,14 @@ class Price:
 
 @dataclasses.dataclass(frozen=True)
 class Question:
-    """A product that is asked for.
+    """A product whose price is wanted.
 
     Attributes:
         value: what is multiplied, [..., K].
         columns: N, of the product.
-        owned: whether only this product reads it, so that what computes it goes.
+        owned: whether only this product reads the value, so that its nodes go too.
         fresh: whether the matrix is a new one, which takes bytes in the file.
-        depth: how many nodes before it may still be looked at.
+        depth: how many earlier nodes may still be examined.
     """
 
     value: ir.Value
@@ -80,13 +73,13 @@ class Question:
 
     @property
     def product_bytes(self) -> float:
-        """What the product takes in memory."""
+        """The size of the product in memory."""
         return _size(self.shape[:-1]) * self.columns * _item(self.value)
 
     def of(
         self, value: ir.Value, *, owned: bool | None = None, fresh: bool = False
     ) -> "Question":
-        """Ask for a value before this one."""
+        """Ask for an earlier value."""
         mine = self.owned and sole_reader(value) is not None
         return Question(
             value, self.columns, mine if owned is None else owned,
@@ -95,11 +88,7 @@ class Question:
 
 
 class Prices:
-    """Asks for the cheapest way, and remembers the answers while the graph stays.
-
-    Args:
-        bytes_per_node: how many bytes of the file a node that is gone may cost.
-    """
+    """Finds the cheapest ways, and caches prices until the graph changes."""
 
     def __init__(self, bytes_per_node: int) -> None:
         self.rate = max(bytes_per_node, 1e-9)
@@ -107,21 +96,23 @@ class Prices:
         self.owned = OwnedWork(self.rate)
 
     def forget(self) -> None:
-        """Forget all answers: the graph is another now."""
+        """Clear the cache after a change of the graph."""
         self.known.clear()
         self.owned.known.clear()
 
     def saving(self, layer: LinearLayer) -> Price | None:
-        """Return the cheapest other way for a layer, with the work and MACs it saves.
+        """Return the cheapest other way of a layer, with the work and MACs it saves.
 
-        None if there is no other way that has fewer MACs and costs less.
+        None if no other way has fewer MACs and costs less.
         """
+        # Compare the direct product with the best other way
         columns = (static_shape(layer.product.outputs[0]) or (0,))[-1]
         source = layer.source
         asked = Question(source, columns, sole_reader(source) is not None, fresh=False)
         now, best = self.direct(asked), self.indirect(asked)
         if best is None:
             return None
+        # The weight may become unused
         saved = now.work - best.work
         if not uses_weight(best.way) and sole_reader(layer.weight) is not None:
             saved += self.owned.file(layer.weight)
@@ -141,7 +132,7 @@ class Prices:
         return found
 
     def direct(self, asked: Question) -> Price:
-        """Price the product of the value as it is, kept for it if it is owned."""
+        """Price the product of the value as it is; the nodes of an owned value stay."""
         if holds_numbers(asked.value):
             return Price(Precomputed(asked.value), asked.product_bytes / self.rate, 0)
         macs = _size(asked.shape) * asked.columns
@@ -154,7 +145,7 @@ class Prices:
         return Price(Direct(asked.value), cost + held.work, macs + held.macs)
 
     def indirect(self, asked: Question) -> Price | None:
-        """Price the ways through the node that computes the value; None if none."""
+        """Price the ways through the node that computes the value, if there are any."""
         node = asked.value.producer()
         if node is None or node.graph is not asked.value.graph or not is_standard(node):
             return None
@@ -213,14 +204,16 @@ class Prices:
 def terms_of(
     node: ir.Node, shape: tuple[int, ...]
 ) -> Iterator[tuple[ir.Value, bool, tuple[int, int] | None]]:
-    """Take a sum apart: its values, whether only it reads them, their matrix rows.
+    """Yield the terms of a sum: value, whether only the sum reads it, its matrix rows.
 
-    What an Expand or Tile repeats is taken as it is where adding repeats it anyway.
+    A term behind an Expand or Tile is yielded without it where adding repeats it
+    anyway.
     """
     values = [value for value in node.inputs if value is not None]
     shapes = [static_shape(value) for value in values]
     if len(values) < 2 or any(not each for each in shapes) or 0 in shape:
         return
+    # Only sums of equal width, or a Concat of columns
     axis = node.attributes.get_int("axis", 0) if node.op_type == "Concat" else -1
     if axis not in (-1, len(shape) - 1):
         return
@@ -232,6 +225,7 @@ def terms_of(
         return
     leads = [each[:-1] for each in shapes if each]
     start = 0
+    # Skip repetitions that broadcasting makes unnecessary
     for at, value in enumerate(values):
         owned = sole_reader(value) is not None
         source = without_repeats(value)

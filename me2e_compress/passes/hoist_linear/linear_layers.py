@@ -1,4 +1,4 @@
-"""Linear layers: a product with a constant matrix, and the vector added to it."""
+"""Linear layers: a product with a constant matrix, and an added vector."""
 
 import dataclasses
 import math
@@ -19,19 +19,14 @@ from me2e_compress.rewrite import (
 
 @dataclasses.dataclass(frozen=True)
 class LinearLayer:
-    """``source @ weight + bias``, of every row of the source.
-
-    Attributes:
-        product: the MatMul or Gemm.
-        sum: the Add of its bias, if that is a node of its own.
-    """
+    """``source @ weight + bias``: a MatMul or Gemm, and the Add of a separate bias."""
 
     product: ir.Node
     sum: ir.Node | None
 
     @property
     def source(self) -> ir.Value:
-        """The rows: [..., K]."""
+        """The rows, [..., K]."""
         value = self.product.inputs[0]
         assert value is not None
         return value
@@ -45,7 +40,7 @@ class LinearLayer:
 
     @property
     def result(self) -> ir.Value:
-        """What it computes: [..., N]."""
+        """The output, [..., N]."""
         return (self.sum or self.product).outputs[0]
 
     @property
@@ -55,7 +50,7 @@ class LinearLayer:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the weight is what the rows are multiplied by, as it is stored."""
+        """Whether the stored weight is exactly the matrix."""
         return self.product.op_type == "MatMul" or (
             not self.product.attributes.get_int("transB", 0)
             and self.product.attributes.get_float("alpha", 1.0) == 1.0
@@ -71,7 +66,7 @@ class LinearLayer:
         return numbers * self.product.attributes.get_float("alpha", 1.0)
 
     def bias(self) -> Numbers | None:
-        """Return the vector that is added, [N]; None if none is."""
+        """Return the added vector, [N]; None if there is none."""
         total: Numbers | None = None
         columns = (static_shape(self.result) or ())[-1:]
         if len(self.product.inputs) > 2 and self.product.inputs[2] is not None:
@@ -85,7 +80,7 @@ class LinearLayer:
 
 
 def layer_at(product: ir.Node) -> LinearLayer | None:
-    """Read the layer that a product is, with its bias where nothing else reads it."""
+    """Return the layer of a product, with its bias where nothing else reads it."""
     if not _is_product(product):
         return None
     reader = sole_reader(product.outputs[0])
@@ -95,7 +90,7 @@ def layer_at(product: ir.Node) -> LinearLayer | None:
 
 
 def layer_behind(value: ir.Value) -> LinearLayer | None:
-    """Read the layer that computes a value."""
+    """Return the layer that computes a value."""
     node = maker(value, "MatMul", "Gemm", "Add")
     if node is None or node.op_type != "Add":
         return (
@@ -109,7 +104,7 @@ def layer_behind(value: ir.Value) -> LinearLayer | None:
 
 
 def _is_product(node: ir.Node) -> bool:
-    """Return whether a node multiplies rows by one constant matrix, of known sizes."""
+    """Return whether a node multiplies rows of known sizes by one constant matrix."""
     if node.op_type not in ("MatMul", "Gemm") or node.domain not in ("", "ai.onnx"):
         return False
     if node.attributes.get_int("transA", 0):

@@ -1,4 +1,4 @@
-"""The numbers of a way to compute a linear layer: its matrices and its vector."""
+"""The matrices and vectors of a way to compute a linear layer."""
 
 from collections.abc import Callable
 
@@ -16,12 +16,9 @@ from me2e_compress.rewrite import Numbers, numbers_of
 
 
 class Matrix:
-    """What a product multiplies by, [K, N]: an initializer once one is needed.
+    """A matrix [K, N] that becomes an initializer when it is first needed.
 
-    Args:
-        numbers: the matrix.
-        value: the initializer that holds it, if there is one.
-        name: what to call one.
+    ``value`` is the initializer that holds it, if there is one.
     """
 
     def __init__(self, numbers: Numbers, value: ir.Value | None, name: str) -> None:
@@ -54,7 +51,7 @@ class Matrix:
 
 
 def vector_of(way: Way, matrix: Matrix) -> Numbers | None:
-    """Return what the layers that a way composes add to every row, [N]."""
+    """Return the vector, [N], that the composed layers add to every row."""
     if isinstance(way, Moved):
         return vector_of(way.parts[0], matrix) if len(way.parts) == 1 else None
     if isinstance(way, Composed):
@@ -73,7 +70,7 @@ def vector_of(way: Way, matrix: Matrix) -> Numbers | None:
 
 
 def plus(one: Numbers | None, two: Numbers | None) -> Numbers | None:
-    """Add up what is there."""
+    """Add two vectors, either of which may be None."""
     if one is None or two is None:
         return two if one is None else one
     total: Numbers = one + two

@@ -1,4 +1,4 @@
-"""The work that goes with a value: of what only it is computed by."""
+"""The work that is saved when a value and the nodes only it needs are removed."""
 
 import dataclasses
 import math
@@ -14,26 +14,20 @@ from me2e_compress.rewrite import holds_numbers, sole_reader
 
 @dataclasses.dataclass(frozen=True)
 class Amount:
-    """Work, in starts of a node, and multiply-accumulates.
-
-    Attributes:
-        work: bytes of the file included.
-        macs: multiply-accumulates.
-    """
+    """Work in node starts (file bytes included), and multiply-accumulates."""
 
     work: float = 0.0
     macs: int = 0
 
     def plus(self, other: "Amount") -> "Amount":
-        """Return both together."""
+        """Return the sum of both."""
         return Amount(self.work + other.work, self.macs + other.macs)
 
 
 class OwnedWork:
-    """Adds up what would be gone with a value, and remembers it.
+    """Adds up and caches the work that goes with a value.
 
-    Args:
-        rate: bytes of the file that a node which is gone may cost.
+    ``rate`` is the number of file bytes that a removed node may cost.
     """
 
     def __init__(self, rate: float) -> None:
@@ -41,14 +35,15 @@ class OwnedWork:
         self.known: dict[int, Amount] = {}
 
     def of(self, value: ir.Value) -> Amount:
-        """Return the work and MACs of what only this value is computed by.
+        """Return the work and MACs of the nodes that only this value needs.
 
-        Without calling itself: a sum may have thousands of terms.
+        It does not recurse: a sum may have thousands of terms.
         """
         waiting = [value]
         while waiting:
             last = waiting[-1]
             amount, sources = self._last_step(last)
+            # Visit the sources first
             unknown = [each for each in sources if id(each) not in self.known]
             if unknown:
                 waiting.extend(unknown)
@@ -60,12 +55,13 @@ class OwnedWork:
         return self.known[id(value)]
 
     def _last_step(self, value: ir.Value) -> tuple[Amount, list[ir.Value]]:
-        """Return what the last step to a value takes, and what only that reads."""
+        """Return the work of the last step to a value, and the values only it reads."""
         node = value.producer()
         if id(value) in self.known:
             return self.known[id(value)], []
         if node is None or node.graph is not value.graph:
             return Amount(), []
+        # A step is a layer, a move of rows, or a sum
         layer = layer_behind(value)
         if layer is not None:
             amount, sources = self._layer(layer), [layer.source]
@@ -78,13 +74,13 @@ class OwnedWork:
             amount, sources = Amount(work(node)), list(found)
         if amount is None:
             return Amount(), []
+        # Constants that only this step reads count by their size
         owned = [each for each in sources if sole_reader(each) is not None]
         stored = [each for each in owned if holds_numbers(each)]
         files = Amount(sum(map(self.file, stored)))
         return amount.plus(files), [each for each in owned if each not in stored]
 
     def _layer(self, layer: LinearLayer) -> Amount | None:
-        """Return what a layer takes; None if others read what is inside."""
         if not all(sole_reader(each.outputs[0]) for each in layer.nodes):
             return None
         cost = sum(map(work, layer.nodes))
@@ -94,6 +90,6 @@ class OwnedWork:
         return Amount(cost, math.prod(static_shape(layer.source) or ()) * columns)
 
     def file(self, weight: ir.Value) -> float:
-        """Return what a constant takes in the file."""
+        """Return the price of a constant's bytes in the file."""
         item = 4.0 if weight.dtype is None else weight.dtype.itemsize
         return math.prod(static_shape(weight) or ()) * item / self.rate

@@ -1,4 +1,4 @@
-"""Write a way to compute a linear layer into the graph, in the layer's place."""
+"""Write another way to compute a linear layer into the graph."""
 
 import math
 from collections.abc import Sequence
@@ -32,13 +32,7 @@ from me2e_compress.rewrite import (
 
 
 class Rewriter:
-    """Rewrites one graph.
-
-    Args:
-        graph: the main graph, or a body.
-        names: of all values of the model; new ones are entered.
-        by: the pass's name.
-    """
+    """Rewrites a graph or body; ``names`` holds all value names of the model."""
 
     def __init__(self, graph: ir.Graph, names: set[str], by: str) -> None:
         self.graph, self.names, self.by = graph, names, by
@@ -59,14 +53,14 @@ class Rewriter:
         return True
 
     def swap(self, old: ir.Value, new: ir.Value) -> None:
-        """Put a value in another's place, under its name; drop what nothing reads."""
+        """Replace a value, keep its name, and drop what nothing reads any more."""
         name = old.name
         replace_value(old, new, self.names)
         self.drop(old)
         new.name = name
 
     def drop(self, value: ir.Value) -> None:
-        """Remove what makes a value that nothing reads, and what only that read."""
+        """Remove the unread maker of a value, and all nodes that only it needed."""
         waiting = [value.producer()]
         while waiting:
             last = waiting.pop()
@@ -91,7 +85,7 @@ class Rewriter:
         return value
 
     def undo(self, values: Sequence[ir.Value]) -> None:
-        """Take back what was written last, in order, and what is stored for it."""
+        """Remove the last written values, in order, and their constants."""
         for value in reversed(values):
             self.drop(value)
         for value in self.stored:
@@ -101,11 +95,7 @@ class Rewriter:
     def move(
         self, node: ir.Node, inputs: list[ir.Value]
     ) -> tuple[str, list[ir.Value | None], list[ir.Attr], tuple[int, ...]]:
-        """Say what rearranges other rows as a node does its own.
-
-        Returns:
-            Operator, inputs, attributes, and the shape that comes out.
-        """
+        """Return operator, inputs, attributes and shape of a node on other rows."""
         width = (static_shape(inputs[0]) or (0,))[-1]
         shape = (*(static_shape(node.outputs[0]) or ())[:-1], width)
         if node.op_type in VIEWS or node.op_type == "Expand":
@@ -125,15 +115,9 @@ class Rewriter:
         sources: Sequence[ir.Node],
         like: ir.Value,
     ) -> ir.Value:
-        """Write a node before the one that makes a value, of the same type.
+        """Write a node before the maker of ``like`` and with its type.
 
-        Args:
-            op_type: the operator.
-            inputs: what it reads.
-            attributes: its attributes.
-            shape: of what it gives.
-            sources: the nodes that it stands for, the leading one first.
-            like: the value that what is written will take the place of.
+        ``sources`` are the nodes that it stands for, the leading one first.
         """
         place = like.producer()
         assert place is not None
@@ -147,18 +131,17 @@ class Rewriter:
 
 
 class _Writer:
-    """Writes nodes before the end of one layer."""
 
     def __init__(self, rewriter: Rewriter, layer: LinearLayer) -> None:
         self.rewriter, self.layer = rewriter, layer
         self.made: list[ir.Value] = []
 
     def build(self, way: Way, matrix: Matrix, bias: Numbers | None) -> ir.Value:
-        """Write the nodes that multiply by a matrix and add a vector."""
         return self._write_way(way, matrix, plus(bias, vector_of(way, matrix)))
 
     def _write_way(self, way: Way, matrix: Matrix, vector: Numbers | None) -> ir.Value:
-        """Write a way, and one vector for all that it adds to every row."""
+        """Write a way, with one vector for all that it adds to every row."""
+        # Products and constants end the recursion
         if isinstance(way, Direct):
             return self._multiply(way.value, matrix, vector)
         if isinstance(way, Precomputed):
@@ -167,6 +150,7 @@ class _Writer:
             return self._write_way(way.way, matrix.behind(way), vector)
         if isinstance(way, Distributed):
             return self._distribute(way, matrix, vector)
+        # A move: write each distinct part once
         if len(way.parts) == 1:
             parts = [self._write_way(way.parts[0], matrix, vector)]
         else:
@@ -178,7 +162,7 @@ class _Writer:
     def _distribute(
         self, way: Distributed, matrix: Matrix, vector: Numbers | None
     ) -> ir.Value:
-        """Write the terms, the fewest rows first: the vector goes there."""
+        """Write the terms, the fewest rows first, which take the vector."""
         terms, minus = list(way.terms), way.node.op_type == "Sub"
         if not minus:
             terms.sort(key=lambda term: math.prod(term.shape[:-1]))
@@ -238,7 +222,7 @@ class _Writer:
 def _without_vectors(
     terms: list[Term], matrix: Matrix, vector: Numbers | None
 ) -> tuple[list[Term], Numbers | None]:
-    """Take the constant terms of one row into the vector, if others have the shape."""
+    """Merge constant terms of one row into the vector, if others have full shape."""
     kept = [
         term
         for term in terms

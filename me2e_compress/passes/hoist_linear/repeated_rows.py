@@ -1,6 +1,7 @@
-"""What is done to every row alike is done once where rows repeat each other.
+"""Compute row-wise operators before rows are repeated.
 
 Given:   Expand(x) -> Add(bias) -> LayerNormalization -> Relu
+
 Result:  x -> Add(bias) -> LayerNormalization -> Relu -> Expand
 """
 
@@ -31,12 +32,12 @@ UNARY = frozenset(
 """Operators that map every element by itself."""
 
 BINARY = frozenset({"Add", "Div", "Max", "Min", "Mul", "Pow", "Sub"})
-"""Operators that map pairs of elements, and repeat what is smaller."""
+"""Element-wise operators of two operands, which broadcast."""
 
 REDUCTIONS = frozenset(
     {"ReduceL2", "ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum"}
 )
-"""Operators that make one number of every row where their axis is the last."""
+"""Operators that reduce every row to one number where their axis is the last."""
 
 ALONG_AXIS = frozenset({"LayerNormalization", "LogSoftmax", "Softmax"})
 """Operators that map every row by itself where their axis is the last."""
@@ -45,17 +46,12 @@ SOFTMAX_OPSET = 13
 """Before, the axis of a softmax was the second by default."""
 
 LONGEST = 16
-"""How many nodes in a row may lie between what is repeated and what reads it."""
+"""Largest number of nodes between the repeated value and its reader."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Repetition:
-    """Where rows are repeated.
-
-    Attributes:
-        source: the value before it.
-        nodes: those that rearrange and repeat its rows, the last one first.
-    """
+    """A value whose rows are repeated, and the nodes that do it, the last one first."""
 
     source: ir.Value
     nodes: tuple[ir.Node, ...]
@@ -68,13 +64,7 @@ class Repetition:
 
 @dataclasses.dataclass(frozen=True)
 class Move:
-    """A node in front of a repetition.
-
-    Attributes:
-        inputs: what it reads there.
-        shape: what it gives there.
-        found: the repetition that comes behind it.
-    """
+    """The inputs and output shape of a node in front of a repetition."""
 
     inputs: tuple[ir.Value | None, ...]
     shape: tuple[int, ...]
@@ -87,6 +77,7 @@ def do_before_repeats(node: ir.Node, rewriter: Rewriter, opset: int) -> bool:
         return False
     shape = static_shape(node.outputs[0])
     operands = node.inputs[: 2 if node.op_type in BINARY else 1]
+    # Try the operands that have as many rows as the result
     for index, value in enumerate(operands):
         given = static_shape(value)
         if value is None or not shape or not given or given[:-1] != shape[:-1]:
@@ -108,6 +99,7 @@ def _is_row_wise(node: ir.Node, opset: int) -> bool:
         return False
     if node.op_type in UNARY or node.op_type in BINARY:
         return True
+    # Reductions and normalizations must work along the last axis
     rank = rank_of(node.outputs[0]) or 0
     if node.op_type in REDUCTIONS:
         return bool(node.attributes.get_int("keepdims", 1)) and _axes(node) in (
@@ -124,7 +116,6 @@ def _is_row_wise(node: ir.Node, opset: int) -> bool:
 
 
 def _axes(node: ir.Node) -> list[int]:
-    """Return the axes of a reduction, an attribute before opset 18."""
     given = node.attributes.get("axes")
     if given is not None:
         return [int(axis) for axis in given.as_ints()]
@@ -133,7 +124,7 @@ def _axes(node: ir.Node) -> list[int]:
 
 
 def _repetition(value: ir.Value) -> Repetition | None:
-    """Find the value with the fewest rows that one is rearranged and repeated from."""
+    """Find the source with the fewest rows that a value is repeated from."""
     best, least = None, math.prod(static_shape(value) or ())
     nodes: list[ir.Node] = []
     while len(nodes) < LONGEST:
@@ -152,10 +143,10 @@ def _repetition(value: ir.Value) -> Repetition | None:
 
 
 def _move(node: ir.Node, index: int, found: Repetition) -> Move | None:
-    """Say what a node does in front of a repetition; None if it cannot be there.
+    """Return a node's inputs and shape in front of a repetition; None if impossible.
 
-    Its other operand is one row, or is repeated along the same axes, or has none of
-    the axes that are repeated.
+    Its other operand must be one row, be repeated along the same axes, or have none of
+    the repeated axes.
     """
     small = static_shape(found.source)
     if not small:
@@ -165,6 +156,7 @@ def _move(node: ir.Node, index: int, found: Repetition) -> Move | None:
     if node.op_type not in BINARY:
         ends = (static_shape(node.outputs[0]) or ())[-1:]
         return Move(tuple(inputs), (*small[:-1], *ends), found)
+    # A single row broadcasts before the repetition as after it
     other = static_shape(node.inputs[1 - index]) if len(inputs) == 2 else None
     if other is None:
         return None
@@ -172,6 +164,7 @@ def _move(node: ir.Node, index: int, found: Repetition) -> Move | None:
         return Move(tuple(inputs), small, found)
     if not found.broadcasts:
         return None
+    # Otherwise both operands must broadcast to less than the result
     again = without_repeats(node.inputs[1 - index])
     if again is not None:
         inputs[1 - index] = again
@@ -184,11 +177,13 @@ def _move(node: ir.Node, index: int, found: Repetition) -> Move | None:
 
 
 def _pays(node: ir.Node, move: Move) -> bool:
-    """Return whether a node's smaller work is worth the repetition of what it gives."""
+    """Return whether the smaller work of a node is worth repeating its result."""
     whole = static_shape(node.outputs[0]) or ()
+    # Bytes that the node no longer reads and writes
     saved = _traffic(node.inputs) - _traffic(move.inputs)
     item = 4.0 if node.outputs[0].dtype is None else node.outputs[0].dtype.itemsize
     saved += (math.prod(whole) - math.prod(move.shape)) * item
+    # Cost of a repetition that other readers still need
     owned, added = True, 0.0
     for moving in move.found.nodes:
         owned = owned and sole_reader(moving.outputs[0]) is not None
@@ -213,6 +208,7 @@ def _traffic(values: Sequence[ir.Value | None]) -> float:
 def _rewrite(node: ir.Node, move: Move, rewriter: Rewriter) -> None:
     old, found = node.outputs[0], move.found
     inputs, attributes = _along_last(node, move, rewriter)
+    # Write the node on the source, then repeat its result
     new = rewriter.write(
         node.op_type, inputs, attributes, move.shape, sources=(node,), like=old
     )
@@ -235,7 +231,7 @@ def _rewrite(node: ir.Node, move: Move, rewriter: Rewriter) -> None:
 def _along_last(
     node: ir.Node, move: Move, rewriter: Rewriter
 ) -> tuple[list[ir.Value | None], list[ir.Attr]]:
-    """Say what a moved node reads: its axis is the last of what has another rank."""
+    """Return a moved node's inputs and attributes, its axis being the last."""
     inputs, attributes = list(move.inputs), dict(node.attributes)
     last = len(move.shape) - 1
     if node.op_type in ALONG_AXIS:

@@ -1,7 +1,6 @@
-"""Operators that only rearrange or repeat rows: the last axis stays whole and in place.
+"""Operators that only rearrange or repeat rows and keep the last axis.
 
-What is done to every row alike may be done before them: ``Tile(x) @ W`` is
-``Tile(x @ W)``.
+Row-wise operators may be computed before them: ``Tile(x) @ W`` is ``Tile(x @ W)``.
 """
 
 import math
@@ -12,7 +11,7 @@ import onnx_ir as ir
 from me2e_compress.graph import array_of, is_standard, rank_of, static_shape
 
 VIEWS = frozenset({"Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"})
-"""Those that move nothing, and that a Reshape can say."""
+"""Those that move nothing and equal a Reshape."""
 
 REPEATS = frozenset({"Concat", "Expand", "Tile"})
 """Those that may repeat axes of size 1."""
@@ -21,7 +20,7 @@ REPEATS = frozenset({"Concat", "Expand", "Tile"})
 def moved_rows(node: ir.Node) -> tuple[ir.Value, ...] | None:
     """Return the inputs whose rows a node rearranges or repeats; None if it does not.
 
-    Sizes must be known, and the last axis of each input that of the output.
+    Sizes must be known, and the last axis of each input must be that of the output.
     """
     rule = _RULES.get(node.op_type)
     if rule is None or not is_standard(node) or not node.inputs:
@@ -41,7 +40,7 @@ def moved_rows(node: ir.Node) -> tuple[ir.Value, ...] | None:
 def broadcasts(node: ir.Node) -> bool:
     """Return whether a node repeats only axes of size 1, as an Add does by itself.
 
-    So does a Concat of the same value, again and again: ``torch.stack([x] * 6)``.
+    A Concat of the same value does so too: ``torch.stack([x] * 6)``.
     """
     if not is_standard(node) or node.op_type not in REPEATS:
         return False
@@ -55,7 +54,7 @@ def broadcasts(node: ir.Node) -> bool:
 
 
 def without_repeats(value: ir.Value | None) -> ir.Value | None:
-    """Return what a value repeats along axes of size 1; None if it does not."""
+    """Return the value before a repetition along axes of size 1, if there is one."""
     node = None if value is None else value.producer()
     return node.inputs[0] if node is not None and broadcasts(node) else None
 

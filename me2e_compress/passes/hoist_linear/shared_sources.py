@@ -1,11 +1,11 @@
-"""Linear layers that read the same rows, as one layer whose columns are split.
+"""Merge linear layers that read the same rows into one layer and a Split.
 
-Fewer nodes, but the same multiply-accumulates, and what comes out is copied. On
+Fewer nodes, but the same multiply-accumulates and a copy of the result. On
 onnxruntime's CPU (1.31, two cores of an AMD Zen 5, ``python -m
-benchmarks.bench_hoisting``) queries, keys and values of 20 rows of 64 take 0.8 to 0.9
-of the time of three products, of 150 rows the same, of 300 x 256 1.0 to 1.1, of
-2,000 x 256 at least 1.2; sampling offsets and weights of 10,000 rows 1.1. In int8 all
-columns would share one range besides.
+benchmarks.bench_hoisting``), relative to three products of queries, keys and values:
+0.8 to 0.9 for 20 rows of 64, 1.0 for 150 rows, 1.0 to 1.1 for 300 x 256, at least 1.2
+for 2,000 x 256; sampling offsets and weights of 10,000 rows take 1.1. In int8 all
+columns would share one range.
 """
 
 import itertools
@@ -19,11 +19,11 @@ from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.rewrite import fresh_name, inherit, sole_reader
 
 SPLIT_INPUT_OPSET = 13
-"""Since then the sizes of a Split are an input."""
+"""The opset from which the sizes of a Split are an input."""
 
 
 def merge_layers(rewriter: Rewriter, opset: int) -> int:
-    """Merge the layers of one module that read the same value; count them."""
+    """Merge the layers of one module that read the same value, and count them."""
     groups: dict[tuple[int, str], list[LinearLayer]] = {}
     for node in rewriter.graph:
         layer = layer_at(node)
@@ -40,6 +40,7 @@ def _merge(group: list[LinearLayer], rewriter: Rewriter, opset: int) -> None:
     first = group[0].product.outputs[0]
     assert first.dtype is not None
     lead, kind = (static_shape(first) or ())[:-1], first.dtype.numpy()
+    # One product with the concatenated matrices
     sources = tuple(itertools.chain(*(layer.nodes for layer in group)))
     matrices = [layer.matrix() for layer in group]
     widths = [matrix.shape[1] for matrix in matrices]
@@ -49,6 +50,7 @@ def _merge(group: list[LinearLayer], rewriter: Rewriter, opset: int) -> None:
     value = rewriter.write(
         "MatMul", [group[0].source, weight], [], shape, sources=sources, like=first
     )
+    # One sum with the concatenated biases
     biases = [layer.bias() for layer in group]
     if any(bias is not None for bias in biases):
         parts = [
@@ -59,6 +61,7 @@ def _merge(group: list[LinearLayer], rewriter: Rewriter, opset: int) -> None:
         value = rewriter.write(
             "Add", [value, vector], [], shape, sources=sources, like=first
         )
+    # Split the columns again
     split = _split(value, widths, first, rewriter, opset)
     inherit(split, sources, by=rewriter.by)
     for layer, column in zip(group, split.outputs, strict=True):
@@ -70,7 +73,6 @@ def _merge(group: list[LinearLayer], rewriter: Rewriter, opset: int) -> None:
 def _split(
     value: ir.Value, widths: list[int], first: ir.Value, rewriter: Rewriter, opset: int
 ) -> ir.Node:
-    """Write a Split of the last axis before the node that makes the first value."""
     place = first.producer()
     assert place is not None
     name = fresh_name(f"{place.name}_Split", rewriter.names)

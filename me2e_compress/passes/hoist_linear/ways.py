@@ -17,14 +17,14 @@ class Direct:
 
 @dataclasses.dataclass(frozen=True)
 class Precomputed:
-    """Multiply a constant once and for all."""
+    """Multiply a constant in advance."""
 
     value: ir.Value
 
 
 @dataclasses.dataclass(frozen=True)
 class Moved:
-    """Multiply what a node rearranges or repeats, then do that to the product."""
+    """Multiply the inputs of a node that moves rows, then move the product."""
 
     node: ir.Node
     parts: tuple["Way", ...]
@@ -32,7 +32,7 @@ class Moved:
 
 @dataclasses.dataclass(frozen=True)
 class Composed:
-    """Multiply what a linear layer reads by the product of both matrices."""
+    """Multiply the source of a linear layer by the product of both matrices."""
 
     layer: LinearLayer
     way: "Way"
@@ -40,13 +40,7 @@ class Composed:
 
 @dataclasses.dataclass(frozen=True)
 class Term:
-    """One term of a sum of products.
-
-    Attributes:
-        way: how it is computed.
-        shape: of the value that it multiplies.
-        rows: which rows of the matrix it is multiplied by; None for all.
-    """
+    """One term of a sum of products; ``rows`` of the matrix are None for all."""
 
     way: "Way"
     shape: tuple[int, ...]
@@ -55,7 +49,7 @@ class Term:
 
 @dataclasses.dataclass(frozen=True)
 class Distributed:
-    """Add up (or subtract) products: of an Add, a Sub, or a Concat of columns."""
+    """Add (or subtract) the products of an Add, a Sub, or a Concat of columns."""
 
     node: ir.Node
     terms: tuple[Term, ...]
@@ -65,7 +59,7 @@ Way: TypeAlias = Direct | Precomputed | Moved | Composed | Distributed
 
 
 def uses_weight(way: Way) -> bool:
-    """Return whether some part of a way multiplies by the weight as it is."""
+    """Return whether some part of a way multiplies by the unchanged weight."""
     if isinstance(way, Moved):
         return any(map(uses_weight, way.parts))
     if isinstance(way, Distributed):

@@ -1,4 +1,4 @@
-"""Make a graph from anywhere one that the other passes can work on."""
+"""Bring a graph of any origin into the form that the other passes expect."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -28,21 +28,22 @@ _FUNCTIONS_SINCE_IR = 8
 
 @dataclasses.dataclass(frozen=True)
 class ImportNormalize(Pass):
-    """Give every node a name and an origin, and write four things in one way only.
+    """Give every node a name and an origin, and normalize the graph.
 
-    1. Nodes without a name, or with one that is taken, get one.
-    2. Every node is told its module and its origin, before anything renames it.
-    3. Plugin nodes of the default domain move to ``me2e.plugin``; the domain that
-       they had stays in their metadata, for the way back to TensorRT.
-    4. float64 that leaked into a graph of float32 becomes float32.
+    1. Nodes without a name, or with a name that is taken, get one.
+    2. Every node gets its module and its origin before anything renames it.
+    3. Plugin nodes of the default domain move to ``me2e.plugin``; their metadata keep
+       the old domain for the way back to TensorRT.
+    4. float64 that leaked into a float32 graph becomes float32.
     5. Constant nodes become initializers.
-    6. A model with functions declares at least IR version 8, and every domain in use
-       is imported.
+    6. A model with functions declares at least IR version 8, and all used domains are
+       imported.
 
-    Subgraphs and function bodies are covered. Unknown operators are carried through.
+    Subgraphs and function bodies are included. Unknown operators are left alone.
 
     Given:
         n = RotateTRT(x)  ;  c = Constant<double>()  ;  y = Mul(n, c)
+
     Result:
         n = me2e.plugin.RotateTRT(x)  ;  y = Mul(n, c)   with c a float32 initializer
     """
@@ -64,16 +65,16 @@ class ImportNormalize(Pass):
 
 
 def needs_import(model: ir.Model) -> bool:
-    """Return whether nodes lack a past, or plugins of the default domain a domain."""
+    """Return whether nodes lack provenance, or plugins a domain of their own."""
     return bool(provenance.missing(model)) or any(
         _bare_plugins(body, model) for body in _bodies(model)
     )
 
 
 def with_own_domains(model: ir.Model) -> ir.Model:
-    """Return a graph whose plugins have the domain that they came with.
+    """Return a graph whose plugins have their original domains.
 
-    The graph itself where none was moved, else a copy.
+    It is the graph itself if no plugin was moved, else a copy.
     """
     if not any(ORIGINAL_DOMAIN in node.metadata_props for node in nodes_of(model)):
         return model
@@ -88,20 +89,15 @@ def with_own_domains(model: ir.Model) -> ir.Model:
 
 
 def _bodies(model: ir.Model) -> Iterator[ir.Graph | ir.Function]:
-    """Walk the main graph, then the functions; subgraphs are within their nodes."""
     yield model.graph
     yield from model.functions.values()
 
 
 def _name_nodes(model: ir.Model, by: str) -> int:
-    """Name every node of the graph, its subgraphs and its functions; count the new.
-
-    A node keeps its name unless an earlier one bears it. New names are the operator's
-    (or the taken name) with the first number that is free, so they depend on the
-    order of the nodes alone. A node with a past takes the pass's name into it.
-    """
+    """Name nodes without a unique name; new names depend only on the order of nodes."""
     count = 0
     for body in _bodies(model):
+        # Reserve all given names first
         nodes = list(nodes_in(body))
         reserved = {node.name for node in nodes if node.name}
         taken: set[str] = set()
@@ -110,6 +106,7 @@ def _name_nodes(model: ir.Model, by: str) -> int:
             if node.name and node.name not in taken:
                 taken.add(node.name)
                 continue
+            # Take the first free number
             stem = node.name or node.op_type
             number = counters.get(stem, 0)
             while f"{stem}_{number}" in reserved:
@@ -136,12 +133,11 @@ def _stamp(model: ir.Model, context: Context) -> int:
 
 
 def _isolate_plugins(model: ir.Model, by: str) -> int:
-    """Move default-domain nodes that ONNX has no operator for; count them.
+    """Move plugins of the default domain to one of their own, and count them.
 
-    Such nodes come from ``OperatorExportTypes.ONNX_FALLTHROUGH`` (BEVFormer_tensorrt,
-    DL4AGX uniad-trt: ``MultiScaleDeformableAttnTRT``, ``RotateTRT``, ``InverseTRT``)
-    or from a plugin symbolic without a domain (``MSDAPlugin``). A node that calls a
-    function of the model is none of them.
+    They come from ``OperatorExportTypes.ONNX_FALLTHROUGH`` (BEVFormer_tensorrt, DL4AGX
+    uniad-trt: ``MultiScaleDeformableAttnTRT``, ``RotateTRT``, ``InverseTRT``) or from a
+    plugin symbolic without a domain (``MSDAPlugin``).
     """
     count = 0
     for body in _bodies(model):
@@ -157,7 +153,6 @@ def _isolate_plugins(model: ir.Model, by: str) -> int:
 
 
 def _bare_plugins(body: ir.Graph | ir.Function, model: ir.Model) -> list[ir.Node]:
-    """List the plugins of the default domain."""
     return [
         node
         for node in nodes_in(body)

@@ -1,4 +1,4 @@
-"""float64 that leaked into a float32 graph, as exporters do (``torch.linspace``)."""
+"""Remove float64 that leaked into a float32 graph (``torch.linspace`` in exporters)."""
 
 from collections.abc import Iterator
 
@@ -12,20 +12,16 @@ _TYPE_ATTRIBUTES = ("to", "dtype", "output_datatype")
 Bernoulli, Multinomial, SequenceEmpty; the window functions and MelWeightMatrix."""
 
 _BY_WIDTH = ("BitCast",)
-"""Standard operators that mean something else at another width."""
+"""Standard operators whose meaning depends on the width."""
 
 
 def demote(model: ir.Model, by: str) -> tuple[int, str]:
-    """Turn double into float32 everywhere: weights, attributes, value types.
+    """Turn float64 into float32 everywhere: weights, attributes, value types.
 
-    Left alone where the outside wants double: an input or output of the graph, or a
-    value that an unknown operator reads or makes. Finite numbers beyond
-    float32's range become its largest ones, so that a mask of ``-1.8e308`` stays
-    finite.
-
-    Returns:
-        How many places changed, and a sentence for the report if there are doubles
-        that had to stay.
+    Nothing changes where an input or output of the graph is double, or a value of an
+    unknown operator. Finite numbers beyond float32's range become its largest ones, so
+    that a mask of ``-1.8e308`` stays finite. Returns the number of changes, and a
+    sentence for the report if doubles had to stay.
     """
     if not any(True for _ in _doubles(model)):
         return 0, ""

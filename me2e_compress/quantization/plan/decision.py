@@ -33,20 +33,20 @@ class Decision:
 
     Attributes:
         node: its name, which need not be unique.
-        output: name of its first output, which is.
+        output: name of its first output, which is unique.
         op: its operator.
         module: its ME2E module; empty if unknown.
         dtype: ``int8``, ``float``, or ``weight-only``: computed in float, its weight
             stored as int8.
         rule: id of the rule that decided; for int8 ``layer``, ``attention``,
-            ``sampled`` or ``residual``; ``override`` where the user did.
+            ``sampled`` or ``residual``; ``override`` if the user did.
         reason: the same in words.
-        shapes: of the first two inputs and the first output; None where open.
+        shapes: shapes of the first two inputs and the first output; None if open.
         activations: which inputs get an activation scale. Of an Add it is one, the
             residual branch: the other comes out of a convolution that it is fused with.
-        weight: which input is stored as int8; None where none is.
-        axis: of the weight's per-channel scales; None for one scale in all, as
-            a batch of matrices has.
+        weight: which input is stored as int8; None if none is.
+        axis: axis of the weight's per-channel scales; None for one scale in all, as a
+            batch of matrices has.
         borderline: what was close about it; empty if nothing was.
     """
 
@@ -75,8 +75,8 @@ class ScaleGroup:
 
     Attributes:
         kind: ``shared-input``: several nodes read one tensor, through one pair;
-            ``concat``: what a Concat joins and what it gives are on one scale.
-        name: of the tensor, or of the Concat.
+            ``concat``: the inputs and the result of a Concat are on one scale.
+        name: name of the tensor, or of the Concat.
         tensors: the activations on one scale.
         nodes: names of the nodes that read them in int8.
     """
@@ -89,12 +89,9 @@ class ScaleGroup:
 
 @dataclasses.dataclass(frozen=True)
 class KeptFloat:
-    """A node that a plan makes int8, and one target does not.
+    """A node that is int8 in a plan but float on one target.
 
-    Attributes:
-        node: its name.
-        output: name of its first output.
-        reason: what the target lacks.
+    ``output`` is the name of its first output, ``reason`` what the target lacks.
     """
 
     node: str
@@ -108,11 +105,11 @@ class QuantPlan(Displayed):
 
     Attributes:
         scheme: the modules that are to be int8.
-        decisions: one a node.
+        decisions: one per node.
         rules: name of the rule set.
         groups: what was decided together.
-        kept_float: which of its int8 nodes stay float on the target for which it was
-            carried out; none where it was not.
+        kept_float: int8 nodes that stay float on the target for which the plan was
+            carried out; empty before that.
     """
 
     scheme: QuantScheme
@@ -133,7 +130,7 @@ class QuantPlan(Displayed):
 
     @property
     def placed(self) -> tuple[Decision, ...]:
-        """Those of them that are int8 in the graph for the target."""
+        """Those of the chosen nodes that are int8 in the graph for the target."""
         left = {each.output for each in self.kept_float}
         return tuple(each for each in self.chosen if each.output not in left)
 
@@ -187,7 +184,7 @@ def save_plan(plan: QuantPlan, path: Path) -> None:
 
 
 def load_plan(path: Path) -> QuantPlan:
-    """Read what :func:`save_plan` wrote.
+    """Read the result of :func:`save_plan`.
 
     Raises:
         RecipeError: no such file, or not a plan.
@@ -216,18 +213,12 @@ def plan_of(model: ir.Model) -> QuantPlan | None:
 
 @dataclasses.dataclass(frozen=True)
 class PlanDifference:
-    """One node that two plans decide differently.
-
-    Attributes:
-        old: its decision in the first plan; None if that has no such node.
-        new: in the second.
-    """
+    """One node that two plans decide differently; None in a plan without it."""
 
     old: Decision | None
     new: Decision | None
 
     def __str__(self) -> str:
-        """Return both decisions on one line."""
         either = self.new or self.old
         name = "" if either is None else either.node or either.output
         return f"{name}: {_short(self.old)} -> {_short(self.new)}"

@@ -1,4 +1,4 @@
-"""Scales that are decided together."""
+"""Find tensors whose scales are decided together."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ SHARED, CONCAT = "shared-input", "concat"
 def find_groups(
     graph: ir.Graph, decided: Mapping[ir.Node, Decision], pins: Pins, *, concat: bool
 ) -> tuple[ScaleGroup, ...]:
-    """List what is decided together.
+    """List the tensors and readers that are decided together.
 
     A tensor that several int8 nodes read has one pair: keeping one of its readers in
     float saves nothing unless the others go too. With ``concat``, a Concat whose result
@@ -59,6 +59,7 @@ def _concats(
         members.setdefault(head, []).extend(moved)
         head_of.update(dict.fromkeys(moved, head))
 
+    # from the last Concat back, so that Concats of Concats join its group
     for node in reversed(graph):
         if node.op_type != "Concat" or node in pins.apart:
             continue
@@ -93,12 +94,10 @@ def share_scales(plan: QuantPlan, ranges: Ranges) -> Ranges:
 
 @dataclasses.dataclass(frozen=True)
 class SharingCost:
-    """Cost of one scale for a group.
+    """The cost of one scale for a group.
 
-    Attributes:
-        group: which.
-        tensor: the one that loses most.
-        loss_db: how much its rounding noise rises; 0 where it had the widest range.
+    ``tensor`` loses most; ``loss_db`` is how much its rounding noise rises, 0 if it had
+    the widest range.
     """
 
     group: ScaleGroup

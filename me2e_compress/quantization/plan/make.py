@@ -47,7 +47,7 @@ def make_plan(
     costs: CostsOf | None = None,
     fused: Objection | None = None,
 ) -> QuantPlan:
-    """Decide for every node; one look at each, so linear in the graph.
+    """Decide for every node, in linear time.
 
     First every node by itself, then what must be decided together: int8 that does not
     pay, residual branches of Adds behind int8 convolutions, and scales that are shared.
@@ -56,7 +56,7 @@ def make_plan(
         model: the float graph: modules stamped on its nodes, shapes inferred.
         scheme: which modules are to be int8.
         rules: asked in order; None for the set ``safe``.
-        overrides: what the user has decided; it beats every rule that is not firm.
+        overrides: the user's decisions; they beat every rule that is not firm.
         costs: estimates what int8 saves and costs on the target, for rules that ask.
         fused: says why a fused operator reads no int8 on the target.
 
@@ -106,6 +106,7 @@ def _decide(
     )
     if node.graph is not main:
         return decision(rule="body", reason="in the body of an If, Loop or Scan")
+    # the first rule that objects decides, unless the user has and it is not firm
     close = _borderline(node, facts, rules)
     pin = pins.of(node)
     for rule in rules:
@@ -113,6 +114,7 @@ def _decide(
         if objection is None or (pin is not None and not rule.firm):
             continue
         return decision(rule=rule.name, reason=objection, borderline=close)
+    # the user's float, else int8
     if pin is not None and pin.dtype == FLOAT:
         return decision(rule="override", reason=pin.reason, borderline=close)
     rule_id, reason, layout = _int8(node, facts)
@@ -174,7 +176,7 @@ def _borderline(node: ir.Node, facts: RuleFacts, rules: Sequence[Rule]) -> str:
 
 
 def _scale_axis(node: ir.Node) -> int | None:
-    """Return the axis of a weight's scales; None where it has one scale in all.
+    """Return the axis of a weight's scales; None if it has one scale in all.
 
     Kernels apply the scales of output channels to the result of one product: that of a
     MatMul by a batch of matrices, or by a vector, has no such channels.
@@ -193,9 +195,7 @@ def _residuals(
     if its other branch is int8: that branch, and only that, gets a pair. Where both
     branches end in a convolution, the longer path is the one that is fused and the
     shorter the residual (a down-sampling projection), as NVIDIA's quantizer decides.
-
-    Returns:
-        New decisions for those Adds. The others stay what they are.
+    Returns new decisions for those Adds alone.
     """
     depth = _depths(graph)
     found: dict[ir.Node, Decision] = {}

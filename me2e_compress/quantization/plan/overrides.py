@@ -40,7 +40,7 @@ class _Strict(pydantic.BaseModel):
 
 
 class Override(_Strict):
-    """One exception: which nodes, and what becomes of them."""
+    """One exception: which nodes, and their dtype."""
 
     dtype: str
     nodes: str | None = None
@@ -60,9 +60,7 @@ class Override(_Strict):
     def matches(self, node: ir.Node, names: Sequence[str] | None = None) -> bool:
         """Return whether it applies to a node.
 
-        Args:
-            node: of a graph.
-            names: its own and its origins'; None looks them up.
+        ``names`` are the node's own and its origins'; None looks them up.
         """
         return (
             (self.op is None or node.op_type == self.op)
@@ -72,7 +70,6 @@ class Override(_Strict):
         )
 
     def __str__(self) -> str:
-        """Return the patterns that it matches by."""
         return ", ".join(f"{key} {value!r}" for key, value in self._given().items())
 
     def _given(self) -> dict[str, str]:
@@ -121,7 +118,7 @@ class Overrides(_Strict):
 
     @classmethod
     def parse(cls, text: str | bytes, origin: str = "overrides") -> Self:
-        """Read TOML; ``origin`` is what an error message calls it."""
+        """Read TOML; ``origin`` is its name in error messages."""
         try:
             return cls.model_validate(documents.from_toml(text))
         except documents.MalformedError as error:
@@ -135,7 +132,7 @@ class Overrides(_Strict):
         """Find the nodes of a graph that they apply to.
 
         Raises:
-            RecipeError: one matches nothing.
+            RecipeError: an override matches nothing.
         """
         main = {node: _names(node) for node in model.graph}
         pinned: dict[ir.Node, Override] = {}
@@ -159,9 +156,7 @@ NONE = Overrides()
 class Pins:
     """Overrides bound to the nodes of one graph.
 
-    Args:
-        pinned: the override of each node that has one.
-        apart: Concats whose inputs keep scales of their own.
+    ``apart`` holds the Concats whose inputs keep scales of their own.
     """
 
     def __init__(
@@ -171,7 +166,7 @@ class Pins:
         self.apart = apart
 
     def of(self, node: ir.Node) -> Pin | None:
-        """Return what the user decided for a node; None for nothing."""
+        """Return the user's decision for a node, if any."""
         found = self._pinned.get(node)
         if found is None:
             return None
@@ -180,8 +175,7 @@ class Pins:
     def check(self, decided: Mapping[ir.Node, Decision]) -> None:
         """Refuse overrides to int8 that no node could follow.
 
-        Raises:
-            RecipeError: names the override and why its first node cannot be int8.
+        The RecipeError names the override and why its first node cannot be int8.
         """
         refused: dict[Override, Decision] = {}
         followed: dict[Override, None] = {}

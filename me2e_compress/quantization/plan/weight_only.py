@@ -26,12 +26,12 @@ WORTH = 0.02
 def with_weight_only(plan: QuantPlan, model: ir.Model) -> QuantPlan:
     """Decide that the weights of matrix-vector products become int8, and only they.
 
-    Such a product reads every weight once, so that its time and its file are those of
-    the weight; quantizing its one row would gain nothing. Products that other rules
-    keep in float, weights that float layers read too and small ones stay as they are.
+    Such a product reads every weight once, so its time and file size are those of the
+    weight; quantizing its one row would gain nothing. Products that other rules keep in
+    float, weights that float layers read too and small ones stay as they are.
 
     Args:
-        plan: of the graph.
+        plan: the graph's plan.
         model: the float graph that was planned.
     """
     found = {each.output: each for each, _ in _candidates(plan, model)}
@@ -44,8 +44,7 @@ def with_weight_only(plan: QuantPlan, model: ir.Model) -> QuantPlan:
 def savable_bytes(plan: QuantPlan, model: ir.Model) -> tuple[int, int]:
     """Count the weights that could become int8 alone, and the bytes that this saves.
 
-    Returns:
-        Two zeros where that is less than a fiftieth of all weights.
+    Both are zero if that is less than a fiftieth of all weights.
     """
     weights = {weight: None for _, weight in _candidates(plan, model)}
     saved = sum(_bytes(weight) * 3 // 4 for weight in weights)
@@ -56,9 +55,10 @@ def savable_bytes(plan: QuantPlan, model: ir.Model) -> tuple[int, int]:
 def _candidates(
     plan: QuantPlan, model: ir.Model
 ) -> Iterator[tuple[Decision, ir.Value]]:
-    """Yield what the decisions would be, each with its weight."""
+    """Yield the possible decisions, each with its weight."""
     nodes = {str(node.outputs[0].name): node for node in model.graph}
     constants = constant_values(model)
+    # matrix-vector products that no other rule keeps in float
     vectors = {
         nodes[each.output]: each
         for each in plan.decisions

@@ -1,4 +1,4 @@
-"""What a rule is, what it may know, and what a set of rules is."""
+"""The interfaces of rules and rule sets, and the facts that rules may use."""
 
 import abc
 import dataclasses
@@ -26,18 +26,15 @@ Objection: TypeAlias = Callable[[ir.Node], str | None]
 
 
 class RuleFacts:
-    """What rules may know besides the node; each fact is found when first asked for.
+    """Facts about a graph for rules; each is computed when first asked for.
 
     Args:
         model: the graph, shapes inferred, in topological order.
         modules: which are to be int8.
-        costs: estimates what int8 saves and costs on the target; None where no target
-            is known, or it says nothing of costs.
-        fused: why fused operators read no int8 on the target; None where no target is
+        costs: estimates what int8 saves and costs on the target; None if no target is
+            known, or it says nothing of costs.
+        fused: why fused operators read no int8 on the target; None if no target is
             known.
-
-    Attributes:
-        model, modules, costs, fused: as given.
     """
 
     def __init__(
@@ -88,7 +85,7 @@ class Rule(abc.ABC):
     """Keeps some nodes in float: derive a frozen dataclass, its fields are options.
 
     Class attributes:
-        name: what plans, reports and recipes call it.
+        name: the rule's name in plans, reports and recipes.
         firm: True where the node cannot be int8 at all, so that no override lifts it.
     """
 
@@ -104,17 +101,12 @@ class Rule(abc.ABC):
     ) -> Mapping[ir.Node, str]:
         """Return why some nodes stay in float, now that all others are decided.
 
-        Args:
-            int8: the nodes that no rule objects to, in graph order.
-            facts: as before.
+        ``int8`` are the nodes that no rule objects to, in graph order.
         """
         return {}
 
     def borderline(self, node: ir.Node, facts: RuleFacts) -> str | None:
-        """Return what is close about a node, for a reader to look at; None if nothing.
-
-        It may have decided for either side.
-        """
+        """Return what is close about a node, if anything, on either side."""
         return None
 
     def __str__(self) -> str:
@@ -151,9 +143,9 @@ class RuleSet(abc.ABC):
     """Rules that are asked together: derive a frozen dataclass, its fields are options.
 
     Class attributes:
-        name: what plans and recipes call it.
-        share_concat: whether what a Concat joins is put on one scale with what it
-            gives, so that it moves int8 without requantizing.
+        name: the set's name in plans and recipes.
+        share_concat: whether the inputs of a Concat are put on one scale with its
+            result, so that it moves int8 without requantizing.
 
     Attributes:
         without: names of rules that are switched off.

@@ -1,4 +1,4 @@
-"""Rules of int8 kernels: what they are too coarse for.
+"""Rules of int8 kernels: which layers are too small for them.
 
 Bounds are those of NVIDIA's own quantizer (ModelOpt 0.47,
 ``modelopt/onnx/quantization/graph_utils.py``): int8 tensor cores work on tiles of 16
@@ -21,7 +21,7 @@ class SmallProduct(Rule):
     """A product whose inner or outer dimension is below one tile stays float.
 
     Attributes:
-        minimum: of both dimensions, in elements.
+        minimum: smallest inner and outer dimension, in elements.
     """
 
     minimum: int = 16

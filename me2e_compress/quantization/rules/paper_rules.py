@@ -1,4 +1,4 @@
-"""The rule set of the paper: what is a layer at all, of which module, two stages."""
+"""The rule set of the paper: operators, modules and the two stages."""
 
 import dataclasses
 from typing import ClassVar
@@ -133,8 +133,8 @@ class AttentionLength(Rule):
     def borderline(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Return what is close about a node: a reader may want to decide it otherwise.
 
-        Within an eighth of the limit; or only one of queries and keys is beyond it, so
-        that tools which look at one of the two decide otherwise.
+        Close is within an eighth of the limit; or only one of queries and keys beyond
+        it, so that tools which look at one of the two decide otherwise.
         """
         attention = facts.attention.get(node)
         if attention is None or attention.queries is None or attention.keys is None:

@@ -80,14 +80,14 @@ class AttentionWeights(Rule):
 
 @dataclasses.dataclass(frozen=True)
 class SafeRules(PaperRules):
-    """The paper's, the limits of kernels, and in float what a model drives by.
+    """The paper's rules and the limits of kernels; what a model drives by stays float.
 
     Geometry, positions, attention weights and ego status stay float; the default of
     every target.
 
     Attributes:
-        attention_limit: longest attention that the paper's stage 1 would make int8,
-            in tokens; without ``attention-weights`` it counts.
+        attention_limit: longest attention that the paper's stage 1 would make int8, in
+            tokens; without ``attention-weights`` it counts.
         without: names of rules that are switched off, e.g. ``gemv``.
         extra: more rules, asked last.
     """
@@ -96,7 +96,7 @@ class SafeRules(PaperRules):
     share_concat: ClassVar[bool] = True
 
     def own_rules(self) -> tuple[Rule, ...]:
-        """Return what is no layer, what a model drives by, stages, kernels, cost."""
+        """Return rules of operators, safety, the paper's stages, kernels and cost."""
         operator, _, module, weight, length, vector = super().own_rules()
         return (
             *(operator, module, weight),

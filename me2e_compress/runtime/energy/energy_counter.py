@@ -1,6 +1,6 @@
-"""Counters of energy: what a device can be asked, and what its answer is.
+"""Energy counters of devices, and the registry of them.
 
-To add one: write its class and its reader, then add it to this table.
+To add one, write its class and its reader, then add it to this table.
 """
 
 import abc
@@ -22,7 +22,7 @@ __all__ = [
 ]
 
 AUTO = "auto"
-"""Asks every counter of this machine in turn."""
+"""Tries every counter of this machine in turn."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class EnergyCounter(abc.ABC):
     """A kind of counter; its fields are its options.
 
     Class attributes:
-        name: What the command line calls it.
-        automatic: True if ``auto`` may ask it.
+        name: its name on the command line.
+        automatic: whether ``auto`` may try it.
     """
 
     name: ClassVar[str]
@@ -39,10 +39,10 @@ class EnergyCounter(abc.ABC):
 
     @abc.abstractmethod
     def open(self) -> Reader | EnergyRecording | Absent:
-        """Ask it for what is wanted of it, not for its neighbours, and open it.
+        """Open the counter and check that it can be read.
 
         Raises:
-            EnergyError: A file that it is to be read from is not usable.
+            EnergyError: a file that it reads is not usable.
         """
 
 
@@ -62,19 +62,17 @@ ENERGY_COUNTERS: Registry[EnergyCounter] = Registry(
 
 
 def open_counter(text: str = AUTO) -> Reader | EnergyRecording | Absent:
-    """Open the counter of a text, e.g. ``rapl`` or ``recorded:FILE``.
+    """Open a counter by its text, e.g. ``rapl`` or ``recorded:FILE``.
 
     Args:
-        text: ``auto`` asks the counters of this machine in turn and opens the first
-            that answers; else a name and options, see :data:`ENERGY_COUNTERS`.
+        text: ``auto`` opens the first counter of this machine that answers; otherwise a
+            name and options, see :data:`ENERGY_COUNTERS`.
 
     Returns:
-        The open counter; or why there is none, with every one that was asked and what
-        it answered.
+        The open counter, or an :class:`Absent` with the answer of each counter tried.
 
     Raises:
-        EnergyError: No such counter, an option that it has not, or a file that is not
-            usable.
+        EnergyError: no such counter, an unknown option, or a file that is not usable.
     """
     if text.strip() != AUTO:
         if name_in(text) not in ENERGY_COUNTERS.names():
@@ -86,11 +84,12 @@ def open_counter(text: str = AUTO) -> Reader | EnergyRecording | Absent:
 
 
 def check_counter(text: str) -> None:
-    """Open a counter and leave it: what it is named by is right, be it there or not.
+    """Check that a counter's text is valid by opening and closing it.
+
+    A counter that is absent on this machine passes.
 
     Raises:
-        EnergyError: No such counter, an option that it has not, or a file that is not
-            usable.
+        EnergyError: no such counter, an unknown option, or a file that is not usable.
     """
     found = open_counter(text)
     if isinstance(found, Reader):

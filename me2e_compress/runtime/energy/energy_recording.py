@@ -1,4 +1,4 @@
-"""Energy or power over time beside the frames that were done, and windows cut of it."""
+"""A recording of energy over time with the frames done, and windows cut from it."""
 
 from dataclasses import dataclass
 
@@ -18,13 +18,8 @@ Floats = npt.NDArray[np.float64]
 class EnergyRecording:
     """What a device counted while one model ran on it.
 
-    Attributes:
-        times_s: Ascending, seconds.
-        joules: Since some moment, one a time.
-        frames: Inferences done, one a time; where it stands, the device is idle.
-        device: Its name.
-        scope: What was counted.
-        counter: What counted.
+    ``times_s`` ascends; ``joules`` counts from an arbitrary start; ``frames`` is the
+    number of inferences done so far: where it is constant, the device is idle.
     """
 
     times_s: Floats
@@ -35,26 +30,24 @@ class EnergyRecording:
     counter: str
 
     def measured(self, schedule: EnergySchedule) -> EnergyResult:
-        """Return the energy of the model that ran.
-
-        Raises:
-            EnergyError: The recording is too short, or its counter stands still.
-        """
+        """Return the energy of the model; EnergyError if the recording is too short."""
         by = CountedBy(self.counter, self.device, self.scope, self.step_s())
         return summarise(self.windows(schedule), by, self.idle_w(schedule))
 
     def windows(self, schedule: EnergySchedule) -> list[Window]:
-        """Cut windows out of the work, after the warm-up, one behind the other.
+        """Cut consecutive windows from the work after the warm-up.
 
         Raises:
-            EnergyError: The recording is too short, or its counter stands still.
+            EnergyError: the recording is too short, or its counter does not move.
         """
+        # Find the stretch in which frames are done, and skip the warm-up.
         working = np.flatnonzero(np.diff(self.frames) > 0)
         if not len(working):
             raise EnergyError("energy recording: no frame is done in it")
         first, last = int(working[0]), int(working[-1]) + 1
         start = self.times_s[first] + schedule.warm_up_s
         at = int(np.searchsorted(self.times_s, start))
+        # Cut windows until the rest is too short for another one.
         found = list[Window]()
         while at < last:
             end = self._end(at, last, schedule)
@@ -71,7 +64,7 @@ class EnergyRecording:
         return found
 
     def idle_w(self, schedule: EnergySchedule) -> float | None:
-        """Return the watts before and behind the work; None where that is too short."""
+        """Return the mean watts before and after the work; None if both are short."""
         working = np.flatnonzero(np.diff(self.frames) > 0)
         ends = ((0, int(working[0])), (int(working[-1]) + 1, len(self.times_s) - 1))
         idle = [
@@ -82,11 +75,11 @@ class EnergyRecording:
         return sum(each.watts for each in idle) / len(idle) if idle else None
 
     def step_s(self) -> float:
-        """Return the seconds from one row to the next: the median."""
+        """Return the median seconds between rows."""
         return float(np.median(np.diff(self.times_s)))
 
     def _end(self, at: int, last: int, schedule: EnergySchedule) -> int | None:
-        """Return the row that ends the window which begins at one; None: too late."""
+        """Return the last row of the window that begins at ``at``; None: too late."""
         long = int(np.searchsorted(self.times_s, self.times_s[at] + schedule.window_s))
         many = self.frames[at] + schedule.window_frames
         end = max(long, int(np.searchsorted(self.frames, many)))

@@ -1,4 +1,4 @@
-"""Joules of a model as they were measured on one machine, or why they were not."""
+"""The measured energy of a model on one machine, or the reason why there is none."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -17,41 +17,41 @@ NotNegative: TypeAlias = Annotated[float, Field(allow_inf_nan=False, ge=0)]
 Positive: TypeAlias = Annotated[float, Field(allow_inf_nan=False, gt=0)]
 
 FURTHEST_APART = 0.1
-"""Share by which a counter and the integrated power may differ unremarked: known cases
-are 187 J beside 327 J (Zeus, issue 181)."""
+"""Relative difference between counter and integrated power that is tolerated; a known
+bad case is 187 J beside 327 J (Zeus, issue 181)."""
 
 
 @dataclass(frozen=True, repr=False)
 class EnergyResult(Displayed):
-    """Energy per frame over windows of a counter; None is not measured.
+    """Energy per frame over windows of a counter; None means not measured.
 
-    One frame at a time, back to back: MLPerf's SingleStream, energy per sample.
+    Frames run one at a time, back to back, as in MLPerf's SingleStream.
 
     Attributes:
-        joules: Of all windows together, idle power included.
-        frames: Inferences in all windows.
-        j_per_frame: Joules a frame, gross: idle power included.
-        net_j_per_frame: The same without what the idle device takes in that time;
-            below zero where noise is all there is.
-        low: Lower end of the 95 % interval of ``j_per_frame``: of what repeating on
-            this device and counter moves. What the counter itself is off by is not
-            in it.
-        high: Upper end.
-        windows: How many.
-        window_s: Seconds of one, on average.
-        counter: What counted: ``nvml-total``, ``rapl``, ``ina3221``, ...
-        counter_step_s: Seconds from one value of the counter to the next.
-        idle_w: Watts of the idle device, the model loaded: mean of before and after.
-        temperature: Degrees Celsius before the first window and after the last.
-        clocks: MHz by clock, lowest and highest seen.
-        throttled: Reasons for which the device slowed itself down in a window.
-        device: Its name.
-        scope: What the counter covers: a board, packages, rails.
-        reason: Why nothing was measured; empty if it was.
-        model_sha256: Of the model that ran; None: not known.
-        window_j_per_frame: Joules a frame, window by window.
-        power_j_per_frame: Joules a frame by integrated power, beside the counter.
-        warnings: What puts the figure in doubt.
+        joules: energy of all windows together, idle power included.
+        frames: inferences in all windows.
+        j_per_frame: joules per frame, gross: idle power included.
+        net_j_per_frame: joules per frame without idle power; noise may make it
+            negative.
+        low: lower end of the 95 % interval of ``j_per_frame``. It covers repetition on
+            this device and counter, not the error of the counter itself.
+        high: upper end of that interval.
+        windows: number of windows.
+        window_s: mean seconds of a window.
+        counter: name of the counter: ``nvml-total``, ``rapl``, ``ina3221``, ...
+        counter_step_s: seconds between updates of the counter.
+        idle_w: watts of the idle device with the model loaded: mean of before and
+            after.
+        temperature: degrees Celsius before the first window and after the last.
+        clocks: lowest and highest MHz of each clock.
+        throttled: reasons for which the device throttled itself in a window.
+        device: name of the device.
+        scope: what the counter covers: a board, packages, rails.
+        reason: why nothing was measured; empty if it was.
+        model_sha256: digest of the model that ran; None if unknown.
+        window_j_per_frame: joules per frame of each window.
+        power_j_per_frame: joules per frame by integrated power, beside the counter.
+        warnings: reasons to doubt the figure.
     """
 
     joules: NotNegative | None = None
@@ -77,11 +77,7 @@ class EnergyResult(Displayed):
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that there is either a figure with its interval, or a reason.
-
-        Raises:
-            ValueError: there is neither, or the interval does not hold the figure.
-        """
+        """Check that there is either a figure with its interval, or a reason."""
         if self.j_per_frame is None:
             if not self.reason or self.joules is not None:
                 raise ValueError("neither joules a frame nor a reason why not")
@@ -95,7 +91,7 @@ class EnergyResult(Displayed):
 
     @property
     def headline(self) -> str:
-        """Joules a frame with their interval, or why there are none."""
+        """The joules per frame with their interval, or why there are none."""
         if self.j_per_frame is None:
             return f"energy: not measured: {self.reason}"
         return (
@@ -105,15 +101,16 @@ class EnergyResult(Displayed):
 
     @property
     def power_apart(self) -> float | None:
-        """Share by which integrated power differs from the counter."""
+        """The relative difference of integrated power from the counter."""
         if self.j_per_frame is None or self.power_j_per_frame is None:
             return None
         return self.power_j_per_frame / self.j_per_frame - 1
 
     def alerts(self) -> tuple[str, ...]:
-        """Return what puts the figure in doubt."""
+        """Return reasons to doubt the figure."""
         slowed = ", ".join(self.throttled)
         throttled = (f"energy: the device slowed itself down: {slowed}",)
+        # A counter that disagrees with integrated power is suspect.
         apart = self.power_apart
         found = self.warnings + (throttled if slowed else ())
         if apart is None or abs(apart) <= FURTHEST_APART:
@@ -125,7 +122,7 @@ class EnergyResult(Displayed):
         return (*found, line)
 
     def tables(self) -> tuple[Table, ...]:
-        """Return the figures; none where nothing was measured."""
+        """Return the table of figures; empty if nothing was measured."""
         if self.j_per_frame is None:
             return ()
         rows = [
@@ -153,14 +150,14 @@ class EnergyResult(Displayed):
         return notes
 
     def to_json(self) -> dict[str, Any]:
-        """Return every attribute under its name."""
+        """Return every attribute by name."""
         return asdict(self)
 
     def save(self, path: Path) -> None:
-        """Write it atomically.
+        """Write the result atomically.
 
         Raises:
-            EnergyError: The file cannot be written.
+            EnergyError: the file cannot be written.
         """
         try:
             write_json(path, self.to_json(), indent=2)
@@ -169,10 +166,10 @@ class EnergyResult(Displayed):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what :meth:`save` wrote; keys that are not known are left out.
+        """Read what :meth:`save` wrote; unknown keys are ignored.
 
         Raises:
-            EnergyError: No such file, or not of this form.
+            EnergyError: no such file, or not of this form.
         """
         with documents.reading(path, EnergyError, "not an energy file"):
             record = documents.from_json(documents.content(path))

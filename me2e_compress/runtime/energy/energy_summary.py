@@ -1,4 +1,4 @@
-"""From windows of a counter to the result that is written."""
+"""Summarize the windows of a counter as an energy result."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,14 +12,7 @@ from me2e_compress.runtime.energy.reader import DeviceState
 
 @dataclass(frozen=True)
 class CountedBy:
-    """What counted, in words.
-
-    Attributes:
-        counter: ``nvml-total``, ``rapl``, ...
-        device: Its name.
-        scope: What is counted.
-        step_s: From one value to the next.
-    """
+    """Description of the counter, copied into the result."""
 
     counter: str
     device: str
@@ -36,18 +29,13 @@ def summarise(
     power_j_per_frame: float | None = None,
     warnings: tuple[str, ...] = (),
 ) -> EnergyResult:
-    """Return the result of one model.
+    """Return the energy result of one model.
 
-    Args:
-        windows: Of its frames.
-        by: What counted.
-        idle_w: Watts of the idle device; None: not measured.
-        states: Of the device, before and after each window.
-        power_j_per_frame: By integrated power, beside the counter.
-        warnings: What puts the figure in doubt.
+    ``idle_w`` is None where the idle device was not measured; ``states`` are those
+    before and after each window.
 
     Raises:
-        EnergyError: Too few windows.
+        EnergyError: there are too few windows.
     """
     found = estimate(windows, by.step_s, idle_w)
     frames = sum(each.frames for each in windows)
@@ -80,7 +68,7 @@ def summarise(
 
 
 def _clocks(states: Sequence[DeviceState]) -> dict[str, tuple[float, float]]:
-    """Return the lowest and the highest of each clock, MHz."""
+    """Return the lowest and highest MHz of each clock."""
     seen: dict[str, list[float]] = {}
     for state in states:
         for name, mhz in state.clocks_mhz.items():

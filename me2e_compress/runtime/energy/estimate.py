@@ -1,4 +1,4 @@
-"""Joules a frame from windows of a counter, with an interval that holds them."""
+"""Estimate joules per frame, with a confidence interval, from windows of a counter."""
 
 import math
 from collections.abc import Sequence
@@ -10,15 +10,15 @@ from me2e_compress.errors import EnergyError
 
 FEWEST_WINDOWS = 5
 ENOUGH_FOR_A_BEND = 8
-"""Windows from which a drift may be bent: a chip that settles warms up ever slower."""
+"""Windows from which the drift is fitted by a parabola: warming up slows down."""
 HARMONICS = 12
-"""Of the counter's rate that are looked at for a beat with the frames."""
+"""Harmonics of the counter's rate that are checked for a beat with the frames."""
 SENSED = 0.25
-"""Share of a step in which the counter looks at the power: 25 ms of 100 ms on A100 and
+"""Share of a step in which the counter samples the power: 25 ms of 100 ms on A100 and
 H100 (Yang, Adamek and Armour, Part-time Power Measurements, SC 2024); other devices
-look longer, and beat less."""
+sample longer and beat less."""
 BEATS = 0.05
-"""Beat from which frames and counter are not independent any more."""
+"""Beat from which frames and counter are no longer independent."""
 
 # Student's t, both sides 95 %, by degrees of freedom (any table of statistics); beyond,
 # it is nearly linear in their inverse.
@@ -31,14 +31,10 @@ _Z = 1.960
 
 @dataclass(frozen=True)
 class Window:
-    """A stretch of frames back to back, between two readings of a counter.
+    """A run of back-to-back frames between two readings of a counter.
 
-    Attributes:
-        begin_s: When the counter was read first, seconds.
-        end_s: When it was read last.
-        frames: Inferences between.
-        joules: What the counter moved.
-        paused_s: Seconds without work between frames, see :func:`detuning`.
+    ``joules`` is the counter's increase; ``paused_s`` the seconds without work between
+    frames, see :func:`detuning`.
     """
 
     begin_s: float
@@ -49,24 +45,18 @@ class Window:
 
     @property
     def taken_s(self) -> float:
-        """Seconds."""
+        """The length of the window in seconds."""
         return self.end_s - self.begin_s
 
     @property
     def watts(self) -> float:
-        """Mean power."""
+        """The mean power."""
         return self.joules / self.taken_s
 
 
 @dataclass(frozen=True)
 class EnergyEstimate:
-    """Joules a frame and their 95 % interval.
-
-    Attributes:
-        j_per_frame: Mean over the windows.
-        low: Lower end, not below 0.
-        high: Upper end.
-    """
+    """Mean joules per frame over the windows, and the 95 % interval."""
 
     j_per_frame: float
     low: float
@@ -76,44 +66,49 @@ class EnergyEstimate:
 def estimate(
     windows: Sequence[Window], step_s: float, idle_w: float | None = None
 ) -> EnergyEstimate:
-    """Return joules a frame over windows of one model, and how well they are known.
+    """Return joules per frame over windows of one model, with the 95 % interval.
 
-    The mean of the windows, and Student's t over what is left of them after a straight
-    line over time: what warms up or drifts is no noise. Windows begin at a random phase
-    of the counter, so that its step, its part-time sensing and its noise are in their
-    spread. Where windows happen to lie closer than the step alone allows, its share
-    stands in for the spread: a window of so many steps and ``r`` seconds holds a step
-    more or less by chance, a standard deviation of power x sqrt(r (step - r)). What the
-    pauses took lies between idle and mean power: the middle is taken off, and half the
-    distance added to the interval, in quadrature.
+    A straight line over time (a parabola from :data:`ENOUGH_FOR_A_BEND` windows) is
+    fitted to the windows, because warm-up and drift are no noise; Student's t applies
+    to the residuals. Windows begin at a random phase of the counter, so that its step,
+    its part-time sensing and its noise show in their spread. If the windows lie closer
+    together than the step alone allows, the error of the step replaces the spread: a
+    window of whole steps and ``r`` more seconds holds one step more or less by chance,
+    a standard deviation of power x sqrt(r (step - r)). Energy in pauses lies between
+    idle and mean power: the middle is subtracted, and half the distance is added to the
+    interval in quadrature.
 
     Args:
-        windows: At least :data:`FEWEST_WINDOWS`, at random phases of the counter, each
+        windows: at least :data:`FEWEST_WINDOWS`, at random phases of the counter, each
             after frames of the same model.
-        step_s: Seconds from one value of the counter to the next.
-        idle_w: Watts of the idle device; None: somewhere from 0 up.
+        step_s: seconds between updates of the counter.
+        idle_w: watts of the idle device; None if unknown (0 or more).
 
     Raises:
-        EnergyError: Too few windows.
+        EnergyError: there are too few windows.
     """
     if len(windows) < FEWEST_WINDOWS:
         raise EnergyError(
             f"energy: {len(windows)} windows: at least {FEWEST_WINDOWS} are needed for"
             " an interval"
         )
+    # Subtract the energy of the pauses.
     frames = np.array([each.frames for each in windows], float)
     taken = np.array([each.taken_s for each in windows])
     paused = np.array([each.paused_s for each in windows])
     watts = np.array([each.watts for each in windows])
     idle = 0.0 if idle_w is None else idle_w
     spent = (watts * taken - paused * (watts + idle) / 2) / frames
+    # Take the drift over time out of the spread.
     middle = np.array([(each.begin_s + each.end_s) / 2 for each in windows])
     bends = 2 if len(windows) >= ENOUGH_FOR_A_BEND else 1
     free = len(windows) - 1 - bends
     left = spent - np.polynomial.Polynomial.fit(middle, spent, bends)(middle)
+    # The spread is at least what the counter's step allows.
     beyond = taken % step_s  # of whole steps: what the two ends can differ by
     ends = watts / frames * np.sqrt(beyond * (step_s - beyond))
     variance = max(float(left @ left) / free, float(np.mean(ends**2)))
+    # Combine noise and the uncertainty of the pauses.
     pauses = float(np.mean(paused * np.abs(watts - idle) / frames)) / 2
     half = math.hypot(student_t(free) * math.sqrt(variance / len(windows)), pauses)
     mean = float(spent.mean())
@@ -121,24 +116,19 @@ def estimate(
 
 
 def student_t(free: int) -> float:
-    """Return Student's t, both sides 95 %, for so many degrees of freedom."""
+    """Return the two-sided 95 % quantile of Student's t distribution."""
     if free <= len(_T):
         return _T[free - 1]
     return _Z + (_T[-1] - _Z) * len(_T) / free
 
 
 def beat(frame_s: float, frames: int, step_s: float) -> float:
-    """Return how far frames keep step with a counter that looks at set moments.
+    """Return how strongly frames are in step with a counter that samples periodically.
 
-    0: over a window the counter looks at every part of a frame alike; 1: always at the
-    same, so that it tells little of the frame. Of the harmonics of its rate, the
-    largest of how well the beginnings of frames agree in phase, weighed with how well
-    it sees that harmonic.
-
-    Args:
-        frame_s: From frame to frame, seconds.
-        frames: Of a window.
-        step_s: Of the counter.
+    0: over a window the counter samples all parts of a frame equally; 1: it always
+    samples the same part, and so says little about the frame. This is the maximum over
+    the harmonics of the counter's rate of the phase agreement of frame starts, weighted
+    by the counter's sensitivity to that harmonic. ``frames`` is the number in a window.
     """
     orders = np.arange(1, HARMONICS + 1)
     turns = orders * frame_s / step_s
@@ -150,11 +140,11 @@ def beat(frame_s: float, frames: int, step_s: float) -> float:
 
 
 def detuning(frame_s: float, frames: int, step_s: float) -> float:
-    """Return the pause after each frame that keeps a window from beating, seconds.
+    """Return the pause after each frame, in seconds, that keeps a window from beating.
 
-    Frames that keep step with the counter are held up by so little that over a window
-    they fall behind by one step of it, or a whole fraction of one: it then looks at
-    every part of a frame. 0 where they do not keep step.
+    Frames in step with the counter are delayed so that over a window they fall behind
+    by one step, or a whole fraction of one: the counter then samples every part of a
+    frame. Returns 0 if they are not in step.
     """
     fractions = [0.0, *(step_s / order for order in range(HARMONICS, 0, -1))]
     pauses = [behind / frames for behind in fractions]

@@ -1,4 +1,4 @@
-"""The power rails of a Jetson: INA3221 sensors under sysfs."""
+"""Read the power rails of a Jetson: INA3221 sensors under sysfs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,33 +10,22 @@ from me2e_compress.runtime.energy.energy_counter import EnergyCounter
 from me2e_compress.runtime.energy.reader import Absent, Reader
 
 INPUTS = ("VDD_IN", "POM_5V_IN")
-"""Rails that feed the module (Xavier NX, Orin NX and Nano, TX2; Nano); all others hang
-on them, and adding them up counts those twice (jetson_stats, issue 51)."""
+"""Rails that feed the module (Xavier NX, Orin NX and Nano, TX2; Nano). All others
+branch from them; adding those would count them twice (jetson_stats, issue 51)."""
 CONTAINED = {"VDDQ_VDD2_1V8AO": "VIN_SYS_5V0"}
-"""Rails that another one already holds (Jetson AGX Orin, NVIDIA's developer guide)."""
+"""Rails that another rail includes (Jetson AGX Orin, NVIDIA's developer guide)."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One rail of a sensor.
-
-    Attributes:
-        label: name of the rail.
-        millivolts: file of its voltage.
-        milliamperes: file of its current.
-    """
+    """One rail of a sensor, with the files of its voltage and current."""
 
     label: str
     millivolts: Path
     milliamperes: Path
 
     def watts(self) -> float:
-        """Return the power now.
-
-        Raises:
-            OSError: a file cannot be read.
-            ValueError: it holds no number.
-        """
+        """Return the present power; OSError or ValueError if a file has no number."""
         volts, amperes = self.millivolts.read_text(), self.milliamperes.read_text()
         return int(volts) * int(amperes) / 1e6
 
@@ -46,7 +35,7 @@ class Ina3221(EnergyCounter):
     """Jetson: the rail that feeds the module; without one, the sum of its rails.
 
     Attributes:
-        rails: labels of those to add up; empty: as said.
+        rails: labels of the rails to add up; empty chooses as described above.
         root: folder of the drivers of I2C devices.
     """
 
@@ -55,7 +44,7 @@ class Ina3221(EnergyCounter):
     root: Path = Path("/sys/bus/i2c/drivers")
 
     def open(self) -> Reader | Absent:
-        """Read every rail that counts once."""
+        """Open the rails, each counted once."""
         sensors = sorted(self.root.glob("ina3221*/*/hwmon/hwmon*"))
         if not sensors:
             return Absent(f"no {self.root}/ina3221")
@@ -64,12 +53,14 @@ class Ina3221(EnergyCounter):
         if lacking := [label for label in self.rails if label not in labels]:
             there = ", ".join(labels) or "none"
             return Absent(f"no rail {lacking[0]}; there are {there}")
+        # Choose rails so that none is counted twice.
         wanted = self.rails or counted(labels)
         chosen = [each for each in found if each.label in wanted]
         if not chosen:
             return Absent(
                 f"{sensors[0]}: no rail with a label, a voltage and a current"
             )
+        # Read each once, so that missing permissions show now.
         try:
             for each in chosen:
                 each.watts()
@@ -81,12 +72,7 @@ class Ina3221(EnergyCounter):
 
 
 class Ina3221Reader(Reader):
-    """Open rails; their power is integrated.
-
-    Args:
-        channels: those that are added up.
-        sensors: folders of the sensors.
-    """
+    """Open rails, whose power is integrated."""
 
     counter = "ina3221-integrated"
     counts = False
@@ -105,7 +91,7 @@ class Ina3221Reader(Reader):
         self.step_s = _seconds(_text(sensors[0] / "update_interval"))
 
     def watts(self) -> float:
-        """Return the power of all rails that count."""
+        """Return the summed power of the chosen rails."""
         try:
             return sum(each.watts() for each in self._channels)
         except (OSError, ValueError) as error:
@@ -113,7 +99,7 @@ class Ina3221Reader(Reader):
 
 
 def counted(labels: Sequence[str]) -> list[str]:
-    """Return the rails that are added up: none is part of another one."""
+    """Return the rails to add up, none of which is part of another."""
     inputs = [label for label in labels if label in INPUTS]
     if inputs:
         return inputs[:1]

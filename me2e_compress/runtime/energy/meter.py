@@ -1,4 +1,4 @@
-"""Measure the energy of models: windows of a counter, in turn, idle around them."""
+"""Measure the energy of models in alternating windows, with idle before and after."""
 
 import contextlib
 import time
@@ -26,15 +26,15 @@ from me2e_compress.runtime.energy.schedule import EnergySchedule
 Work = Callable[[], object]
 """Runs one frame of a model and returns when it is done, on the device too."""
 Every = Callable[[float, Callable[[], None]], AbstractContextManager[None]]
-"""Calls something every so many seconds while the context is open."""
+"""Calls a function every so many seconds while the context is open."""
 
 _STEPS = 5
-"""Steps of a counter that are waited for to learn how long one is."""
+"""Updates of a counter to wait for when its step is measured."""
 _LONGEST_STEP_S = 2.0
-"""A counter that does not move for so long stands still."""
+"""A counter that does not move for this long does not work."""
 _POLL_S = 0.002
 _SHORTEST_PAUSE_S = 1e-3
-"""The system keeps no shorter ones: they are saved up."""
+"""Shorter pauses are not reliable; they are accumulated."""
 
 
 @dataclass(frozen=True)
@@ -50,19 +50,13 @@ class _Span:
 
 
 class EnergyMeter:
-    """Measures models beside one another by one counter.
+    """Measure several models side by side with one counter.
 
-    The idle device comes first, the models loaded; they warm up together; then windows
-    in turn (A B B A), each at a random phase of the counter and behind frames of its
-    own model; then idle again.
-
-    Args:
-        reader: The counter, open; nothing else may run on its device.
-        schedule: How long, and how often; None takes the defaults.
-        clock: Seconds, never going back.
-        sleep: Waits so many seconds.
-        every: Calls something all the while.
-        on_window: Called with windows done, windows in all, and the model's name.
+    The idle device is measured first, with the models loaded. The models then warm up
+    together and take windows in turn (A B B A), each at a random phase of the counter
+    and after lead-in frames of its own model. Idle is measured again at the end.
+    Nothing else may run on the device of ``reader``; ``on_window`` is called with
+    windows done, windows in all, and the model's name.
     """
 
     def __init__(
@@ -82,13 +76,10 @@ class EnergyMeter:
         self._power = PowerSamples(reader, clock)
 
     def measure(self, work: Mapping[str, Work]) -> dict[str, EnergyResult]:
-        """Measure models in turn.
-
-        Args:
-            work: What runs a frame, by model.
+        """Measure models in turn; ``work`` maps each name to what runs one frame.
 
         Raises:
-            EnergyError: The counter goes back, stands still, or cannot be read.
+            EnergyError: the counter goes back, does not move, or cannot be read.
         """
         spans: dict[str, list[_Span]] = {name: [] for name in work}
         turns = self._schedule.turns(list(work))
@@ -97,9 +88,11 @@ class EnergyMeter:
             if self._reader.tells_power
             else contextlib.nullcontext()
         ):
+            # Idle and warm up before the windows.
             step_s = self._reader.step_s or self._learnt_step()
             idle = [self._idle()]
             frame_s = self._warm_up(work)
+            # Alternate the models, so that drift falls on all alike.
             for done, name in enumerate(turns):
                 self._on_window(done, len(turns), name)
                 spans[name].append(self._work(work[name], frame_s[name], step_s))
@@ -107,6 +100,7 @@ class EnergyMeter:
             self._sleep(self._schedule.lead_in_s)
             idle.append(self._idle())
             self._sleep(2 * SAMPLED_S)  # the last sample of power lies behind it
+        # Idle power is the mean of before and after.
         idle_w = fmean(self._window(each).watts for each in idle)
         return {
             name: self._result(spans[name], step_s, idle_w, frame_s[name])
@@ -133,7 +127,7 @@ class EnergyMeter:
         )
 
     def _by_power(self, spans: Sequence[_Span]) -> float | None:
-        """Return joules a frame beside the counter; None: it was read too seldom."""
+        """Return joules per frame by integrated power; None with too few samples."""
         ends = [(each.begin_s, each.end_s) for each in spans]
         fewest = min(self._power.count(*each) for each in ends)
         if not self._reader.counts or fewest < FEWEST_SAMPLES:
@@ -148,7 +142,7 @@ class EnergyMeter:
         return Window(span.begin_s, span.end_s, span.frames, joules, span.paused_s)
 
     def _learnt_step(self) -> float:
-        """Learn the counter's step from when it moves."""
+        """Measure the counter's update interval from its changes."""
         if not self._reader.counts:
             return SAMPLED_S
         moved, last = [self._clock()], self._reader.joules()
@@ -169,7 +163,7 @@ class EnergyMeter:
         return _Span(begin, end, 0, self._moved(before, after, end - begin))
 
     def _warm_up(self, work: Mapping[str, Work]) -> dict[str, float]:
-        """Run all models, a lead-in each in turn; return the seconds of a frame."""
+        """Warm up all models in turn; return the seconds of a frame of each."""
         taken: dict[str, list[float]] = {name: [] for name in work}
         until = self._clock() + self._schedule.warm_up_s
         while self._clock() < until or not all(taken.values()):
@@ -185,7 +179,7 @@ class EnergyMeter:
         return [after - before for before, after in pairwise(times)]
 
     def _work(self, run: Work, frame_s: float, step_s: float) -> _Span:
-        """Run a window, at a random phase of the counter."""
+        """Run one window at a random phase of the counter."""
         frames = self._schedule.frames(frame_s)
         pause = detuning(frame_s, frames, step_s)
         self._sleep(float(self._random.uniform(0, step_s)))
@@ -199,7 +193,7 @@ class EnergyMeter:
         return _Span(begin, end, frames, joules, paused, states)
 
     def _frames(self, run: Work, frames: int, pause: float) -> float:
-        """Run frames with pauses between; return the seconds of these."""
+        """Run frames with pauses between; return the seconds spent in pauses."""
         owed, paused = 0.0, 0.0
         for _ in range(frames):
             run()
@@ -212,7 +206,7 @@ class EnergyMeter:
         return paused
 
     def _read(self) -> tuple[float, float]:
-        """Return the time and the joules; 0 where power is integrated."""
+        """Return the time and the joules; 0 joules where power is integrated."""
         joules = self._reader.joules() if self._reader.counts else 0.0
         return self._clock(), joules
 

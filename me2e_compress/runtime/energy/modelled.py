@@ -1,7 +1,7 @@
-"""Energy that a graph's arithmetic and memory traffic would take, by published figures.
+"""Model the energy of a graph's arithmetic and memory traffic from published figures.
 
-Nothing is measured: no control, no caches, no leakage. It says how graphs compare, not
-what one takes, and never stands beside measured joules.
+Nothing is measured: control, caches and leakage are not included. The figures compare
+graphs; they do not predict a device and never stand beside measured joules.
 """
 
 from collections import defaultdict
@@ -17,7 +17,7 @@ from me2e_compress.errors import EnergyError
 from me2e_compress.graph.activations import VIEWS, as_written, value_bytes
 
 Number = Literal["int8", "float16", "float32"]
-"""What is multiplied."""
+"""The number type of the factors of a product."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,10 @@ class EnergyCosts:
     """Published energies of one silicon process.
 
     Attributes:
-        mac_pj: Picojoules of a multiplication and the addition to a sum, by what is
-            multiplied; sums are int32 or float32.
-        byte_pj: Picojoules of a byte from or to external memory.
-        source: Where the figures stand.
+        mac_pj: picojoules of a multiply-accumulate by type of the factors; sums are
+            int32 or float32.
+        byte_pj: picojoules of a byte from or to external memory.
+        source: where the figures are published.
     """
 
     mac_pj: Mapping[Number, float]
@@ -50,7 +50,7 @@ PROCESSES: Mapping[str, EnergyCosts] = {
         " 450 pJ for 64 bits, the middle",
     ),
 }
-"""By name; both papers give the same kinds of operation."""
+"""Processes by name; both papers give the same kinds of operation."""
 
 DEFAULT_PROCESS = "7nm"
 _INT8 = (ir.DataType.INT8, ir.DataType.UINT8)
@@ -59,20 +59,20 @@ _FLOAT16 = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
 
 @dataclass(frozen=True, repr=False)
 class ModelledEnergy(Displayed):
-    """What one frame would take; a lower bound where nodes are not counted.
+    """Modelled energy of one frame; a lower bound where nodes are not counted.
 
     Attributes:
-        modelled_j_per_frame: Joules; None where no node could be counted.
-        mac_j: Of it, multiplications and additions.
-        memory_j: Of it, weights and activations from and to external memory.
-        macs: Multiply-accumulates by what is multiplied.
-        weight_bytes: Read once a frame.
-        activation_bytes: Read and written by the nodes that multiply; all others are
-            taken to be fused into these.
-        by_module: Joules of each module.
-        unknown_nodes: How many nodes are not counted.
-        process: Whose figures: ``45nm`` or ``7nm``.
-        source: Where these stand.
+        modelled_j_per_frame: joules; None where no node could be counted.
+        mac_j: joules of multiply-accumulates.
+        memory_j: joules of weights and activations from and to external memory.
+        macs: multiply-accumulates by type of the factors.
+        weight_bytes: weights, read once a frame.
+        activation_bytes: activations read and written by multiplying nodes; all other
+            nodes are assumed to be fused into these.
+        by_module: joules of each module.
+        unknown_nodes: number of nodes that are not counted.
+        process: ``45nm`` or ``7nm``.
+        source: where the figures of the process are published.
     """
 
     modelled_j_per_frame: float | None
@@ -88,7 +88,7 @@ class ModelledEnergy(Displayed):
 
     @property
     def headline(self) -> str:
-        """Modelled millijoules of a frame, and by whose figures."""
+        """The modelled millijoules per frame, and the process."""
         if self.modelled_j_per_frame is None:
             return f"modelled energy: nodes not counted: {self.unknown_nodes}"
         least = "at least " if self.unknown_nodes else ""
@@ -98,7 +98,7 @@ class ModelledEnergy(Displayed):
         )
 
     def tables(self) -> tuple[Table, ...]:
-        """Return millijoules by module, MACs and bytes."""
+        """Return millijoules by module, with MACs and bytes in the note."""
         whole = self.mac_j + self.memory_j
         rows = [
             (module, f"{1e3 * joules:.3f}", f"{joules / whole:.1%}" if whole else "-")
@@ -120,7 +120,7 @@ class ModelledEnergy(Displayed):
 
 @dataclass(frozen=True)
 class _Traffic:
-    """One node that multiplies."""
+    """One multiplying node."""
 
     module: str
     number: Number
@@ -134,22 +134,23 @@ def modelled_energy(
     process: str = DEFAULT_PROCESS,
     module_of: Callable[[ir.Node], str] = lambda node: "model",
 ) -> ModelledEnergy:
-    """Add up what a frame's products and their operands would take.
+    """Add up the energy of a frame's products and their operands.
 
-    A product counts as int8 where both factors are: integer operators, and those
-    between QuantizeLinear and DequantizeLinear. Int8 weights of a float product count
-    as int8 in memory alone.
+    A product counts as int8 where both factors are: in integer operators, and between
+    QuantizeLinear and DequantizeLinear. Int8 weights of a float product count as int8
+    for memory only.
 
     Args:
-        model: The graph, with shapes inferred; it stays as it is.
-        process: One of :data:`PROCESSES`.
-        module_of: The module of a node.
+        model: the graph, with shapes inferred; it is not changed.
+        process: one of :data:`PROCESSES`.
+        module_of: returns the module of a node.
 
     Raises:
-        EnergyError: No such process.
+        EnergyError: no such process.
     """
     costs = costs_of(process)
     found, unknown = _multiplying(model, module_of)
+    # Add up by module and by number type.
     by_module: defaultdict[str, float] = defaultdict(float)
     macs: defaultdict[str, int] = defaultdict(int)
     for each in found:
@@ -175,7 +176,7 @@ def costs_of(process: str) -> EnergyCosts:
     """Return the figures of a process.
 
     Raises:
-        EnergyError: No such process.
+        EnergyError: no such process.
     """
     if process not in PROCESSES:
         there = ", ".join(PROCESSES)
@@ -194,7 +195,7 @@ def _memory_j(each: _Traffic, costs: EnergyCosts) -> float:
 def _multiplying(
     model: ir.Model, module_of: Callable[[ir.Node], str]
 ) -> tuple[list[_Traffic], int]:
-    """Weigh the nodes that multiply; count those of which nobody knows."""
+    """Weigh the multiplying nodes; count those whose shapes are unknown."""
     count, seen = graph.macs_counter(model), set[str]()
     weighed = [
         None if macs is None else _traffic(node, macs, module_of(node), seen)
@@ -206,16 +207,13 @@ def _multiplying(
 
 
 def _traffic(node: ir.Node, macs: int, module: str, seen: set[str]) -> _Traffic | None:
-    """Weigh a node; None where a shape is open. A weight counts where it is read first.
+    """Weigh a node; None where a shape is open.
 
-    Args:
-        node: It multiplies.
-        macs: How much.
-        module: Of it.
-        seen: Names of the weights that were counted; grows.
+    A weight counts where it is read first: ``seen`` holds the names counted and grows.
     """
     weights, activations = 0, 0
     stored = [_stored(value) for value in node.inputs if value is not None]
+    # Inputs are activations, or weights not counted before.
     for value in stored:
         size = value_bytes(value)
         if size is None:
@@ -234,7 +232,7 @@ def _traffic(node: ir.Node, macs: int, module: str, seen: set[str]) -> _Traffic 
 
 
 def _number(node: ir.Node, stored: list[ir.Value]) -> Number:
-    """Return what a node multiplies: its first two operands decide."""
+    """Return the number type of a product: its first two operands decide."""
     types = [value.dtype for value in stored[:2]]
     if node.op_type.startswith("QLinear"):  # data, scale, zero point, weight, ...
         types = [stored[0].dtype]
@@ -245,7 +243,7 @@ def _number(node: ir.Node, stored: list[ir.Value]) -> Number:
 
 
 def _stored(value: ir.Value) -> ir.Value:
-    """Return what lies in memory: behind a DequantizeLinear, its integers."""
+    """Return the value in memory: the integers before a DequantizeLinear."""
     at = value
     while (node := at.producer()) is not None and node.inputs and node.inputs[0]:
         if node.op_type == "DequantizeLinear":
@@ -257,7 +255,7 @@ def _stored(value: ir.Value) -> ir.Value:
 
 
 def _is_weight(value: ir.Value) -> bool:
-    """Return whether a value is in the file; a float one may be quantized there."""
+    """Return whether a value is stored in the file, possibly before quantization."""
     node = value.producer()
     if node is not None and node.op_type == "QuantizeLinear" and node.inputs[0]:
         return node.inputs[0].const_value is not None

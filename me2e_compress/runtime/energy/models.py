@@ -19,7 +19,7 @@ from me2e_compress.runtime.stack.split_stack import digest_of_files
 from me2e_compress.runtime.stack.stack_session import open_session
 
 MOST_BYTES = 500_000_000
-"""Frames are held in memory up to here: reading them from disk takes energy too."""
+"""Bytes of frames held in memory: reading from disk takes energy too."""
 
 
 def measure_energy(
@@ -33,32 +33,32 @@ def measure_energy(
     said: Mapping[str, str] | None = None,
     on_window: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> dict[str, EnergyResult]:
-    """Measure the energy of models, one frame at a time, window by window in turn.
+    """Measure the energy of models, one frame at a time, in alternating windows.
 
-    Recurrent state is fed forward and reset where scenes begin; the first frames, as
-    many as fit into 500 MB, are repeated as often as it takes. Nothing else may run on
+    Recurrent state is fed forward and reset where scenes begin. The first frames, as
+    many as fit into 500 MB, are repeated as often as needed. Nothing else may run on
     the device.
 
     Args:
-        models: ONNX files, or TOMLs of stacks, by name.
-        frames: What they see.
+        models: ONNX files, or TOML files of stacks, by name.
+        frames: the inputs of the models.
         counter: ``auto``, or a name and options; see ``open_counter``.
-        schedule: How long, and how often; None takes the defaults.
-        threads: Of onnxruntime.
-        provider: What runs them.
-        said: What is known of them beside their own metadata.
-        on_window: Called with windows done, windows in all, and the model's name.
+        schedule: durations and counts; None takes the defaults.
+        threads: onnxruntime's number of threads.
+        provider: the execution provider.
+        said: metadata that overrides the models' own.
+        on_window: called with windows done, windows in all, and the model's name.
 
     Returns:
-        By model: joules a frame; or, without a counter, why not, at once.
+        Joules per frame by model; without a counter, the reason why not, at once.
 
     Raises:
-        EnergyError: The counter goes back, stands still or cannot be read; or a
-            recording is asked to tell of several models.
-        GraphError: A model cannot be run.
-        FramesError: A frame does not fit, or there is none.
+        EnergyError: the counter fails, or a recording is given for several models.
+        GraphError: a model cannot be run.
+        FramesError: a frame does not fit, or there is none.
     """
     digests = {name: digest_of_files(path) for name, path in models.items()}
+    # Measure, take the recording, or say why there is no counter.
     opened = open_counter(counter)
     if isinstance(opened, Absent):
         found = dict.fromkeys(models, EnergyResult(reason=opened.reason))
@@ -105,7 +105,7 @@ def _metered(
 
 
 def _held(frames: Frames) -> list[Frame]:
-    """Keep the first frames, as many as memory is meant for, at least one."""
+    """Keep the first frames that fit into memory, at least one."""
 
     def fitting() -> Iterator[Frame]:
         taken = 0

@@ -1,4 +1,4 @@
-"""NVIDIA's own counter: the total energy of a board, and its power beside it."""
+"""Read NVIDIA's counter of a board's total energy, and its power."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ _SLOWED = {
     "nvmlClocksEventReasonHwPowerBrakeSlowdown": "power brake",
     "nvmlClocksEventReasonSwThermalSlowdown": "thermal slowdown",
 }
-"""Reasons of NVML that cost speed; idle, and clocks that someone set, are none."""
+"""NVML's reasons that reduce speed; idling and clocks set by a user do not count."""
 
 
 _CLOCKS = {"sm": pynvml.NVML_CLOCK_SM, "memory": pynvml.NVML_CLOCK_MEM}
@@ -29,26 +29,22 @@ _CLOCKS = {"sm": pynvml.NVML_CLOCK_SM, "memory": pynvml.NVML_CLOCK_MEM}
 class Nvml(EnergyCounter):
     """NVIDIA GPU: total energy (Volta and later), else its power integrated.
 
-    That NVML answers says nothing: on a Jetson with JetPack 7 it does, and supports
-    neither. So the calls themselves are asked.
+    That NVML loads proves nothing: on a Jetson with JetPack 7 it loads, but supports
+    neither call. So the calls themselves are tried.
 
     Attributes:
-        index: of the GPU.
-
-    Raises:
-        ValueError: a negative index.
+        index: number of the GPU, 0 or more.
     """
 
     name: ClassVar[str] = "nvml"
     index: int = 0
 
     def __post_init__(self) -> None:
-        """Check the index."""
         if self.index < 0:
             raise ValueError(f"index {self.index}: must be 0 or more")
 
     def open(self) -> Reader | Absent:
-        """Ask for the total energy, then for the power."""
+        """Try the total energy, then the power."""
         try:
             pynvml.nvmlInit()
         except pynvml.NVMLError as error:
@@ -77,9 +73,9 @@ class NvmlReader(Reader):
     """An open GPU.
 
     Args:
-        handle: NVML's.
+        handle: NVML's device handle.
         counts: whether it counts energy.
-        power: its power in mW; or why it does not tell.
+        power: the power in mW, or the error where it cannot be read.
     """
 
     scope = "the whole board"
@@ -95,11 +91,11 @@ class NvmlReader(Reader):
         return self._ask(pynvml.nvmlDeviceGetTotalEnergyConsumption) / 1e3
 
     def watts(self) -> float:
-        """Return the power now, not the average of a second."""
+        """Return the instantaneous power, not the average of a second."""
         return self._ask(_instant_power) / 1e3
 
     def state(self) -> DeviceState:
-        """Return temperature, clocks and why it is slowed down."""
+        """Return the temperature, the clocks and the reasons for throttling."""
         degrees = _number(
             pynvml.nvmlDeviceGetTemperature, self._handle, pynvml.NVML_TEMPERATURE_GPU
         )
@@ -117,7 +113,7 @@ class NvmlReader(Reader):
         return DeviceState(degrees, told, slowed)
 
     def close(self) -> None:
-        """Leave NVML."""
+        """Shut down NVML."""
         pynvml.nvmlShutdown()
 
     def _ask(self, question: Callable[[Any], int]) -> int:
@@ -128,7 +124,7 @@ class NvmlReader(Reader):
 
 
 def _answer(question: Callable[[Any], T], handle: Any) -> T | str:
-    """Return what NVML answers, or its error in words."""
+    """Return NVML's answer, or its error as text."""
     try:
         return question(handle)
     except pynvml.NVMLError as error:
@@ -136,7 +132,7 @@ def _answer(question: Callable[[Any], T], handle: Any) -> T | str:
 
 
 def _number(question: Callable[..., int], *arguments: Any) -> float | None:
-    """Return what NVML answers; None where it does not."""
+    """Return NVML's answer as a number; None on an error."""
     try:
         return float(question(*arguments))
     except pynvml.NVMLError:
@@ -144,7 +140,7 @@ def _number(question: Callable[..., int], *arguments: Any) -> float | None:
 
 
 def _instant_power(handle: Any) -> int:
-    """Return milliwatts now; nvmlDeviceGetPowerUsage averages over a second."""
+    """Return the present milliwatts; nvmlDeviceGetPowerUsage averages over a second."""
     (found,) = pynvml.nvmlDeviceGetFieldValues(
         handle, [pynvml.NVML_FI_DEV_POWER_INSTANT]
     )

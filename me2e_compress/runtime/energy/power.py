@@ -1,4 +1,4 @@
-"""Power that is read again and again, and its integral."""
+"""Sample the power in the background and integrate it."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -13,36 +13,31 @@ from me2e_compress.runtime.energy.reader import Reader
 Floats = npt.NDArray[np.float64]
 
 SAMPLED_S = 0.02
-"""Power is read so often: five times within a usual step of 0.1 s."""
+"""Seconds between samples of the power: five within a usual step of 0.1 s."""
 FEWEST_SAMPLES = 20
-"""Samples of a window; with fewer, its integral tells nothing of it."""
+"""Fewest samples in a window from which its integral is used."""
 
 
 class PowerSamples:
-    """What a reader says of its power, with the time.
-
-    Args:
-        reader: Tells its power.
-        clock: Seconds.
-    """
+    """Timed samples of a reader's power; ``clock`` returns seconds."""
 
     def __init__(self, reader: Reader, clock: Callable[[], float]) -> None:
         self._reader, self._clock = reader, clock
         self._taken = list[tuple[float, float]]()
 
     def add(self) -> None:
-        """Read the power once."""
+        """Sample the power once."""
         self._taken.append((self._clock(), self._reader.watts()))
 
     def count(self, begin_s: float, end_s: float) -> int:
-        """Count the readings from one time to another."""
+        """Count the samples between two times."""
         return sum(begin_s <= each <= end_s for each, _ in self._taken)
 
     def joules(self, begin_s: float, end_s: float) -> float:
-        """Return the energy from one time to another.
+        """Return the energy between two times.
 
         Raises:
-            EnergyError: The power was read too seldom between them.
+            EnergyError: there are fewer than :data:`FEWEST_SAMPLES` between them.
         """
         times, watts = np.array(self._taken or [(0.0, 0.0)]).T
         count = self.count(begin_s, end_s)
@@ -59,17 +54,16 @@ class PowerSamples:
 
 
 def integrated(times_s: Floats, watts: Floats) -> Floats:
-    """Return the joules since the first time, by trapezoids, one a time."""
+    """Return the joules since the first time, at each time, by the trapezoidal rule."""
     steps = np.diff(times_s) * (watts[1:] + watts[:-1]) / 2
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 @contextlib.contextmanager
 def in_background(period_s: float, call: Callable[[], None]) -> Iterator[None]:
-    """Call something every so many seconds while the context is open, in a thread.
+    """Call a function periodically in a thread while the context is open.
 
-    Raises:
-        EnergyError: The call did, when the context is left.
+    An EnergyError of the call is raised when the context is left.
     """
     done, failed = Event(), list[EnergyError]()
 

@@ -1,4 +1,4 @@
-"""The counters of processor packages that Linux shows under powercap (RAPL)."""
+"""Read the energy counters of processors from Linux's powercap interface (RAPL)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from me2e_compress.runtime.energy.reader import Absent, Reader
 from me2e_compress.runtime.profile import processor
 
 _COUNTED = ("package", "dram")
-"""Beginnings of zone names that are added up. ``core`` and ``uncore`` are parts of a
-package, ``psys`` holds the packages; ``dram`` stands beside them."""
+"""Prefixes of the zone names to add up. ``core`` and ``uncore`` are parts of a package,
+``psys`` includes the packages; ``dram`` is separate."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,10 @@ class Rapl(EnergyCounter):
     root: Path = Path("/sys/class/powercap")
 
     def open(self) -> Reader | Absent:
-        """Read every zone once: root alone may, since CVE-2020-8694."""
+        """Read every zone once: only root may, since CVE-2020-8694."""
         if not self.root.is_dir():
             return Absent(f"no {self.root}")
+        # Take the packages and the memory, not their parts.
         zones = {
             zone: name
             for zone in sorted(self.root.glob("intel-rapl:*"))
@@ -49,15 +50,7 @@ class Rapl(EnergyCounter):
 
 
 class RaplReader(Reader):
-    """Open zones.
-
-    Args:
-        zones: folders, with the name of each.
-
-    Raises:
-        OSError: one cannot be read.
-        ValueError: what it says is not a number.
-    """
+    """Open zones, given as folders with their names."""
 
     counter = "rapl"
     step_s = 1e-3
@@ -68,12 +61,12 @@ class RaplReader(Reader):
         self._zones = [_Zone(folder, name) for folder, name in zones.items()]
 
     def joules(self) -> float:
-        """Return the joules since it was opened, those of wrap-arounds included."""
+        """Return the joules since opening, corrected for wrap-arounds."""
         return sum(zone.moved_uj() for zone in self._zones) / 1e6
 
 
 class _Zone:
-    """One counter in microjoules that starts over at its range."""
+    """One counter in microjoules that wraps around at its range."""
 
     def __init__(self, folder: Path, name: str) -> None:
         self._file, self._name = folder / "energy_uj", name

@@ -1,4 +1,4 @@
-"""An open counter of energy, or why there is none."""
+"""The interface of an open energy counter, or the reason why there is none."""
 
 import abc
 from collections.abc import Mapping
@@ -7,13 +7,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class DeviceState:
-    """How a device is at a moment; what it does not tell is left out.
-
-    Attributes:
-        temperature_c: Degrees Celsius; None: not told.
-        clocks_mhz: By clock.
-        throttled: Reasons for which it slows itself down.
-    """
+    """The state of a device at one moment; unknown values are left out."""
 
     temperature_c: float | None = None
     clocks_mhz: Mapping[str, float] = field(default_factory=dict)
@@ -21,15 +15,15 @@ class DeviceState:
 
 
 class Reader(abc.ABC):
-    """A counter that answers; it counts energy, or tells power, or both.
+    """An open counter that counts energy, or reads power, or both.
 
     Attributes:
-        counter: What counts, for the result.
-        device: Its name.
-        scope: What is counted: a board, packages, rails.
-        step_s: Seconds from one value to the next, where the device says; else None.
-        counts: True if it counts energy; else its power is integrated.
-        tells_power: True if it tells its power.
+        counter: name of the counter, for the result.
+        device: name of the device.
+        scope: what is counted: a board, packages, rails.
+        step_s: seconds between updates, if the device tells; else None.
+        counts: whether it counts energy; otherwise its power is integrated.
+        tells_power: whether it reads power.
     """
 
     counter: str
@@ -40,36 +34,32 @@ class Reader(abc.ABC):
     tells_power: bool = False
 
     def joules(self) -> float:
-        """Return the energy since some moment; asked only if it ``counts``.
+        """Return the energy since an arbitrary start; called only if ``counts``.
 
         Raises:
-            EnergyError: It cannot be read any more, or went back.
+            EnergyError: the counter cannot be read any more, or went back.
         """
         raise NotImplementedError
 
     def watts(self) -> float:
-        """Return the power now; asked only if it ``tells_power``.
+        """Return the present power; called only if ``tells_power``.
 
         Raises:
-            EnergyError: It cannot be read any more.
+            EnergyError: it cannot be read any more.
         """
         raise NotImplementedError
 
     def state(self) -> DeviceState:
-        """Return how the device is; nothing, unless the device can tell."""
+        """Return the state of the device, as far as it is known."""
         return DeviceState()
 
     def close(self) -> None:
-        """Give back what was opened; nothing, unless overridden."""
+        """Release what was opened; the default does nothing."""
         return
 
 
 @dataclass(frozen=True)
 class Absent:
-    """A counter that is not there, or may not be read.
-
-    Attributes:
-        reason: What it answered.
-    """
+    """A counter that is missing or may not be read, with the reason."""
 
     reason: str

@@ -1,4 +1,4 @@
-"""A recording that was made on the target device, as CSV or JSON."""
+"""Read an energy recording made on the target device, as CSV or JSON."""
 
 import csv
 import io
@@ -20,11 +20,11 @@ _COLUMNS = "time_s, frames, and joules or watts"
 
 @dataclass(frozen=True)
 class Recorded(EnergyCounter):
-    """A file of what the target device counted, or what power it took.
+    """A file of the energy or the power that was recorded on the target device.
 
     CSV with a header, or JSON with an array for each column: ``time_s``, ``frames``
     (inferences done so far), and ``joules`` (so far) or ``watts`` (at that time). JSON
-    may add ``device``, ``scope`` and ``counter``, texts.
+    may add the texts ``device``, ``scope`` and ``counter``.
 
     Attributes:
         file: the recording.
@@ -38,7 +38,7 @@ class Recorded(EnergyCounter):
         """Read the file and check it.
 
         Raises:
-            EnergyError: no such file, no such columns, or numbers that cannot be.
+            EnergyError: the file is missing or its columns or numbers are not valid.
         """
         try:
             columns, words = _read(self.file)
@@ -52,7 +52,7 @@ class Recorded(EnergyCounter):
 
 
 def _read(path: Path) -> tuple[Mapping[str, Sequence[Any]], Mapping[str, str]]:
-    """Return the columns, and what a file says of its device."""
+    """Return the columns, and the texts that describe the device."""
     content = documents.content(path)
     if path.suffix.lower() == ".json":
         record = documents.from_json(content)
@@ -60,6 +60,7 @@ def _read(path: Path) -> tuple[Mapping[str, Sequence[Any]], Mapping[str, str]]:
             raise ValueError(f"an object with {_COLUMNS} is expected")
         columns = {k: v for k, v in record.items() if isinstance(v, list)}
         return columns, {k: v for k, v in record.items() if isinstance(v, str)}
+    # CSV: every row must have as many values as the header.
     rows = csv.reader(io.StringIO(content.decode("utf-8-sig")))
     header = [name.strip() for name in next(rows, [])]
     lines = [line for line in rows if line]
@@ -80,6 +81,7 @@ def _recording(
         raise ValueError(f"time_s does not ascend at row {_first(np.diff(times) <= 0)}")
     if np.any(np.diff(frames) < 0):
         raise ValueError(f"frames go back at row {_first(np.diff(frames) < 0)}")
+    # Check the columns against each other.
     counts = "joules" in columns
     found = _numbers(columns, "joules" if counts else "watts")
     if len({len(times), len(frames), len(found)}) > 1 or len(times) < 2:
@@ -88,6 +90,7 @@ def _recording(
         raise ValueError(f"joules go back at row {_first(np.diff(found) < 0)}")
     if not counts and np.any(found < 0):
         raise ValueError(f"watts are negative at row {_first(found < 0)}")
+    # Power is integrated to joules.
     joules = found if counts else integrated(times, found)
     counter = words.get(
         "counter", "recorded" if counts else "recorded-power-integrated"

@@ -1,4 +1,4 @@
-"""When energy is measured: warm-up, idle, and windows of the models in turn."""
+"""The schedule of an energy measurement: warm-up, idle, and alternating windows."""
 
 import math
 from collections.abc import Sequence
@@ -10,20 +10,20 @@ from me2e_compress.runtime.energy.estimate import FEWEST_WINDOWS
 
 @dataclass(frozen=True)
 class EnergySchedule:
-    """How long, and how often; the paper measures 100 frames after 30 s, once.
+    """Durations and counts; the paper measures 100 frames after 30 s, once.
 
     Attributes:
-        warm_up_s: Work before the first window, seconds, all models together.
-        window_s: A window lasts so long at least: the counter's step of 0.1 s is 1 %.
-        window_frames: It has so many frames at least.
-        windows: Of each model.
-        idle_s: The idle device is measured so long, before and after.
-        lead_in_s: Frames of the same model just before a window, seconds: the counter
+        warm_up_s: work before the first window, seconds, all models together.
+        window_s: least seconds of a window: the counter's step of 0.1 s is 1 %.
+        window_frames: least frames of a window.
+        windows: number of windows of each model.
+        idle_s: seconds for which the idle device is measured, before and after.
+        lead_in_s: seconds of frames of the same model just before a window: the counter
             lags by a step, and clocks and caches settle.
-        seed: Of the phases at which windows begin.
+        seed: of the random phases at which windows begin.
 
     Raises:
-        EnergyError: Too few windows, or a time that is not positive.
+        EnergyError: too few windows, or a time that is not positive.
     """
 
     warm_up_s: float = 30.0
@@ -35,7 +35,6 @@ class EnergySchedule:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if self.windows < FEWEST_WINDOWS:
             raise EnergyError(
                 f"energy: {self.windows} windows: at least {FEWEST_WINDOWS} are needed"
@@ -49,11 +48,11 @@ class EnergySchedule:
             raise EnergyError(f"energy: seed {self.seed}: must be 0 or more")
 
     def frames(self, frame_s: float) -> int:
-        """Return the frames of a window of a model that takes so many seconds each."""
+        """Return the frames in a window of a model that takes ``frame_s`` a frame."""
         return max(self.window_frames, math.ceil(self.window_s / frame_s))
 
     def turns(self, models: Sequence[str]) -> list[str]:
-        """Return whose window comes when: A B B A, a drift falls on all alike."""
+        """Return the models in order of their windows: A B B A spreads drift evenly."""
         there, back = list(models), list(reversed(models))
         return [
             each

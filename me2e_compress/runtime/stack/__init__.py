@@ -1,1 +1,1 @@
-"""A stack of several ONNX files as one model."""
+"""Run a stack of several ONNX files as one model."""

@@ -1,4 +1,4 @@
-"""First values of recurrent inputs, from files."""
+"""Read first values of recurrent inputs from files."""
 
 from pathlib import Path
 
@@ -13,15 +13,9 @@ from me2e_compress.runtime.stack.part_graph import misfit, told
 
 
 def read_value(path: Path, name: str, where: str) -> Array:
-    """Read a first value; of an ``.npz`` the array called like the input.
+    """Read a first value; from an ``.npz``, the array named like the input.
 
-    Args:
-        path: the file.
-        name: of the input.
-        where: what the message begins with.
-
-    Raises:
-        GraphError: it cannot be read, or has no such array.
+    ``where`` begins the message of the GraphError for a file that cannot be read.
     """
     try:
         check_regular(path)
@@ -37,10 +31,10 @@ def read_value(path: Path, name: str, where: str) -> Array:
 
 
 def fitted(value: Array, port: SessionPort, where: str) -> Array:
-    """Give an array leading dimensions of 1, and check it against its input.
+    """Prepend dimensions of 1 to an array, and check it against its input.
 
     Raises:
-        GraphError: it is of another type or shape.
+        GraphError: the type or shape differs.
     """
     missing = max(0, len(port.shape) - value.ndim)
     value = value.reshape((1,) * missing + value.shape)

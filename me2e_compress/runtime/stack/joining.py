@@ -1,4 +1,4 @@
-"""Join the files of a stack: edges, state, first values."""
+"""Join the files of a stack: edges, state and first values."""
 
 import dataclasses
 import json
@@ -17,7 +17,7 @@ from me2e_compress.runtime.stack.stack_file import ZEROS, StackFile, StateEntry
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Joined:
-    """What is known of a stack once its files are joined; see ``SplitStack``."""
+    """The result of joining a stack's files; see ``SplitStack``."""
 
     inputs: Mapping[str, SessionPort]
     outputs: Mapping[str, SessionPort]
@@ -30,26 +30,24 @@ class Joined:
 
 
 def join(content: StackFile, files: Sequence[PartGraph], folder: Path) -> Joined:
-    """Join files.
-
-    Args:
-        content: what the TOML says.
-        files: that it names.
-        folder: that first values are relative to.
+    """Join the files of a stack; paths of first values are relative to ``folder``.
 
     Raises:
-        GraphError: they do not fit each other.
+        GraphError: the files do not fit each other.
     """
+    # Connect the parts, for first and for other frames.
     joiner = _Joiner(content, files, folder)
     at_next = joiner.joints(first=False)
     at_first = joiner.joints(first=True)
     inputs = _inputs((at_next, at_first))
+    # Name the outputs of the stack.
     answers = dict(joiner.answers())
     ports = {each.label: each.outputs for each in files}
     outputs = {
         name: ports[joiner.kept(part).label][output]
         for name, (part, output) in answers.items()
     }
+    # Pair the state, and check that no part is left alone.
     recurrent = joiner.recurrent(inputs, outputs)
     _check_joined(joiner.names.parts(), (at_next, at_first), recurrent, answers)
     first_values = joiner.first_values(inputs, at_first)
@@ -61,7 +59,7 @@ def join(content: StackFile, files: Sequence[PartGraph], folder: Path) -> Joined
 
 
 class _Joiner:
-    """The rules by which an input finds what feeds it."""
+    """The rules that find the source of each input."""
 
     def __init__(
         self, content: StackFile, files: Sequence[PartGraph], folder: Path
@@ -85,7 +83,7 @@ class _Joiner:
             raise GraphError(f"{part}.{name} is fed by [edges] and by [state]")
 
     def joints(self, *, first: bool) -> Joints:
-        """Find what feeds every input at one kind of frame."""
+        """Find the source of every input at one kind of frame."""
         graphs = dict(self._running(first=first))
         sources = {
             part: {
@@ -101,7 +99,7 @@ class _Joiner:
         return self.files[part]
 
     def answers(self) -> Iterator[tuple[str, tuple[str, str]]]:
-        """Yield the outputs that come at every frame: their names, part and output."""
+        """Yield the name, part and output of what is present at every frame."""
         for part, each in self._running(first=False):
             at_first = dict(self._running(first=True))[part]
             for output in each.outputs:
@@ -111,8 +109,9 @@ class _Joiner:
     def recurrent(
         self, inputs: Mapping[str, SessionPort], outputs: Mapping[str, SessionPort]
     ) -> dict[str, str]:
-        """Pair recurrent inputs with the outputs that answer them."""
+        """Pair recurrent inputs with the outputs that are fed back to them."""
         pairs = dict[str, str | None]()
+        # Metadata of the files comes first; [state] overrides it.
         for each in self.files.values():
             for name, output in each.recurrent().items():
                 if output is None:
@@ -126,6 +125,7 @@ class _Joiner:
                 _check_answer(name, answer, inputs, outputs)
             elif pairs.get(name) is None:
                 pairs.pop(name, None)
+        # The naming rules complete the pairs.
         known = {name: to for name, to in pairs.items() if name in inputs}
         metadata = {RECURRENT: json.dumps(known)} if known else {}
         found = recurrence(metadata, inputs, outputs)
@@ -209,7 +209,7 @@ class _Joiner:
 
 
 def _inputs(joints: Sequence[Joints]) -> dict[str, SessionPort]:
-    """Gather what comes from outside; parts that share a name share the input."""
+    """Collect the external inputs; parts that share a name share the input."""
     found = dict[str, tuple[PartGraph, SessionPort]]()
     for each in joints:
         for taker, name, public in each.outside():
@@ -244,7 +244,8 @@ def _check_joined(
     recurrent: Mapping[str, str],
     answers: Mapping[str, tuple[str, str]],
 ) -> None:
-    """Refuse parts that nothing joins to the first: an edge is missing."""
+    """Raise an error if a part is not connected to the first: an edge is missing."""
+    # Parts are connected by edges, or by state.
     pairs = {
         (part, source.part)
         for each in joints
@@ -256,6 +257,7 @@ def _check_joined(
         for taker, _, public in each.outside():
             if public in recurrent:
                 pairs.add((taker.part, answers[recurrent[public]][0]))
+    # Grow the set of parts connected to the first one.
     reached = {parts[0]}
     for _ in parts:
         reached |= {b for a, b in pairs if a in reached}
@@ -271,7 +273,7 @@ def _check_joined(
 
 
 def _merged(files: Sequence[PartGraph]) -> dict[str, str]:
-    """Put metadata together: objects that agree are joined, else a later file wins."""
+    """Merge metadata: JSON objects that agree are joined, else a later file wins."""
     found = dict[str, str]()
     for each in files:
         for key, text in each.metadata.items():
@@ -283,7 +285,7 @@ def _merged(files: Sequence[PartGraph]) -> dict[str, str]:
 
 
 def _object(text: str) -> dict[str, object]:
-    """Read a JSON object; what is none is an empty one."""
+    """Read a JSON object; anything else gives an empty one."""
     try:
         value = documents.from_json(text)
     except documents.MalformedError:

@@ -1,4 +1,4 @@
-"""Which output of a stack's files feeds which input, at first and at other frames."""
+"""Connections between the files of a stack, at first and at other frames."""
 
 import dataclasses
 import graphlib
@@ -10,11 +10,11 @@ from me2e_compress.runtime.stack.part_graph import PartGraph, misfit, told
 
 
 class FeedSource(NamedTuple):
-    """What feeds an input.
+    """The source of an input.
 
     Attributes:
-        part: that gives it; empty where it comes from outside: a frame, or the state.
-        name: of the output, or of the input of the stack.
+        part: the part that gives it; empty for a frame's input or the state.
+        name: name of the output, or of the input of the stack.
     """
 
     part: str
@@ -22,17 +22,17 @@ class FeedSource(NamedTuple):
 
 
 Sources = Mapping[str, Mapping[str, FeedSource]]
-"""By part and input, what feeds it."""
+"""The source of each input, by part and input."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Joints:
-    """How the files are joined at one kind of frame.
+    """The connections of the files at one kind of frame.
 
     Attributes:
-        order: the parts that run, each behind those that feed it.
-        graphs: by part, the file that runs.
-        sources: by part and input, what feeds it.
+        order: the parts that run, in topological order.
+        graphs: the file that runs, by part.
+        sources: the source of each input, by part and input.
     """
 
     order: tuple[str, ...]
@@ -41,16 +41,17 @@ class Joints:
 
     @classmethod
     def of(cls, graphs: Mapping[str, PartGraph], sources: Sources) -> "Joints":
-        """Check that everything fits, and find the order.
+        """Check that all connections fit, and sort the parts.
 
         Raises:
             GraphError: an output is missing or of another type or shape than the input
-                it feeds, or the parts wait for one another.
+                that it feeds, or the parts form a cycle.
         """
         for part, fed in sources.items():
             for name, source in fed.items():
                 if source.part:
                     _check(graphs, graphs[part], name, source)
+        # Sort the parts by their dependencies.
         waits = {
             part: [each.part for each in sources[part].values() if each.part]
             for part in graphs
@@ -66,7 +67,7 @@ class Joints:
         return cls(order, graphs, sources)
 
     def outside(self) -> Iterator[tuple[PartGraph, str, str]]:
-        """Yield file, input and the input of the stack that it is."""
+        """Yield the file, its input and the stack's input, for external inputs."""
         for part, fed in self.sources.items():
             for name, source in fed.items():
                 if not source.part:
@@ -97,11 +98,7 @@ def _check(
 
 @dataclasses.dataclass(frozen=True)
 class Names:
-    """How the inputs and outputs of parts are called in the stack.
-
-    Attributes:
-        files: all of them.
-    """
+    """The names of the parts' inputs and outputs in the stack."""
 
     files: Sequence[PartGraph]
 
@@ -116,7 +113,7 @@ class Names:
         )
 
     def outputs_of(self, part: str) -> tuple[str, ...]:
-        """Return what the files of a part give."""
+        """Return the outputs of a part's files."""
         files = (each for each in self.files if each.part == part)
         return tuple(dict.fromkeys(name for each in files for name in each.outputs))
 
@@ -127,15 +124,11 @@ class Names:
         )
 
     def public(self, part: str, output: str) -> str:
-        """Name an output of the stack: by its part where two have one of that name."""
+        """Return the stack's name of an output, with its part if it is ambiguous."""
         return output if len(self.givers(output)) == 1 else f"{part}.{output}"
 
     def output(self, text: str, where: str) -> FeedSource:
-        """Find the output that a text names: ``PART.NAME``, or what one part gives.
-
-        Raises:
-            GraphError: none, or several.
-        """
+        """Find the output of a text: ``PART.NAME``, or a name that one part gives."""
         givers = self.givers(text)
         if len(givers) > 1:
             raise two_givers(where, text, givers)
@@ -152,10 +145,10 @@ class Names:
         raise GraphError(f"{where}: no part gives {text}; there is {', '.join(there)}")
 
     def inputs(self, text: str, where: str) -> tuple[tuple[str, str], ...]:
-        """Find the parts and inputs that a text names: ``PART.NAME``, or all of a name.
+        """Find the (part, input) pairs of a text: ``PART.NAME``, or all of that name.
 
         Raises:
-            GraphError: none.
+            GraphError: there is none.
         """
         part, _, name = text.partition(".")
         if takers := self.takers(text):
@@ -167,7 +160,7 @@ class Names:
 
 
 def two_givers(where: str, name: str, givers: Sequence[str]) -> GraphError:
-    """Say that several parts could feed an input."""
+    """Build the error for an input that several parts could feed."""
     ways = " or ".join(f"{each}.{name}" for each in givers)
     return GraphError(
         f"{where}: {' and '.join(givers)} both give {name}: say {ways}, by [edges]"

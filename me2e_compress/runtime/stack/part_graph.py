@@ -15,15 +15,15 @@ from me2e_compress.runtime.recurrence import SessionPort, declared_pairs
 
 @dataclasses.dataclass(frozen=True)
 class PartGraph:
-    """One ONNX file of a stack, as far as the others see it.
+    """The interface of one ONNX file of a stack.
 
     Attributes:
         label: ``head``, or ``head.first_frame``.
-        part: whose file it is.
+        part: the part that the file belongs to.
         path: the file.
-        inputs: by name; the shape is empty where nobody knows it.
-        outputs: by name.
-        metadata: of the file.
+        inputs: inputs by name; the shape is empty where it is unknown.
+        outputs: outputs by name.
+        metadata: metadata of the file.
     """
 
     label: str
@@ -35,21 +35,13 @@ class PartGraph:
 
     @classmethod
     def load(cls, label: str, part: str, path: Path) -> Self:
-        """Read a file.
-
-        Raises:
-            GraphError: no such file, or not a graph.
-        """
+        """Read a file; GraphError if it is missing or not a graph."""
         model = graph.load(path)
         sides = _ports(model.graph.inputs), _ports(model.graph.outputs)
         return cls(label, part, path, *sides, dict(model.metadata_props))
 
     def recurrent(self) -> dict[str, str | None]:
-        """Return what its metadata feeds back: None for an input that is not.
-
-        Raises:
-            GraphError: the metadata is not such a mapping.
-        """
+        """Return the output declared for each input; None if it is not fed back."""
         try:
             named = declared_pairs(self.metadata)
         except GraphError as error:
@@ -66,7 +58,7 @@ class PartGraph:
 
 
 def misfit(given: SessionPort, taken: SessionPort) -> bool:
-    """Return whether what one gives can never be what the other takes."""
+    """Return whether an output can never feed an input."""
     if given.type != taken.type:
         return True
     if not given.shape or not taken.shape:  # not known
@@ -78,7 +70,7 @@ def misfit(given: SessionPort, taken: SessionPort) -> bool:
 
 
 def told(port: SessionPort) -> str:
-    """Say type and shape: ``float [1, 6, 2]``."""
+    """Describe type and shape: ``float [1, 6, 2]``."""
     element = port.type.removeprefix("tensor(").removesuffix(")")
     return f"{element} {list(port.shape)}"
 

@@ -24,18 +24,18 @@ class SplitStack:
     """A stack of several files as one model.
 
     Attributes:
-        path: of the TOML.
-        content: of it.
-        files: the ONNX files, by label: ``head``, ``head.first_frame``.
-        inputs: what frames and the state hold, by name.
-        outputs: what comes out at every frame, by name: ``NAME``, or ``PART.NAME``
-            where two parts have one of that name.
+        path: path of the TOML file.
+        content: content of the TOML file.
+        files: the ONNX files by label: ``head``, ``head.first_frame``.
+        inputs: the inputs by name, including the state.
+        outputs: the outputs present at every frame, by name: ``NAME``, or ``PART.NAME``
+            where two parts share a name.
         answers: part and output behind each of these names.
         recurrent: ``{input: output}`` of the state that is fed forward.
-        first_values: of recurrent inputs that do not begin at zeros.
-        at_first: how the files are joined where a scene begins.
-        at_next: how they are joined at other frames.
-        metadata: of all files and of the TOML, which wins.
+        first_values: first values of recurrent inputs that are not zeros.
+        at_first: connections of the files where a scene begins.
+        at_next: connections at other frames.
+        metadata: metadata of all files and of the TOML file, which wins.
     """
 
     path: Path
@@ -55,8 +55,8 @@ class SplitStack:
         """Read a TOML file and the files it names, and join them.
 
         Raises:
-            GraphError: a file is missing or no graph, or they do not fit each other;
-                the message names the TOML, and part and tensor.
+            GraphError: a file is missing or no graph, or the files do not fit each
+                other; the message names the TOML file, the part and the tensor.
         """
         content = StackFile.load(path)
         try:
@@ -83,14 +83,14 @@ class SplitStack:
         )
 
     def saying(self, said: Mapping[str, str]) -> Self:
-        """Return it with metadata that win over its own."""
+        """Return the stack with metadata that override its own."""
         pairs = {**self.recurrent, **(declared_pairs(said) or {})}
         recurrent = {name: to for name, to in pairs.items() if to is not None}
         metadata = {**self.metadata, **said}
         return dataclasses.replace(self, recurrent=recurrent, metadata=metadata)
 
     def paths(self) -> tuple[Path, ...]:
-        """Return every file that belongs to it: the TOML, graphs, first values."""
+        """Return every file that belongs to it: the TOML file, graphs, first values."""
         named = (self.path.parent / each.first for each in self.content.state.values())
         return (
             self.path,
@@ -99,7 +99,7 @@ class SplitStack:
         )
 
     def sha256(self) -> str:
-        """Return a digest of all its files, wherever they lie."""
+        """Return a digest of the content of all its files."""
         seal = hashlib.sha256()
         for each in self.paths():
             seal.update(graph.sha256_of(each).encode())
@@ -123,12 +123,12 @@ class SplitStack:
 
 
 def is_stack(path: str | Path) -> bool:
-    """Return whether a file is a description of a stack, by its name."""
+    """Return whether a file name is that of a stack's TOML file."""
     return Path(path).suffix == SUFFIX
 
 
 def digest_of_files(path: Path) -> str:
-    """Return the SHA-256 of an ONNX file with its weights, or of all of a stack.
+    """Return the SHA-256 of an ONNX file with its weights, or of a whole stack.
 
     Raises:
         GraphError: the files of a stack do not fit each other.

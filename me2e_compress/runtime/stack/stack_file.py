@@ -1,4 +1,4 @@
-"""What the TOML file of a stack of several ONNX files says."""
+"""The TOML file that describes a stack of several ONNX files."""
 
 import json
 import re
@@ -11,9 +11,9 @@ from me2e_compress import documents
 from me2e_compress.errors import GraphError
 
 SUFFIX = ".toml"
-"""Ending of a file that describes a stack: wherever a model is asked for."""
+"""Suffix of a file that describes a stack, wherever a model is expected."""
 ZEROS = "zeros"
-"""The first value of a state that says nothing else."""
+"""The default first value of a state."""
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 _STRICT = pydantic.ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
@@ -27,8 +27,8 @@ class PartEntry(pydantic.BaseModel):
         file: the ONNX file, relative to the TOML; without one, the part runs at first
             frames alone.
         first_frame: the ONNX file that runs instead where a scene begins.
-        recipe: how ``compress`` makes it smaller, where no recipe is given for all: a
-            recipe's name, or its TOML file, relative to this one.
+        recipe: how ``compress`` treats it, where no recipe is given for all: a recipe's
+            name, or its TOML file, relative to this one.
     """
 
     model_config = _STRICT
@@ -57,10 +57,10 @@ class StateEntry(pydantic.BaseModel):
 
     Attributes:
         answer: the output that is fed back; in the file ``from``. None leaves it to
-            the naming rules: ``X`` is answered by ``X_out``, ``prev_X`` by ``next_X``.
+            the naming rules: ``X_out`` for ``X``, ``next_X`` for ``prev_X``.
         first: the value where a scene begins: ``zeros``, a file ``.npy`` or ``.npz``
-            relative to the TOML, or ``PART.NAME``: an initializer of that part, or an
-            output of it at that very frame.
+            relative to the TOML, or ``PART.NAME``: an initializer of that part, or its
+            output at that frame.
     """
 
     model_config = _STRICT
@@ -74,15 +74,15 @@ def _entry(value: object) -> object:
 
 
 class StackFile(pydantic.BaseModel):
-    """The content of the file.
+    """The content of the TOML file.
 
     Attributes:
         part: the parts, in any order.
         edges: ``{input: output}``, each ``PART.NAME`` or a name that one part alone
-            has; equal names are joined without.
-        state: by input, what is fed back to it; a text alone is the output.
-        metadata: what the ONNX files should say and do not, such as ``me2e.plan``;
-            what is no text is written as JSON.
+            has; equal names are joined automatically.
+        state: what is fed back to each input; a text alone is the output.
+        metadata: metadata that the ONNX files lack, such as ``me2e.plan``; values that
+            are not text are written as JSON.
     """
 
     model_config = _STRICT
@@ -113,16 +113,12 @@ class StackFile(pydantic.BaseModel):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a file.
-
-        Raises:
-            GraphError: it cannot be read, or says what no stack has.
-        """
+        """Read a file; GraphError if it cannot be read or has unknown entries."""
         with documents.reading(path, GraphError, "not a stack of several files"):
             return cls.model_validate(documents.from_toml(documents.content(path)))
 
     def text(self) -> str:
-        """Write it as TOML."""
+        """Return the content as TOML."""
         lines = list[str]()
         for each in self.part:
             lines += ["[[part]]", *_lines(each.model_dump(mode="json")), ""]
@@ -144,12 +140,12 @@ class StackFile(pydantic.BaseModel):
 
 
 def first_label(part: str) -> str:
-    """Return how the file is called that runs where a scene begins."""
+    """Return the label of the file that runs where a scene begins."""
     return f"{part}.first_frame"
 
 
 class _Inline(str):
-    """TOML that stands as it is."""
+    """Ready-made TOML that is not quoted again."""
 
     __slots__ = ()
 
@@ -170,5 +166,5 @@ def _lines(entries: dict[str, Any]) -> list[str]:
 
 
 def _quoted(text: str) -> str:
-    """Write a TOML string: JSON's escapes are TOML's, but for delete."""
+    """Return a TOML string: JSON's escapes are valid in TOML, except for delete."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -1,4 +1,4 @@
-"""A stack of several files, ready to run."""
+"""Run a stack of several files as one session."""
 
 import dataclasses
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -17,13 +17,7 @@ from me2e_compress.runtime.stack.split_stack import SplitStack, is_stack
 
 @dataclasses.dataclass(frozen=True)
 class PartRun:
-    """One file of a stack at one frame.
-
-    Attributes:
-        label: of the file: ``head``, ``head.first_frame``.
-        feeds: what it was given, by its own names.
-        values: what it answered, by its own names.
-    """
+    """The inputs and outputs of one file of a stack at one frame, by its own names."""
 
     label: str
     feeds: Mapping[str, Array]
@@ -31,13 +25,7 @@ class PartRun:
 
 
 class StackSession:
-    """The sessions of a stack's files as one.
-
-    Args:
-        stack: the files, joined.
-        sessions: one a file, by label.
-        provider: what runs them.
-    """
+    """The sessions of a stack's files, by label, as one session."""
 
     def __init__(
         self,
@@ -64,7 +52,7 @@ class StackSession:
 
         Raises:
             GraphError: onnxruntime cannot run one of them; the message names it.
-            ProviderError: the provider is not there.
+            ProviderError: the provider is not available.
         """
         sessions = dict[str, Session]()
         for label, each in stack.files.items():
@@ -83,12 +71,12 @@ class StackSession:
 
     @property
     def inputs(self) -> Mapping[str, SessionPort]:
-        """By name, what must be fed, in order."""
+        """The inputs by name, in order."""
         return self.stack.inputs
 
     @property
     def outputs(self) -> Mapping[str, SessionPort]:
-        """By name, what comes out at every frame, in order."""
+        """The outputs present at every frame by name, in order."""
         return self.stack.outputs
 
     @property
@@ -102,9 +90,9 @@ class StackSession:
         return self.stack.recurrent
 
     def first_state(self, held: Mapping[str, Array]) -> dict[str, Array]:
-        """Return the first values of those recurrent inputs that a first frame reads.
+        """Return the first values of the recurrent inputs that a first frame reads.
 
-        What is held wins, then what the stack says, then zeros.
+        ``held`` takes precedence, then the stack's first values, then zeros.
 
         Raises:
             GraphError: an input of unknown shape has no first value.
@@ -124,15 +112,10 @@ class StackSession:
         *,
         first: bool = False,
     ) -> dict[str, Array]:
-        """Run every file once, each behind those that feed it.
-
-        Args:
-            feeds: one array for every input; other names are ignored.
-            outputs: which to return; None for all.
-            first: whether a scene begins here.
+        """Run every file once, in topological order.
 
         Raises:
-            FramesError: an input is missing, or has not the type or shape it must.
+            FramesError: an input is missing or has the wrong type or shape.
             GraphError: a node failed on these inputs.
         """
         wanted = self.outputs if outputs is None else outputs
@@ -151,15 +134,10 @@ class StackSession:
         first: bool = False,
         parts: Collection[str] | None = None,
     ) -> Iterator[PartRun]:
-        """Run file after file; whoever stops asking leaves the rest unrun.
-
-        Args:
-            feeds: one array for every input that they read.
-            first: whether a scene begins here.
-            parts: those that run; None for all.
+        """Run the files lazily, one for each item; ``parts`` restricts which ones run.
 
         Raises:
-            FramesError: an input is missing, or has not the type or shape it must.
+            FramesError: an input is missing or has the wrong type or shape.
             GraphError: a node failed on these inputs.
         """
         joints = self._joints(first=first)
@@ -169,6 +147,7 @@ class StackSession:
                 continue
             label = joints.graphs[part].label
             session = self.sessions[label]
+            # Feed the file from earlier files, the frame and the state.
             fed = {
                 name: values[source] if source.part else self._fed(source.name, feeds)
                 for name, source in joints.sources[part].items()
@@ -210,7 +189,7 @@ def open_session(
     Raises:
         GraphError: no such file, files that do not fit each other, or onnxruntime
             cannot run one.
-        ProviderError: the provider is not there.
+        ProviderError: the provider is not available.
     """
     if is_stack(path):
         return StackSession.open(

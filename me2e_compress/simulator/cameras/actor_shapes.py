@@ -17,11 +17,8 @@ VEHICLE_SHADOW = shadow((-0.53, 0.53), (-0.56, 0.56))
 def _wheels(box: Box, u: tuple[float, ...], radius: float, top: float) -> list[Quad]:
     """Build wheels on both sides of a box, from the ground up to v = top.
 
-    Args:
-        box: Where.
-        u: Their places, from the rear (0) to the front (1).
-        radius: As a part of the length of the box.
-        top: As a part of the height of the box.
+    ``u`` holds their places from the rear (0) to the front (1); ``radius`` is a share
+    of the length of the box, ``top`` of its height.
     """
     low, high = box.faces["left"][0, 2], box.faces["left"][2, 2]
     ground = -low / (high - low)
@@ -65,6 +62,7 @@ def car() -> Template:
 
 def van(*, beacon: bool) -> Template:
     """Return a van, or an ambulance with its stripes and its beacon."""
+    # lower body with lamps, stripes and wheels
     body = Box(FULL, FULL, (0.15, 0.5), Slot.BODY)
     roof, front = (0.92 if beacon else 1.0), ((-0.5, 0.42), (-0.5, 0.3))
     upper = Box(front[0], FULL, (0.5, roof), Slot.BODY, front[1], (-0.47, 0.47))
@@ -74,6 +72,7 @@ def van(*, beacon: bool) -> Template:
             body.on(f, (0.0, 1.0), (0.8, 1.0), Slot.STRIPE) for f in ("left", "right")
         ]
     decals += _wheels(body, (0.19, 0.81), 0.07, 0.45)
+    # upper body with its windows
     glass = [upper.on("front", (0.07, 0.93), (0.1, 0.85), Slot.GLASS)]
     glass += [upper.on("right", (0.68, 0.95), (0.2, 0.8), Slot.GLASS)]
     glass += [upper.on("left", (0.05, 0.32), (0.2, 0.8), Slot.GLASS)]
@@ -92,11 +91,13 @@ def van(*, beacon: bool) -> Template:
 def truck() -> tuple[Template, Template]:
     """Return cargo and cab: two solids, so that the nearer one is painted last."""
     cargo_x, cab_x = (-0.5, 0.18), (0.21, 0.5)
+    # cargo on its bed
     bed = Box(cargo_x, FULL, (0.17, 0.32), Slot.TRIM)
     cargo = Box(cargo_x, FULL, (0.32, 1.0), Slot.STRIPE)
     rear = [quad for quad in _lamps(bed, (0.52, 0.95), 0.14) if quad.corners[0, 0] < 0]
     rear += _wheels(bed, (0.3, 0.62), 0.09, 0.5)
     back = [cargo.on("back", (0.49, 0.51), (0.0, 1.0), Slot.TRIM)]
+    # cab
     cab = Box(cab_x, FULL, (0.14, 0.82), Slot.BODY)
     front = [quad for quad in _lamps(cab, (0.17, 0.28), 0.14) if quad.corners[0, 0] > 0]
     front += [cab.on("front", (0.06, 0.94), (0.5, 0.92), Slot.GLASS)]
@@ -124,11 +125,13 @@ def pedestrian() -> Template:
 def bicycle() -> Template:
     """Return a bicycle and its rider."""
     quads = [shadow((-0.5, 0.5), (-0.3, 0.3))]
+    # wheels
     for x in (-0.32, 0.32):
         for half, low, high in ((0.18, 0.12, 0.36), (0.09, 0.0, 0.48)):
             corners = [(x - half, 0.0, low), (x + half, 0.0, low)]
             corners += [(x + half, 0.0, high), (x - half, 0.0, high)]
             quads += plate(corners, Slot.TYRE)
+    # frame and rider
     frame = Box((-0.3, 0.3), (-0.06, 0.06), (0.25, 0.45), Slot.STRIPE)
     legs = Box((-0.14, 0.1), (-0.25, 0.25), (0.2, 0.52), Slot.LEGS)
     torso = Box(

@@ -1,4 +1,4 @@
-"""What weather and sensor faults do to the images."""
+"""The effects of weather and sensor faults on the images."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -31,12 +31,7 @@ DULL = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Atmosphere:
-    """Applies fog and darkness, to the ground by pixel and to solids by place.
-
-    Args:
-        ground: Gives the place of each ground pixel in the ego frame.
-        weather: The options.
-    """
+    """Applies fog and darkness, to the ground by pixel and to solids by position."""
 
     ground: GroundSampler
     weather: Weather
@@ -107,12 +102,7 @@ POOL = 2
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """Adds sensor faults; the same weather, seed and time give the same bytes.
-
-    Args:
-        rig: The cameras.
-        weather: The options.
-    """
+    """Adds sensor faults; the same weather, seed and time give the same bytes."""
 
     rig: CameraRig
     weather: Weather

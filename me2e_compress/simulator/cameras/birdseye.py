@@ -32,9 +32,6 @@ class BirdseyeGrid:
         cell_m: Side of a cell.
         rows: Number of rows.
         columns: Number of columns.
-
-    Raises:
-        EvaluationError: The grid is empty.
     """
 
     front_m: float = 51.2
@@ -44,7 +41,6 @@ class BirdseyeGrid:
     columns: int = 200
 
     def __post_init__(self) -> None:
-        """Check the size."""
         if self.cell_m <= 0 or self.rows < 1 or self.columns < 1:
             raise EvaluationError(
                 f"bird's-eye grid of {self.rows} x {self.columns} cells of "
@@ -70,15 +66,9 @@ def bev_classes(scene: Scene, texture: GroundTexture, grid: BirdseyeGrid) -> Byt
 
 
 def ground_classes(ego: Ego, texture: GroundTexture, grid: BirdseyeGrid) -> Bytes:
-    """Return the class of the ground at the centre of each cell, actors left out.
+    """Return the `PixelClass` of the ground at each cell's centre, without actors.
 
-    Args:
-        ego: Where the grid lies.
-        texture: The painted ground of the route.
-        grid: The cells.
-
-    Returns:
-        `PixelClass`, uint8 [rows, columns].
+    The result is uint8 [rows, columns]; the grid lies at ``ego``.
     """
     # an affine map from cells to texels
     cos, sin = np.cos(ego.heading), np.sin(ego.heading)
@@ -105,10 +95,7 @@ def ground_classes(ego: Ego, texture: GroundTexture, grid: BirdseyeGrid) -> Byte
 def covered(actors: Sequence[Actor], ego: Ego, grid: BirdseyeGrid) -> Flags:
     """Return whether each cell is touched by an actor: bool [rows, columns].
 
-    Args:
-        actors: Boxes of any instant.
-        ego: Where the grid lies, at the same instant or another.
-        grid: The cells.
+    ``ego`` may be of another instant than the actors.
     """
     touched = np.zeros((grid.rows, grid.columns), np.uint8)
     for actor in actors:

@@ -1,4 +1,4 @@
-"""What a pixel shows: the classes of the label rasters."""
+"""Classes of pixels in the label rasters."""
 
 from enum import IntEnum
 
@@ -40,4 +40,4 @@ ACTOR_CLASSES = {
     ActorKind.CONE: PixelClass.STATIC,
     ActorKind.BARRIER: PixelClass.STATIC,
 }
-"""What an actor's pixels are."""
+"""The class of an actor's pixels."""

@@ -1,10 +1,10 @@
 """The ground in all six cameras: rows of the texture, sampled anew each frame.
 
 A camera without pitch and roll sees, in each of its rows, a straight segment of the
-ground at constant depth. So one row of an image is a point and a step in the ego
-frame; both turn and move with the ego, and the pixels of all rows of all cameras are
-one outer product. Rows far away are short in the image and long on the ground: they are
-sampled several times, which keeps distant lines without flicker.
+ground at constant depth. So one row of an image is a point and a step in the ego frame;
+both turn and move with the ego, and the pixels of all rows of all cameras are one outer
+product. Rows far away are short in the image and long on the ground: they are sampled
+several times, which keeps distant lines from flickering.
 """
 
 from dataclasses import dataclass, replace
@@ -51,7 +51,7 @@ class RowGroup:
         steps: [T, R, 2] metres from one column to the next.
         levels: [R] mip level.
         blocks: (level, first, last) slices of the rows.
-        coordinates: Two [T, R, W], working memory, written anew in every frame.
+        coordinates: Two [T, R, W], working memory, overwritten in every frame.
         samples: [T, R, W, 4], likewise.
     """
 
@@ -66,11 +66,7 @@ class RowGroup:
 
 @dataclass(frozen=True, eq=False)
 class GroundSampler:
-    """Draws the ground of a rig from a texture, on one thread at a time.
-
-    Args:
-        rig: The cameras.
-    """
+    """Draws the ground of a rig from a texture, on one thread at a time."""
 
     rig: CameraRig
 
@@ -80,6 +76,7 @@ class GroundSampler:
         for group in self._groups:
             u, v = self._coordinates(group, texture, ego)
             taps = group.samples
+            # sample every row from its own mip level, then average
             for level, first, last in group.blocks:
                 for tap in range(len(u)):
                     cv2.remap(
@@ -158,14 +155,17 @@ class GroundSampler:
     def _group(
         self, camera: npt.NDArray[np.intp], row: npt.NDArray[np.intp], taps: int
     ) -> RowGroup:
+        # rows sorted by mip level, so that each level is one slice
         levels = self._levels(camera, row, taps)
         order = np.argsort(levels, kind="stable")
         camera, row, levels = camera[order], row[order], levels[order]
+        # start and step of each row on the ground
         depth = row_depths(self.rig, taps)[:, camera, row][..., None]
         right = self.rig.rotations[camera, 0, :2]
         forward = self.rig.rotations[camera, 2, :2]
         steps = depth / self.rig.focals_px[camera, None] * right
         centre = self.rig.positions[camera, :2] + depth * forward
+        # slices of equal level
         found, first = np.unique(levels, return_index=True)
         last = [*first[1:].tolist(), len(levels)]
         shape = (taps, len(levels), self.rig.width)

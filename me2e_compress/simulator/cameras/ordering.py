@@ -1,4 +1,4 @@
-"""Which solid hides which: the painting order of every camera.
+"""The painting order of every camera: which solid hides which.
 
 Far to near by distance is wrong for a long truck beside a small car. Two convex
 footprints that do not overlap have an edge of one of them that separates them; the
@@ -27,17 +27,15 @@ class Edges(NamedTuple):
     normal_x: Floats
     normal_y: Floats
     at: Floats
-    """Of the edge along its normal: negative if the camera is outside."""
+    """Position of the edge along its normal: negative if the camera is outside."""
 
 
 def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints, Ints]:
     """Order the visible solids of every camera from far to near.
 
-    Args:
-        right: [K, 4, S] corners of the solids' footprints in the frame of each of K
-            cameras, which sit at the origin; convex, counter-clockwise from above.
-        forward: [K, 4, S] the other coordinate.
-        visible: [K, S] which solids a camera may see.
+    ``right`` and ``forward`` [K, 4, S] are the corners of the solids' footprints in the
+    frame of each of K cameras, which sit at the origin; convex, counter-clockwise from
+    above. ``visible`` [K, S] is which solids a camera may see.
 
     Returns:
         Camera and solid, [V] each: camera by camera, the first to paint first.
@@ -89,8 +87,8 @@ def _edges(x: Floats, y: Floats) -> Edges:
 def _hides(edges: Edges, front: Ints, back: Ints) -> Flags:
     """Return whether an edge shows that solid front[i] is on the camera's side.
 
-    Either an edge of the one at the back, with the camera and the one in front both
-    outside of it, or an edge of the one in front, with the camera inside.
+    Either an edge of the back solid has both the camera and the front solid outside, or
+    an edge of the front solid has the camera inside.
     """
     shown = _outside(edges, back, front) & (edges.at[:, back] < 0.0)
     shown |= _outside(edges, front, back) & (edges.at[:, front] >= 0.0)

@@ -37,10 +37,10 @@ class Faces:
         cameras: [M] index of the camera.
         polygons: M arrays int32 [N, 1 or 4.., 2], fixed-point pixels for cv2.
         colours: [M, 3] RGB.
-        lamps: [M] whether it shines by itself.
+        lamps: [M] whether it emits light.
         details: [M] whether it lies on another face.
         kinds: [M] `PixelClass`.
-        places: [M, 2] where its solid stands, metres in the ego frame.
+        places: [M, 2] position of its solid, metres in the ego frame.
         distances: [M] metres from the camera to its solid.
     """
 
@@ -68,11 +68,7 @@ NO_FACES = Faces(
 
 @dataclass(frozen=True, eq=False)
 class Painter:
-    """Turns solids into the polygons that a rig sees.
-
-    Args:
-        rig: The cameras.
-    """
+    """Turns solids into the polygons that a rig sees."""
 
     rig: CameraRig
 
@@ -228,7 +224,7 @@ def _towards(points: Floats) -> Flags:
 
 
 def _cut(polygon: list[list[float]]) -> Floats:
-    """Cut a polygon of (x, y, depth) at the near plane: the part before it, [N, 3]."""
+    """Return the part [N, 3] of a polygon (x, y, depth) before the near plane."""
     kept = list[list[float]]()
     for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
         if a[2] >= NEAR_M:

@@ -30,19 +30,14 @@ TALLEST = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Sky:
-    """Fills the rows above the horizon.
-
-    Args:
-        rig: The cameras.
-        seed: Of the skyline, which is the same for all cameras and frames.
-    """
+    """Fills the rows above the horizon with one seeded skyline for all cameras."""
 
     rig: CameraRig
     seed: int = 0
 
     @property
     def height(self) -> int:
-        """How many rows of an image are sky: those with their centre above it."""
+        """The number of sky rows: those with their centre above the horizon."""
         return int(np.floor(self.rig.centre_px[1] + 0.5))
 
     def paint(self, images: Bytes, heading: float) -> None:
@@ -78,10 +73,12 @@ class Sky:
     def _panorama(self) -> npt.NDArray[np.uint32]:
         """[ROWS * 2 * COLUMNS] RGBA texels, twice around: no index needs to wrap."""
         rng = np.random.default_rng(self.seed)
+        # a gradient from haze to zenith
         elevation = TALLEST * (1.0 - (np.arange(ROWS) + 0.5) / ROWS)[:, None]
         share = np.sqrt(elevation / TALLEST)[..., None]
         sky = (1 - share) * np.array(HAZE, float) + share * np.array(ZENITH, float)
         picture = np.repeat(sky, COLUMNS, axis=1)
+        # hills, then trees, antialiased along their skylines
         layers = (
             (HILLS, 0.045, 0.035, (2, 3, 5, 9)),
             (TREES, 0.014, 0.012, (7, 23, 61, 137)),
@@ -106,13 +103,7 @@ def _skyline(waves: tuple[int, ...], rng: np.random.Generator) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Cameras:
-    """Renders scenes; the pixels depend on the scene (and its time) alone.
-
-    Args:
-        texture: The painted ground of the route, from `paint_texture`.
-        rig: The cameras.
-        weather: Weather and sensor faults.
-    """
+    """Renders scenes; the pixels depend on the scene (and its time) alone."""
 
     texture: GroundTexture
     rig: CameraRig = field(default_factory=CameraRig)

@@ -100,10 +100,9 @@ STATE_LAMPS = {
 
 @dataclass(frozen=True, slots=True)
 class Solid:
-    """A template, painted and put somewhere in the world.
+    """A template, painted and placed in the world.
 
     Attributes:
-        template: Its shape.
         colours: float64 [Q, 3] RGB of its faces, shading applied.
         pose: x, y, heading in the world; metres and radians.
         size: Length, width, height in metres.
@@ -130,6 +129,7 @@ def solids_of(scene: Scene) -> list[Solid]:
 
 
 def _actor_solids(actor: Actor, time_us: int) -> list[Solid]:
+    # lamps that are on at this instant
     lit: list[Slot] = []
     if actor.braking:
         lit += [Slot.TAIL_LAMP, Slot.THIRD_LAMP]
@@ -138,6 +138,7 @@ def _actor_solids(actor: Actor, time_us: int) -> list[Solid]:
         lit.append(Slot.INDICATOR_LEFT if left else Slot.INDICATOR_RIGHT)
     if actor.kind is ActorKind.EMERGENCY and time_us // BEACON_US % 2 == 0:
         lit.append(Slot.BEACON)
+    # one solid per piece of the actor's shape
     paint, stripe = _paint(actor), STRIPES.get(actor.kind, DIM[Slot.STRIPE])
     return [
         Solid(
@@ -152,7 +153,7 @@ def _actor_solids(actor: Actor, time_us: int) -> list[Solid]:
 
 
 def _paint(actor: Actor) -> Colour:
-    """Return an actor's colour: of its kind, or by its id, the same in every frame."""
+    """Return an actor's colour, by its kind or id, the same in every frame."""
     if actor.kind in FIXED_PAINT:
         return FIXED_PAINT[actor.kind]
     people = actor.kind in (ActorKind.PEDESTRIAN, ActorKind.BICYCLE)

@@ -1,8 +1,8 @@
 """Shapes that the painter knows: lists of quadrilaterals in painting order.
 
-A template lives in the box it is scaled to: x from -0.5 (rear) to 0.5 (front), y from
--0.5 (right) to 0.5 (left), z from 0 (ground) to 1 (top). Quadrilaterals wind counter-
-clockwise seen from outside, so those that turn their back are not drawn.
+A template lives in a unit box that is scaled to the solid: x from -0.5 (rear) to 0.5
+(front), y from -0.5 (right) to 0.5 (left), z from 0 (ground) to 1 (top). Quadrilaterals
+wind counter-clockwise seen from outside, so that back faces are not drawn.
 """
 
 from collections.abc import Iterable
@@ -17,7 +17,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class Slot(IntEnum):
-    """Which of the colours of a solid a quadrilateral wears."""
+    """Which of a solid's colours a quadrilateral has."""
 
     SHADOW = 0
     BODY = 1
@@ -43,7 +43,7 @@ FIRST_LAMP = Slot.HEADLAMP
 
 
 class Quad(NamedTuple):
-    """One face: corners [4, 3], its colour and how it is lit."""
+    """One face: corners [4, 3], its colour and its shading."""
 
     corners: Floats
     slot: Slot
@@ -54,12 +54,12 @@ class Quad(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """A convex piece of something, or a stack of such pieces, lowest first.
+    """A convex solid, or a stack of convex solids, lowest first.
 
     Attributes:
         corners: [3, 4, Q] x, y, z of the four corners of each face, in the unit box.
         slots: [Q] values of `Slot`.
-        shades: [Q] brightness of the colour, by which way the face looks.
+        shades: [Q] brightness of the colour, by the direction of the face.
         details: [Q] whether it lies on another face.
         footprint: [2, 4] x, y of its rectangle on the ground, counter-clockwise.
     """
@@ -80,13 +80,8 @@ SHADES = {"top": 1.08, "front": 0.90, "back": 0.78, "left": 0.96, "right": 0.70}
 class Box:
     """A box whose upper side may be smaller (a cabin, a cone): five faces.
 
-    Args:
-        x: Rear and front at the foot.
-        y: Right and left at the foot.
-        z: Bottom and top.
-        slot: Colour.
-        top_x: Rear and front at the top, if different.
-        top_y: Right and left at the top, if different.
+    The ranges are (rear, front) for ``x`` and ``top_x``, (right, left) for ``y`` and
+    ``top_y``, (bottom, top) for ``z``.
     """
 
     def __init__(
@@ -98,6 +93,7 @@ class Box:
         top_x: tuple[float, float] | None = None,
         top_y: tuple[float, float] | None = None,
     ) -> None:
+        # corners of the foot and of the top
         (rear, front), (right, left) = x, y
         (rear_t, front_t), (right_t, left_t) = top_x or x, top_y or y
         low, high = z
@@ -106,6 +102,7 @@ class Box:
         roof.append((rear_t, left_t))
         a, b, c, d = (np.array([*p, low]) for p in foot)
         e, f, g, h = (np.array([*p, high]) for p in roof)
+        # faces counter-clockwise, seen from outside
         self.slot = slot
         self.faces: dict[str, Floats] = {
             "right": np.array([a, b, f, e]),
@@ -128,12 +125,8 @@ class Box:
     ) -> Quad:
         """Return a patch of a face.
 
-        Args:
-            face: Its name.
-            u: From and to, along its lower edge (from the right end seen from the
-                side it faces away from: counter-clockwise seen from above).
-            v: From and to, upwards.
-            slot: Colour.
+        ``u`` runs along the face's lower edge, counter-clockwise seen from above, and
+        ``v`` upwards, both from 0 to 1.
         """
         corners = ((u[0], v[0]), (u[1], v[0]), (u[1], v[1]), (u[0], v[1]))
         return self._patch(face, corners, slot)
@@ -145,14 +138,7 @@ class Box:
         radii: tuple[float, float],
         slot: Slot,
     ) -> list[Quad]:
-        """Return an octagon on a face, as three quadrilaterals.
-
-        Args:
-            face: Its name.
-            centre: (u, v) as in `on`.
-            radii: In u and in v.
-            slot: Colour.
-        """
+        """Return an octagon on a face, as three quadrilaterals; see `on` for (u, v)."""
         (u, v), (wide, high) = centre, radii
         narrow, low = 0.4142 * wide, 0.4142 * high
         bands = (
@@ -206,7 +192,7 @@ def template(
     x: tuple[float, float] = (-0.5, 0.5),
     y: tuple[float, float] = (-0.5, 0.5),
 ) -> Template:
-    """Put quadrilaterals together; x and y say where they stand."""
+    """Join quadrilaterals; x and y are the extent of the footprint."""
     faces = list(quads)
     return Template(
         corners=np.stack([quad.corners.T for quad in faces], axis=2),

@@ -52,11 +52,11 @@ class GroundTexture:
 
     @property
     def nbytes(self) -> int:
-        """Memory of all rasters."""
+        """Memory of all rasters in bytes."""
         return self.classes.nbytes + sum(level.nbytes for level in self.levels)
 
     def __post_init__(self) -> None:
-        """Freeze the rasters: many frames are sampled from them."""
+        """Make the rasters read-only: many frames are sampled from them."""
         for raster in (*self.levels, self.classes):
             raster.flags.writeable = False
 
@@ -66,11 +66,10 @@ def paint_texture(
 ) -> GroundTexture:
     """Paint lanes, markings, stop lines, crosswalks and the verge.
 
-    Args:
-        roadmap: What to paint.
-        route: [N, 2] metres: the texture covers their bounding box and 60 m around.
-        seed: Of the grain of grass and asphalt.
+    The texture covers the bounding box of ``route``, [N, 2] metres, and 60 m around.
+    ``seed`` is that of the grain of grass and asphalt.
     """
+    # the raster's extent
     west, south = route.min(axis=0) - MARGIN_M
     east, north = route.max(axis=0) + MARGIN_M
     height, width = (_texels(span) for span in (north - south, east - west))
@@ -81,6 +80,7 @@ def paint_texture(
         colours=np.empty((height, width, 3), np.uint8),
         classes=np.full((height, width), PixelClass.TERRAIN, np.uint8),
     )
+    # from grass up: lanes, grain, then everything painted on top
     plan.colours[:] = GRASS
     paint_lanes(plan, roadmap)
     _add_grain(plan, np.random.default_rng(seed))

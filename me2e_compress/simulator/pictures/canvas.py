@@ -16,7 +16,7 @@ SUBPIXEL_BITS = 4
 
 @dataclass(frozen=True, eq=False)
 class Canvas:
-    """A picture uint8 [H, W, 3] and the way from the world to its pixels.
+    """A picture uint8 [H, W, 3] and the map from the world to its pixels.
 
     Attributes:
         pixels: RGB, changed in place.
@@ -98,7 +98,7 @@ class Text:
 
 
 def write(pixels: Bytes, texts: Iterable[Text]) -> None:
-    """Set texts into uint8 [H, W, 3], in the font that comes with Pillow."""
+    """Draw texts into uint8 [H, W, 3], in the font that comes with Pillow."""
     image = Image.fromarray(pixels)
     draw = ImageDraw.Draw(image)
     for text in texts:

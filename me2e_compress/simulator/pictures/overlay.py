@@ -18,20 +18,19 @@ FRONT = ("FRONT_LEFT", "FRONT", "FRONT_RIGHT")
 def overlay(one: RoutePicture, other: RoutePicture) -> npt.NDArray[np.uint8]:
     """Draw the last moments of two drives: uint8 [H, W, 3].
 
-    On the left what the front cameras of both see, the other's above; on the right one
-    view from above, the other drive under the first in grey.
-
-    Args:
-        one: The drive in colour; its traffic is shown.
-        other: The drive it is held against.
+    On the left are the front cameras of both, the other's above; on the right is one
+    view from above, the other drive under the first in grey. The traffic shown is that
+    of ``one``, the drive in colour.
     """
     last, before = len(one.moments) - 1, len(other.moments) - 1
+    # front cameras of both drives
     rows = [
         in_row([drive.tile(index, name) for name in FRONT])
         for drive, index in ((other, before), (one, last))
     ]
     cameras = in_column(rows)
     height = cameras.shape[0]
+    # one view from above
     moment, then = one.moments[last], other.moments[before]
     view = one.birdseye.draw(
         moment.scene,
@@ -42,6 +41,7 @@ def overlay(one: RoutePicture, other: RoutePicture) -> npt.NDArray[np.uint8]:
         OtherDrive(then.scene.ego, other.trail, then.waypoints),
     )
     picture = in_row([cameras, view])
+    # a caption line for each
     caption = np.full((2 * CAPTION, picture.shape[1], 3), PAPER, np.uint8)
     words = [*other.words(before, OTHER, 7), *one.words(last, EGO, 7 + CAPTION)]
     write(caption, words)

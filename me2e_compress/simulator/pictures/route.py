@@ -38,13 +38,13 @@ NO_IMAGE = (226, 228, 232)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """What was recorded at one frame.
+    """The record of one frame.
 
     Attributes:
-        scene: Everything there was.
+        scene: The whole scene.
         images: The six cameras, uint8 [6, H, W, 3] RGB; None if not rendered.
         plan: [n, 2] metres in the ego frame: the plan in force; None before the first,
-            and of a policy that answers controls.
+            and for a policy that answers controls.
         events: Events, at least since the moment before; a repeated event is drawn
             once.
         score: Driving score so far, 0 to 100; None if not computed.
@@ -72,9 +72,6 @@ class RoutePicture:
         route: [N, 2] world points of the route.
         moments: In order of time, at least one.
         tile_width: Width of a camera's tile in pixels.
-
-    Raises:
-        EvaluationError: There are no moments.
     """
 
     title: str
@@ -84,7 +81,6 @@ class RoutePicture:
     tile_width: int = 320
 
     def __post_init__(self) -> None:
-        """Check that there is something to draw."""
         if not self.moments:
             raise EvaluationError(f"{self.title}: no moments to draw")
 
@@ -116,7 +112,7 @@ class RoutePicture:
         return in_row(columns)
 
     def tile(self, index: int, name: str) -> Bytes:
-        """Draw what one camera sees, with its name."""
+        """Draw one camera's image, with its name."""
         images = self.moments[index].images
         if images is None:
             height, width = self._image_size
@@ -133,7 +129,7 @@ class RoutePicture:
 
     @cached_property
     def _image_size(self) -> tuple[int, int]:
-        """Size of the images that there are, or that of a default rig."""
+        """Size of the recorded images, or that of a default rig."""
         sizes = (m.images.shape[1:3] for m in self.moments if m.images is not None)
         height, width = next(sizes, (96, 160))
         return int(height), int(width)
@@ -168,12 +164,12 @@ class RoutePicture:
 
     @cached_property
     def trail(self) -> Floats:
-        """[N, 2] where the ego was, world metres."""
+        """[N, 2] positions of the ego, world metres."""
         return np.array([(m.scene.ego.x, m.scene.ego.y) for m in self.moments])
 
     @cached_property
     def birdseye(self) -> BirdsEye:
-        """Draws the view from above."""
+        """The drawer of the view from above."""
         return BirdsEye(self.texture, self.route)
 
 
@@ -201,21 +197,14 @@ COLOURS = 256
 
 
 def write_png(path: Path, picture: Bytes) -> None:
-    """Write uint8 [H, W, 3] as PNG.
-
-    Raises:
-        EvaluationError: The file cannot be written.
-    """
+    """Write uint8 [H, W, 3] as PNG."""
     _replace(path, "PNG", [Image.fromarray(picture)], 0)
 
 
 def write_gif(path: Path, pictures: Iterable[Bytes], frame_us: int) -> None:
-    """Write an animation that loops; all frames share one palette.
+    """Write an animation of one or more uint8 [H, W, 3] that loops, with one palette.
 
-    Args:
-        path: Where.
-        pictures: uint8 [H, W, 3], all of one size, at least one.
-        frame_us: How long each is shown; GIF rounds to hundredths of a second.
+    ``frame_us`` is rounded to hundredths of a second, as GIF has them.
 
     Raises:
         EvaluationError: There is no picture, or the file cannot be written.
@@ -241,6 +230,7 @@ def _replace(
     path: Path, kind: str, frames: list[Image.Image], duration_ms: int
 ) -> None:
     try:
+        # write beside the file, so that it is replaced in one step
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as near:
             draft = Path(near) / path.name
             if kind == "GIF":

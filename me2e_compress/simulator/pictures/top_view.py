@@ -73,10 +73,8 @@ MARGIN = 0.9
 class OtherDrive:
     """Another drive of the same route, drawn under the ego in grey.
 
-    Attributes:
-        ego: Where its ego is.
-        trail: [N, 2] where that was, world metres.
-        plan: [n, 2] metres in its frame, or None.
+    ``trail`` [N, 2] holds its ego's positions, world metres; ``plan`` [n, 2] is in its
+    ego frame.
     """
 
     ego: Ego
@@ -88,9 +86,8 @@ class OtherDrive:
 class BirdsEye:
     """Draws moments of one route from above.
 
-    Args:
-        texture: The painted ground; its class raster is drawn, in the figure's colours.
-        route: [N, 2] world points of the route's centre line.
+    ``texture`` is drawn by its class raster, in the figure's colours; ``route`` holds
+    [N, 2] world points of the route's centre line.
     """
 
     texture: GroundTexture
@@ -107,14 +104,11 @@ class BirdsEye:
     ) -> Bytes:
         """Draw one moment, uint8 [rows, columns, 3].
 
-        Args:
-            scene: What is there.
-            trail: [N, 2] where the ego was.
-            plan: [n, 2] metres in the ego frame, or None.
-            events: Infractions to mark.
-            size: Rows and columns of the picture; it shows 72 m from top to bottom.
-            other: Another drive, laid over this one; where it is far, more is shown.
+        ``trail`` [N, 2] holds the ego's positions, ``plan`` [n, 2] metres in the ego
+        frame. The picture shows 72 m from top to bottom, or more if the other drive is
+        far away.
         """
+        # the ego heads up; zoom out until the other ego is in the picture
         rows, columns = size
         ego = scene.ego
         scale = rows / (AHEAD_M + BEHIND_M)
@@ -123,6 +117,7 @@ class BirdsEye:
             scale /= _zoom(ego, other.ego, columns / scale / 2)
         pixels = np.empty((rows, columns, 3), np.uint8)
         canvas = Canvas(pixels, (ego.x, ego.y), ego.heading, scale, anchor)
+        # layers, what matters most last
         self._ground(canvas)
         canvas.line(self.route, ROUTE, 2)
         if other is not None and len(other.trail) > 1:
@@ -173,7 +168,7 @@ class BirdsEye:
 
 
 def _zoom(ego: Ego, other: Ego, side_m: float) -> float:
-    """Return how many times more must be shown for the other to be in the picture."""
+    """Return the factor by which more must be shown to include the other ego."""
     east, north = other.x - ego.x, other.y - ego.y
     cos, sin = np.cos(ego.heading), np.sin(ego.heading)
     ahead, left = cos * east + sin * north, cos * north - sin * east
@@ -191,7 +186,7 @@ def _ego(
 
 
 def _vehicle(canvas: Canvas, corners: Floats, colour: Colour) -> None:
-    """Draw a box with a lighter windscreen that shows which way it faces."""
+    """Draw a box with a lighter windscreen that shows its heading."""
     canvas.polygon(corners, colour)
     front_left, rear_left, rear_right, front_right = corners
     edges = (front_left, front_right, front_right, front_left)
@@ -249,7 +244,7 @@ def _plan(canvas: Canvas, ego: Ego, plan: Floats, colour: Colour) -> None:
 
 
 def _infractions(canvas: Canvas, events: tuple[Event, ...]) -> None:
-    """Draw a cross and a name where the ego was; one of a kind at a place."""
+    """Draw a cross and a name where the ego was; one per kind and place."""
     rows, columns = canvas.pixels.shape[:2]
     arm, texts = 7.0 / canvas.scale, list[Text]()
     for event in events:

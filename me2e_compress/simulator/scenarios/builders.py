@@ -79,7 +79,7 @@ def stage_of(route: Route, builder: Builder | None = None) -> Stage:
     """Set up a route: its roads, its actors and their scripts.
 
     Raises:
-        EvaluationError: A parameter that the route gives is wrong or not one of its
+        EvaluationError: A parameter of the route is wrong, or not one of its
             scenario's.
     """
     stage = Stage(route)

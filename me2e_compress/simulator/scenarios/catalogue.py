@@ -1,6 +1,6 @@
 """The 44 scenario types, the abilities they test, and where they differ.
 
-Abilities as Bench2Drive counts them (`tools/ability_benchmark.py` of
+Abilities are those of Bench2Drive (`tools/ability_benchmark.py` of
 Thinklab-SJTU/Bench2Drive, branch 0.0.4): a type counts under one ability or under two,
 of which the second is Traffic_Signs. Types that `DIFFERENCES` does not name keep the
 idea of their namesake in scenario_runner, on our roads.

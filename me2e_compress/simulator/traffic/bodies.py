@@ -58,6 +58,7 @@ class EgoVehicle(Vehicle):  # type: ignore[misc]  # highway-env is untyped
 
     def step(self, dt: float) -> None:
         """Advance by ``dt`` seconds."""
+        # actuators follow with a lag
         low, high = ACCELERATION_RANGE_MPS2
         thrust = min(max(self.wanted.acceleration_mps2, low), high)
         wheel = min(max(self.wanted.steering_rad, -MAX_STEERING_RAD), MAX_STEERING_RAD)
@@ -66,10 +67,12 @@ class EgoVehicle(Vehicle):  # type: ignore[misc]  # highway-env is untyped
         self.steering_rad += (1 - math.exp(-dt / STEERING_LAG_S)) * (
             wheel - self.steering_rad
         )
+        # speed, limited by grip
         pushed = min(max(self._thrust_mps2, -self.grip_mps2), self.grip_mps2)
         before = float(self.speed)
         after = max(0.0, before + pushed * dt)
         mean = (before + after) / 2
+        # curvature, limited by grip
         slip = slip_of(self.steering_rad)
         curvature = math.sin(slip) / (self.LENGTH / 2)
         tightest = self.grip_mps2 / max(mean, 0.1) ** 2
@@ -77,6 +80,7 @@ class EgoVehicle(Vehicle):  # type: ignore[misc]  # highway-env is untyped
             curvature = math.copysign(tightest, curvature)
             slip = math.asin(curvature * self.LENGTH / 2)
         turn = mean * curvature * dt
+        # pose, in highway-env's plane
         course = -self.heading + slip + turn / 2
         self.position = self.position + mean * dt * flip(
             math.cos(course), math.sin(course)
@@ -106,11 +110,7 @@ class EgoVehicle(Vehicle):  # type: ignore[misc]  # highway-env is untyped
 class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
     """A pedestrian or cyclist who follows a polyline once started and never yields.
 
-    Args:
-        id: Unique.
-        kind: Pedestrian or bicycle.
-        line: [N, 2] right-handed metres.
-        speed_mps: Speed once walking.
+    ``line`` is [N, 2] right-handed metres.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
         self.position = flip(x, y)
 
     def rest(self) -> Floats:
-        """Return [M, 2], what is left of its line, from where it is."""
+        """Return [M, 2], the rest of its line from its position on."""
         ahead = self.line[self._arc > self.walked_m]
         return np.vstack([flip(*self.position), ahead])
 

@@ -55,8 +55,8 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         id: Unique.
         network: Where it drives.
         lanes: The lanes it will take, each the successor of the one before.
-        s_m: Where on the first of them it starts.
-        speed_mps: At the start.
+        s_m: Arc length on the first of them at which it starts.
+        speed_mps: Initial speed.
         target_mps: Wanted speed; the initial one by default.
         kind: Decides its size.
         behaviour: Its IDM parameters.
@@ -87,11 +87,13 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         self.diagonal = math.hypot(self.LENGTH, self.WIDTH)
         self.speed: float = speed_mps
         self.position: Floats
+        # highway-env's IDM reads these names
         self.behaviour = behaviour or Behaviour()
         self.COMFORT_ACC_MAX = self.behaviour.acceleration_mps2
         self.COMFORT_ACC_MIN = -self.behaviour.braking_mps2
         self.DISTANCE_WANTED = self.behaviour.jam_gap_m
         self.TIME_WANTED = self.behaviour.headway_s
+        # its way, and what scripts may change
         self.target_speed = speed_mps if target_mps is None else target_mps
         self.lanes, self.leg = list(lanes), 0
         self.target_lane_index = self.lane_index = self.lanes[0]
@@ -134,8 +136,7 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
     def follow_road(self) -> tuple[float, float]:
         """Enter the next lane of the chain where the present one ends.
 
-        Returns:
-            Arc length in the present lane, and offset to its right.
+        Returns the arc length in the present lane, and the offset to its right.
         """
         s, r = self.road.seat(self, self.lanes[self.leg])
         length = self.network.length(self.lanes[self.leg])

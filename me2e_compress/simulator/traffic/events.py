@@ -29,22 +29,15 @@ INFRACTIONS: frozenset[EventKind] = frozenset(EventKind) - {
     EventKind.ACTOR_COLLISION,
     EventKind.STRUCK,
 }
-"""What counts against the driver."""
+"""Events that count against the driver."""
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
     """One event.
 
-    Attributes:
-        time_us: When.
-        kind: What.
-        detail: Which script, or in words what happened.
-        x: Where the ego was, metres.
-        y: Where the ego was, metres.
-        ego_speed_mps: How fast the ego was.
-        actor_id: The other party, if any.
-        actor_kind: What the other party is.
+    ``detail`` names the script, or says in words what happened; x and y (metres) are
+    the ego's position. The actor is the other party, if any.
     """
 
     time_us: int

@@ -21,6 +21,7 @@ class LaneTable:
         lanes = network.lanes_dict()
         self.column: dict[LaneIndex, int] = {key: i for i, key in enumerate(lanes)}
         self.length: Floats = np.array([lane.length for lane in lanes.values()])
+        # straight and circular lanes apart, each as arrays
         straight, circular = list[int](), list[int]()
         for i, lane in enumerate(lanes.values()):
             (straight if isinstance(lane, StraightLane) else circular).append(i)
@@ -39,11 +40,7 @@ class LaneTable:
     def coordinates(self, points: Floats) -> tuple[Floats, Floats]:
         """Return arc lengths and lateral offsets (highway-env's sign) in all lanes.
 
-        Args:
-            points: [N, 2] in highway-env's plane.
-
-        Returns:
-            Two arrays [N, lanes].
+        ``points`` is [N, 2] in highway-env's plane; both results are [N, lanes].
         """
         s = np.empty((len(points), len(self.length)))
         r = np.empty_like(s)

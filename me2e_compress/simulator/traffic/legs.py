@@ -1,4 +1,4 @@
-"""From the lanes that a route uses to its centre line."""
+"""The centre line of a route, from the lanes that it uses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,8 +32,8 @@ _CHANGES = (Command.CHANGE_LEFT, Command.CHANGE_RIGHT)
 class Leg:
     """A piece of the route on one lane.
 
-    A hole between the end of a leg and the beginning of the next is filled by a
-    smooth curve: that is how a route changes lanes.
+    A hole between the end of a leg and the beginning of the next is filled by a smooth
+    curve: that is how a route changes lanes.
     """
 
     lane: LaneIndex
@@ -141,6 +141,7 @@ def _room_beside(
     for index in network.shoulders:
         shoulder[table.column[index]] = True
     widths = np.array([network.lane(index).width for index in table.column])
+    # probe points to either side of the route, every quarter of a metre
     reach = np.arange(PROBE_M, WIDEST_M, PROBE_M)
     sides = list[Floats]()
     for sign, same_way, with_shoulder in (
@@ -157,12 +158,14 @@ def _room_beside(
             & (s < table.length + 0.5)
             & (np.abs(r) <= widths / 2 + TOUCHING_M)
         )
+        # oncoming lanes and shoulders count on some sides only
         if same_way:
             mine = -np.repeat(headings, len(reach))[:, None]
             way = np.cos(table.headings(s) - mine) > 0.5
             inside &= way | shoulder
         if not with_shoulder:
             inside &= ~shoulder
+        # the free width ends at the first probe off the road
         road = inside.any(axis=1).reshape(len(points), len(reach))
         free = np.where(road.all(axis=1), len(reach), np.argmin(road, axis=1))
         sides.append(free * PROBE_M)

@@ -99,10 +99,9 @@ class Network:
     def straight(
         self, start: str, end: str, pose: Pose, length_m: float, section: Section
     ) -> Pose:
-        """Add a straight piece; the pose is where the leftmost lane begins.
+        """Add a straight piece and return the pose where its leftmost lane ends.
 
-        Returns:
-            The pose where the leftmost lane ends.
+        ``pose`` is where the leftmost lane begins.
         """
         for i in range(section.lanes):
             first = pose.moved(0.0, -i * section.width)
@@ -127,11 +126,11 @@ class Network:
         angle_rad: float,
         section: Section,
     ) -> Pose:
-        """Add an arc; radius of the leftmost lane, positive angles turn left.
+        """Add an arc and return the pose where the leftmost lane ends.
 
-        Returns:
-            The pose where the leftmost lane ends.
+        The radius is the leftmost lane's; positive angles turn left.
         """
+        # lanes around one centre, the leftmost first
         left_turn = angle_rad > 0
         side = radius_m if left_turn else -radius_m
         centre = pose.moved(0.0, side)
@@ -139,6 +138,7 @@ class Network:
         for i in range(section.lanes):
             outwards = i * section.width
             left, right = section.markings(i)
+            # in highway-env's plane, whose y points down
             lane = CircularLane(
                 flip(centre.x, centre.y),
                 radius_m + outwards if left_turn else radius_m - outwards,

@@ -21,15 +21,13 @@ class Regulator:
     """A light or sign at one stop line.
 
     Attributes:
-        id: Unique among the signals.
-        kind: Light, stop sign or give-way sign.
         line: Centre of the stop line, heading of the traffic that must obey.
-        line_s: Where the ego's route crosses the line (m), None if it does not.
+        line_s: Arc length (m) at which the ego's route crosses the line, if it does.
         state: Phase of a light.
-        remaining_s: Until the phase changes; None if it depends on the ego.
+        remaining_s: Seconds until the phase changes; None if it depends on the ego.
         nearest_s: For a give-way sign: seconds until the next vehicle with priority
             reaches the conflict, infinity if there is none.
-        conflict_s: For a give-way sign: where on the route the conflict is.
+        conflict_s: For a give-way sign: arc length of the conflict on the route.
     """
 
     id: int
@@ -66,12 +64,14 @@ class Regulator:
         give-way sign if the front enters the conflict less than `YIELD_GAP_S` before
         a vehicle with priority. Each is reported once.
         """
+        # give way
         if front_s >= self.conflict_s and not self._conflict_passed:
             self._conflict_passed = True
             if self.nearest_s() < YIELD_GAP_S:
                 return EventKind.GIVE_WAY
         if self.line_s is None or self._tail_passed:
             return None
+        # what the ego does at the line
         low, high = STOP_ZONE_M
         if low <= self.line_s - front_s <= high and speed < STOPPED_MPS:
             self._stopped = True
@@ -80,6 +80,7 @@ class Regulator:
             self._entered_on_red = self.state is SignalState.RED
         if tail_s < self.line_s:
             return None
+        # judged once the tail is over the line
         self._tail_passed = True
         if self.kind is SignalKind.STOP_SIGN and not self._stopped:
             return EventKind.STOP_SIGN

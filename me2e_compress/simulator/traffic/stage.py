@@ -1,4 +1,4 @@
-"""Where a scenario is set up, and what its scripts see while it runs."""
+"""The setup of a scenario, and what its scripts see while it runs."""
 
 import math
 import zlib
@@ -39,15 +39,15 @@ class Stage:
     """Everything a scenario is made of.
 
     Layouts lay out the network and the route, scripts put actors on it; both do so
-    before the first frame. Afterwards scripts are resumed at every decision.
-
-    Parameters are drawn by name: the value depends on the route's seed and the name
-    alone, not on what was drawn before, and a value in the route's manifest wins.
+    before the first frame. Afterwards scripts are resumed at every decision. Parameters
+    are drawn by name: the value depends on the route's seed and the name alone, not on
+    what was drawn before, and a value in the route's manifest wins.
     """
 
     def __init__(self, route: Route) -> None:
         self.route = route
         self.parameters: dict[str, Parameter] = {}
+        # set by layouts and scripts
         self.network = Network()
         self.layout = ""
         self.script_names: list[str] = []
@@ -58,6 +58,7 @@ class Stage:
         self.crosswalks: list[tuple[Point, Point, Point, Point]] = []
         self.at_goal: list[Callable[[], Event | None]] = []
         self.events: list[Event] = []
+        # set by the world, frame by frame
         self.time_us = 0
         self.ego_s = 0.0
         self._path: RoutePath | None = None
@@ -105,11 +106,7 @@ class Stage:
         return value
 
     def complete(self) -> None:
-        """Finish the setup: every parameter has been drawn.
-
-        Raises:
-            EvaluationError: The route gives a parameter that nothing asked for.
-        """
+        """Check that the route gives no parameter that nothing drew."""
         self._complete = True
         unasked = [
             name for name in self.route.parameters if name not in self.parameters
@@ -121,10 +118,10 @@ class Stage:
             )
 
     def play(self, script: Script) -> None:
-        """Let a generator play its part.
+        """Add a script.
 
-        It runs up to its first ``yield`` at once, so that its actors stand there at
-        frame 0. Its function's name is how the scenario's script is known.
+        It runs up to its first ``yield`` at once, so that its actors are there at frame
+        0. Its function's name becomes the script's name.
         """
         if isinstance(script, GeneratorType):
             self.script_names.append(script.__name__)
@@ -210,7 +207,7 @@ class Stage:
         return float(s - self.ego_s - (self.ego.LENGTH + car.LENGTH) / 2)
 
     def arrival_s(self, s_m: float) -> float:
-        """Return the seconds until the ego's front is there at its present speed."""
+        """Return the seconds until the ego's front arrives at its present speed."""
         left = self.ahead_m(s_m) - self.ego.LENGTH / 2
         return float(left / max(self.ego.speed, SLOWEST_MPS))
 

@@ -19,8 +19,8 @@ BESIDE_M = 0.25
 class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
     """The road: who is in front of whom, and who touches whom.
 
-    Connected lanes are searched for leaders, as highway-env's environments of version
-    1 do. A crash is a real overlap of two rectangles: stock highway-env also calls a
+    Connected lanes are searched for leaders, as highway-env's environments of version 1
+    do. A crash is a real overlap of two rectangles: stock highway-env also calls a
     predicted one a crash, and says neither who nor what was hit.
     """
 
@@ -53,6 +53,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         row = self._row[id(car)]
         offset = -self._s[row, self.table.column[car.lanes[car.leg]]]
         for k, index in enumerate(car.lanes[car.leg :]):
+            # bodies in the way on this lane of the chain
             column = self.table.column[index]
             s, r = self._s[:, column], self._r[:, column]
             room = self._half + (car.WIDTH / 2 + BESIDE_M)
@@ -63,6 +64,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             blocking[row] = False
             if not car.behaviour.sees_ego:
                 blocking &= ~self._ego
+            # the nearest of them, else look into the next lane
             if blocking.any():
                 ahead = np.where(blocking, s, np.inf)
                 nearest = int(np.argmin(ahead))
@@ -84,6 +86,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         column = self.table.column[index]
         row = self._row[id(vehicle)]
         s, r = self._s[:, column], self._r[:, column]
+        # bodies inside the lane, then the nearest on either side
         lane = self.network.get_lane(index)
         inside = (np.abs(r) <= lane.width / 2 + 1) & (s >= 0) & (s <= lane.length)
         inside[row] = False
@@ -115,6 +118,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         moves = np.array([body.speed > 0 for body in bodies])
         delta = points[:, None] - points[None]
         room = reach[:, None] + reach[None]
+        # pairs close enough by their diagonals, then the exact test
         near = (delta * delta).sum(axis=2) < room * room
         near &= moves[:, None] | moves[None]
         pairs = list[tuple[RoadObject, RoadObject]]()

@@ -1,4 +1,4 @@
-"""The world that a route unfolds in, and its gymnasium face."""
+"""The world that a route unfolds in."""
 
 from me2e_compress.simulator.traffic.events import (
     INFRACTIONS,

@@ -1,4 +1,4 @@
-"""What only a privileged policy may see: where actors are going, signal phases."""
+"""What only a privileged policy may see: the plans of actors, signal phases."""
 
 from dataclasses import dataclass
 
@@ -15,11 +15,11 @@ FORESEEN_M = 90.0
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Intent:
-    """Where one moving actor is going.
+    """The plan of one moving actor.
 
     Attributes:
         actor_id: As in the scene.
-        path: [M, 2] metres: where it is, then the way that it will take.
+        path: [M, 2] metres: its position, then the way that it will take.
         target_mps: The speed that it wants on this way; 0 while it waits.
         acceleration_mps2: Its present acceleration.
         sees_ego: Whether it brakes for the ego.
@@ -38,9 +38,9 @@ class Phase:
 
     Attributes:
         signal_id: As in the scene.
-        line_s: Where the route crosses its line, m.
+        line_s: Arc length at which the route crosses its line, m.
         state: Phase of a light, None for signs.
-        remaining_s: Until the phase changes; None where that depends on the ego.
+        remaining_s: Seconds until the phase changes; None if that depends on the ego.
     """
 
     signal_id: int
@@ -71,14 +71,14 @@ def intent_of(body: Car | Walker) -> Intent:
 
 
 def phase_of(regulator: Regulator) -> Phase | None:
-    """Return a signal on the ego's route, None if the route does not meet it."""
+    """Return a signal on the ego's route; None if the route does not meet it."""
     if regulator.line_s is None:
         return None
     return Phase(regulator.id, regulator.line_s, regulator.state, regulator.remaining_s)
 
 
 def _way(car: Car) -> Floats:
-    """Return the centre lines of the lanes ahead, after the place of the car."""
+    """Return the centre lines of the lanes ahead of the car."""
     pieces = [np.array([[car.pose.x, car.pose.y]])]
     skip, found = car.lane_s + car.speed * 0.5 + 1.0, 0.0
     for index in car.lanes[car.leg :]:

@@ -49,13 +49,12 @@ class World:
         builder: Sets the stage instead of the registered scenario type: for new types.
 
     Attributes:
-        route: What is staged.
         path: The ego's route.
         roadmap: All lanes, stop lines and crosswalks.
-        parameters: Every parameter of the scenario with the value it has here.
+        parameters: Every parameter of the scenario with its value.
         outside_m: Metres between the ego's centre and the nearest lane, 0 inside.
         outside_distance_m: Metres driven while that exceeded `TOLERANCE_M`.
-        reason: Why the world has ended, None while it has not.
+        reason: Why the world has ended; None before that.
     """
 
     def __init__(
@@ -66,6 +65,7 @@ class World:
                 f"frame of {dt_us} us: it must be between 1 and {DECISION_US}"
             )
         self.route, self.dt_us = route, dt_us
+        # the scenario sets the stage
         self._stage = stage = stage_of(route, builder)
         self.path: RoutePath = stage.path
         self.parameters = dict(stage.parameters)
@@ -73,6 +73,7 @@ class World:
             tuple(signal.snapshot().stop_line for signal in stage.regulators),
             tuple(stage.crosswalks),
         )
+        # traffic, and the state of the checks
         self._road = TrafficRoad(stage.network)
         self._road.vehicles = [stage.ego]
         self.outside_m, self.outside_distance_m = 0.0, 0.0
@@ -96,7 +97,7 @@ class World:
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """Everything noticed so far, in order."""
+        """All events so far, in order."""
         return tuple(self._stage.events)
 
     @property

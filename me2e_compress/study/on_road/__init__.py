@@ -1,4 +1,4 @@
-"""The search for a scheme within budgets that drives best."""
+"""Search for the scheme within budgets that drives best."""
 
 from me2e_compress.study.on_road.limits import Limits
 from me2e_compress.study.on_road.road_options import RoadSearchOptions

@@ -1,4 +1,4 @@
-"""The schemes among which a search on the road chooses: float, int8 or no module."""
+"""The schemes of a search on the road: each module float, int8 or removed."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,12 +23,7 @@ BEFORE_ABLATION = "fold-constants"
 
 @dataclass(frozen=True)
 class GridPoint:
-    """One assignment of modules; those that it does not name stay in float.
-
-    Attributes:
-        int8: modules in int8, in the order of the map.
-        ablated: modules that are removed, in the order of the map.
-    """
+    """One assignment of modules, in the map's order; unnamed ones stay in float."""
 
     int8: tuple[str, ...] = ()
     ablated: tuple[str, ...] = ()
@@ -43,14 +38,9 @@ class GridPoint:
     def passes(
         self, rules: str, target: str, dims: Mapping[str, int]
     ) -> tuple[Pass, ...]:
-        """Return what makes it of the float model.
+        """Return the passes that turn the float model into this one.
 
-        What read a module that is gone reads what it is on average over the frames.
-
-        Args:
-            rules: of the int8 plan.
-            target: runtime of the int8 graph.
-            dims: sizes of open dimensions.
+        Consumers of a removed module read its average over the frames.
         """
         chosen = list(with_sizes(recipe.load("exact"), dims))
         if self.ablated:
@@ -64,12 +54,13 @@ class GridPoint:
 
 @dataclass(frozen=True)
 class GridModules:
-    """The modules of a graph, and which of them may go.
+    """The modules of a graph, and which of them may be removed.
 
     Attributes:
-        features: those of feature extraction that have nodes, in the order of the map.
-        predictions: the others, alike.
-        needed: of these the ones that make the plan.
+        features: Modules of feature extraction that have nodes, in the order of the
+            map.
+        predictions: Modules of prediction, likewise.
+        needed: Prediction modules that make the plan.
     """
 
     features: tuple[str, ...]
@@ -81,7 +72,7 @@ class GridModules:
         """Read them off a graph.
 
         Raises:
-            GraphError: its metadata names a plan that is not there.
+            GraphError: The graph's metadata names a plan that does not exist.
         """
         placed = assign(model, modules)
         present = {placed.module_of(node) for node in model.graph}
@@ -100,12 +91,12 @@ class GridModules:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All of them."""
+        """All modules."""
         return self.features + self.predictions
 
     @property
     def losable(self) -> tuple[str, ...]:
-        """Those that the stack can lose: of prediction, and not the planner."""
+        """Modules that may be removed: of prediction, and not the planner."""
         return tuple(name for name in self.predictions if name not in self.needed)
 
     def grid(
@@ -113,14 +104,12 @@ class GridModules:
     ) -> tuple[GridPoint, ...]:
         """List the assignments: int8 or float group by group, times what is removed.
 
-        Args:
-            groups: ``A+B,C``: A and B share a choice, C has its own, others stay in
-                float; None takes feature extraction and prediction.
-            ablate: ``A,B`` may go; ``none``; None takes all that the stack can lose.
-            most_ablated: so many of them at once.
+        In ``groups``, ``A+B,C`` lets A and B share a choice, C has its own and others
+        stay in float; None takes feature extraction and prediction. In ``ablate``,
+        ``A,B`` may be removed; None takes all removable ones, ``none`` takes none.
 
         Raises:
-            RecipeError: no such module, one that is named twice, or one that cannot go.
+            RecipeError: A module does not exist, is named twice, or cannot be removed.
         """
         if groups is None:
             chosen = [each for each in (self.features, self.predictions) if each]

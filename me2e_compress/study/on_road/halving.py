@@ -2,7 +2,7 @@
 
 Karnin, Koren and Somekh, "Almost optimal exploration in multi-armed bandits" (2013);
 Jamieson and Talwalkar (2016). Routes are the budget, and each rung's routes begin with
-those of the rung before, so that nothing is driven twice.
+those of the previous rung, so that nothing is driven twice.
 """
 
 import random
@@ -22,12 +22,10 @@ Differ = Callable[[str, Sequence[Route]], Sequence[float]]
 
 @dataclass(frozen=True)
 class Standing:
-    """One of them on one rung.
+    """One scheme on one rung.
 
-    Attributes:
-        name: Its name.
-        difference: Mean over the rung's routes, points of driving score.
-        kept: Whether it goes on, or, on the last rung, wins.
+    ``difference`` is the mean over the rung's routes, points of driving score; ``kept``
+    tells whether it continues or, on the last rung, wins.
     """
 
     name: str
@@ -37,12 +35,7 @@ class Standing:
 
 @dataclass(frozen=True)
 class Rung:
-    """What so many routes showed.
-
-    Attributes:
-        routes: How many.
-        standings: Best first; of equal ones the one that was named first.
-    """
+    """The standings after so many routes, best first; ties go to the first named."""
 
     routes: int
     standings: tuple[Standing, ...]
@@ -57,18 +50,9 @@ def halve(
 ) -> tuple[Rung, ...]:
     """Drive all over the first routes, the better half over twice as many, and so on.
 
-    The last two, or all where there are no more routes, drive every route; the best of
-    these wins.
-
-    Args:
-        names: At least one, the preferred ones first.
-        routes: In the order of :func:`stratified`.
-        first: Routes of the first rung.
-        differ: Drives.
-        on_rung: Is called with each rung.
-
-    Returns:
-        Rung by rung; the first of the last one wins.
+    The last two, or all if no routes are left, drive every route; the first of the last
+    rung wins. ``names`` lists preferred ones first, ``routes`` is in the order of
+    :func:`stratified`, and ``first`` is the number of routes of the first rung.
     """
     left, rungs = list(names), list[Rung]()
     for size in sizes(len(left), len(routes), first):
@@ -82,13 +66,7 @@ def halve(
 
 
 def sizes(names: int, routes: int, first: int) -> Iterator[int]:
-    """Yield the routes of each rung, all of them at the end.
-
-    Args:
-        names: How many begin.
-        routes: How many there are.
-        first: Routes of the first rung.
-    """
+    """Yield the number of routes of each rung; the last has all of them."""
     size = first
     while names > FINAL and size < routes:
         yield size
@@ -97,12 +75,12 @@ def sizes(names: int, routes: int, first: int) -> Iterator[int]:
 
 
 def kept(names: int) -> int:
-    """Return how many of a rung go on: the upper half, and two at least."""
+    """Return how many of a rung continue: the upper half, and at least two."""
     return max(FINAL, (names + 1) // 2)
 
 
 def drives(names: int, routes: int, first: int) -> int:
-    """Return how many routes are driven in all, the reference's included."""
+    """Return how many routes are driven in all, including the reference's."""
     driven, before = 0, 0
     for size in sizes(names, routes, first):
         driven += names * (size - before)
@@ -111,14 +89,11 @@ def drives(names: int, routes: int, first: int) -> int:
 
 
 def stratified(routes: Sequence[Route], seed: int) -> tuple[Route, ...]:
-    """Order routes so that every beginning is as mixed as the whole.
+    """Order routes so that every prefix is as mixed as the whole.
 
-    No scenario type comes a second time before all have come once, and so on; within
-    such a round abilities are spread evenly.
-
-    Args:
-        routes: In any order; it does not count.
-        seed: Which type, and which route of it, comes first.
+    No scenario type occurs again before all have occurred once, and so on; within such
+    a round abilities are spread evenly. The order of the input does not matter;
+    ``seed`` decides which type, and which of its routes, comes first.
     """
     draw = random.Random(seed)
     by_type = defaultdict[str, list[Route]](list)

@@ -1,4 +1,4 @@
-"""What a scheme costs, and the budgets that it is held to."""
+"""Costs of a scheme, and budgets for them."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,12 +10,12 @@ from me2e_compress.workflows.budgets import Joules, check_budgets
 
 @dataclass(frozen=True)
 class Weighed:
-    """What one scheme costs.
+    """Costs of one scheme.
 
     Attributes:
-        mb: Of its weights, 1e6 bytes.
+        mb: Size of the weights, 1e6 bytes.
         ms: Median of a decision on the device, milliseconds.
-        joules: Of a frame, measured or modelled as the search says.
+        joules: Per frame, measured or modelled as the search says.
     """
 
     mb: float
@@ -25,12 +25,12 @@ class Weighed:
 
 @dataclass(frozen=True)
 class Limits:
-    """Budgets, all of which are to be met.
+    """Budgets, all of which must be met.
 
     Args:
-        max_mb: Most MB of weights.
-        max_ms: Most milliseconds, the median of a decision on the device.
-        max_joules: Most joules a frame.
+        max_mb: MB of weights.
+        max_ms: Milliseconds, the median of a decision on the device.
+        max_joules: Joules per frame.
 
     Raises:
         RecipeError: There is none, or one is not a finite number above 0.
@@ -41,15 +41,14 @@ class Limits:
     max_joules: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what nothing could be held against."""
         check_budgets(self.max_mb, self.max_ms, self.max_joules)
 
     def spent(self, weighed: Weighed) -> float:
-        """Return the share of the budget that is met worst; 1 is all of it."""
+        """Return the largest used share of a budget; 1 is all of it."""
         return max(cost / limit for cost, limit in self._pairs(weighed))
 
     def words(self, weighed: Weighed, kind: Joules) -> str:
-        """Say what is spent of what."""
+        """Say how much of each budget is used."""
         pairs = zip(self._pairs(weighed), self.units(kind), strict=True)
         return ", ".join(
             f"{significant(cost)} of {significant(most)} {unit}"
@@ -57,7 +56,7 @@ class Limits:
         )
 
     def refusal(self, whole: Weighed, found: Sequence[Weighed], kind: Joules) -> str:
-        """Say that nothing fits, and the least that was found."""
+        """Say that nothing fits, and what the least cost was."""
         costs = [[cost for cost, _ in self._pairs(each)] for each in (whole, *found)]
         limits = [limit for _, limit in self._pairs(whole)]
         pairs = tuple(zip(limits, self.units(kind), strict=True))

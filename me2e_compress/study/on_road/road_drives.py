@@ -1,4 +1,4 @@
-"""What a search on the road makes and drives: once each, kept in one folder."""
+"""Models and drives of a search on the road, each made once and kept."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -31,15 +31,13 @@ ASKED = "search.json"
 
 @dataclass(frozen=True)
 class RoadDrives:
-    """Schemes that are made and weighed, and drive when they are asked to.
+    """Schemes that are made and weighed, and driven on request.
 
     Attributes:
-        setup: What all drives share.
-        prepared: Models that can drive, by name of the scheme; schemes whose files are
-            the same to the byte share the first one's.
-        weighed: What each costs.
-        failures: Why there is no model of a scheme.
-        joules: What joules are here.
+        prepared: Models that can drive, by scheme; schemes with byte-identical files
+            share the first one's.
+        weighed: Costs of each scheme.
+        failures: Why a scheme has no model.
     """
 
     setup: DriveSetup
@@ -54,22 +52,22 @@ class RoadDrives:
         return self.setup.study
 
     def same_as(self, name: str) -> str:
-        """Name the scheme whose file another is, to the byte; empty for the first."""
+        """Return the first scheme with the same file; empty for the first itself."""
         first = self.prepared[name].variant.name
         return "" if first == name else first
 
     def episodes(self, name: str, routes: Sequence[Route]) -> tuple[Episode, ...]:
-        """Drive what is missing of some routes; return them in their order.
+        """Drive what is missing of some routes; return them in order.
 
         Raises:
             StudyError: It cannot be driven.
-            EvaluationError: The folder is of another evaluation.
+            EvaluationError: The folder belongs to another evaluation.
         """
         (condition,) = self.study.conditions
         return self.setup.some(self.prepared[name], condition, routes)
 
     def differ(self, name: str, routes: Sequence[Route]) -> list[float]:
-        """Return points of driving score beside the float model's, route by route."""
+        """Return the driving score minus the float model's, in points, by route."""
         if self.prepared[name].variant.name == self.study.baseline:
             return [0.0] * len(routes)
         pairs = zip(
@@ -83,7 +81,7 @@ class RoadDrives:
         ]
 
     def difference(self, name: str) -> PairedDifference:
-        """Return the difference to the float model over all routes."""
+        """Return the difference from the float model over all routes."""
         routes, baseline = self.study.routes, self.study.baseline
         ours, others = (self.episodes(each, routes) for each in (name, baseline))
         return difference(ours, others, self.study.seed)
@@ -96,17 +94,12 @@ def make_drives(
     engine: Engine,
     listener: Listener,
 ) -> RoadDrives:
-    """Make and weigh the models of a study; one that fails leaves the others.
+    """Make and weigh the models of a study; one that fails does not stop the others.
 
-    Args:
-        study: Under one condition; its frames are also what latency is measured on.
-        folder: Where everything goes.
-        joules: What joules are here.
-        engine: Where routes are driven.
-        listener: Is called with progress and warnings.
+    The study has one condition; latency is measured on its frames.
 
     Raises:
-        StudyError: The folder is of another search.
+        StudyError: The folder belongs to another search.
         Me2eError: The float model cannot drive, or frames do not fit.
     """
     _claim(study, folder)
@@ -157,11 +150,7 @@ def _joules(
 
 
 def _claim(study: Study, folder: Path) -> None:
-    """Write down what decides the drives, or go on with a folder of the same.
-
-    Raises:
-        StudyError: The folder is of another search, or cannot be written.
-    """
+    """Write what decides the drives, or check that an existing folder agrees."""
     asked, path = _decisive(study), folder / ASKED
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What a search on the road is asked."""
+"""Options of a search on the road."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,33 +13,34 @@ from me2e_compress.workflows.checks import MOST_THREADS, check_count
 
 @dataclass(frozen=True, kw_only=True)
 class RoadSearchOptions:
-    """Budgets, the grid, and how it is driven.
+    """Budgets, grid and drives of a search on the road.
 
     Args:
-        drives: Folder of models, traces and drives; run again, the search goes on.
+        drives: Folder of models, traces and drives; run again, the search resumes.
         limits: Budgets.
-        modules: ``A+B,C``: groups that are float or int8; None: feature extraction
-            and prediction.
-        ablate: ``A,B``: modules that may go; ``none``; None: all that may.
-        most_ablated: So many of them at once.
+        modules: ``A+B,C``: groups that are float or int8; None: feature extraction and
+            prediction.
+        ablate: ``A,B``: modules that may be removed; ``none``; None: all that may.
+        most_ablated: At most so many of them at once.
         routes: ``all``, a number, ids, or a file of routes.
-        latency: What decisions cost: ``trace`` (each model's own), ``fps:F``, ``none``.
-        baseline_median_s: Median latency of the float model on the device imagined;
-            None takes this machine as it is.
+        latency: Latency of decisions: ``trace`` (each model's own), ``fps:F``,
+            ``none``.
+        baseline_median_s: Median latency of the float model on the target device; None
+            takes this machine as it is.
         first_rung: Routes that every scheme drives.
-        rules: Of the int8 plans.
+        rules: Rules of the int8 plans.
         target: Runtime of the int8 graphs.
         module_map: Preset or TOML file; None finds the preset.
         adapter: TOML file that adapts the model to the policy contract.
         dims: Sizes of open dimensions.
-        samples: Inferences that are timed, of each model.
-        threads: Of onnxruntime while they are timed.
-        seed: Of the order of routes, of draws from traces and of bootstraps.
+        samples: Timed inferences per model.
+        threads: Threads of onnxruntime while they are timed.
+        seed: Seed of the order of routes, of draws from traces and of bootstraps.
         provider: What runs the models.
-        force: Replace a recipe that is not as we left it, too.
+        force: Also replace a recipe that was changed since we wrote it.
 
     Raises:
-        RecipeError: A number that is too small, or int8 for another target timed here.
+        RecipeError: A number is too small, or int8 for another target is timed here.
     """
 
     drives: Path
@@ -63,7 +64,6 @@ class RoadSearchOptions:
     force: bool = False
 
     def __post_init__(self) -> None:
-        """Check what can be checked without a file."""
         check_count("--most-ablated", self.most_ablated)
         check_count("--first-rung", self.first_rung, least=1)
         check_count("--threads", self.threads, least=1, most=MOST_THREADS)

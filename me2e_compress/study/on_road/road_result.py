@@ -1,4 +1,4 @@
-"""What a search on the road found: one scheme, and how sure that is."""
+"""Result of a search on the road: one scheme, and how certain it is."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -26,11 +26,10 @@ class Scheme:
     """One assignment, apart from how it drives.
 
     Attributes:
-        name: Of its variant.
-        point: What is int8 and what is gone.
-        weighed: What it costs; None where it could not be made.
-        refused: Why it did not drive; empty if it was let to.
-        same_as: The scheme whose file it is, to the byte; empty if its own.
+        name: Name of its variant.
+        weighed: Its costs; None if it could not be made.
+        refused: Why it did not drive; empty if it could.
+        same_as: The scheme with a byte-identical file; empty if there is none.
     """
 
     name: str
@@ -47,14 +46,11 @@ class RoadSearchResult(Result):
     Attributes:
         output: The recipe that was written.
         schemes: The whole grid.
-        float_costs: What the model as it is costs.
-        rungs: Who drove how far.
-        difference: The winner's to the float model, over all routes.
-        joules: What joules are here.
-        condition: What all drove under.
+        float_costs: Costs of the unchanged model.
+        difference: The winner minus the float model, over all routes.
         device_scale: How many times slower the device is than this machine.
         coverage: Routes that were driven, and those of the whole set.
-        spent: What the winner takes of each budget, in words.
+        spent: Share of each budget that the winner uses, in words.
     """
 
     output: Path
@@ -76,7 +72,7 @@ class RoadSearchResult(Result):
 
     @property
     def worse_by_at_most(self) -> float | None:
-        """Points of driving score: the lower end of the two-sided 95 % interval."""
+        """Points of driving score: lower end of the two-sided 95 % interval."""
         low = self.difference.driving_score.low
         return None if low is None else max(0.0, -low)
 
@@ -116,7 +112,7 @@ class RoadSearchResult(Result):
         return self._grid(), self._climb()
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a scheme."""
+        """Return one row per scheme."""
         return [
             {
                 "scheme": each.name,
@@ -131,7 +127,7 @@ class RoadSearchResult(Result):
         ]
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything."""
+        """Return the whole search as JSON."""
         return {
             "winner": self.winner.name,
             "recipe": str(self.output),
@@ -157,7 +153,7 @@ class RoadSearchResult(Result):
         }
 
     def _of(self, scheme: Scheme) -> Iterator[tuple[Rung, Standing]]:
-        """Yield where a scheme stood, rung by rung."""
+        """Yield the standings of a scheme, rung by rung."""
         for rung in self.rungs:
             for standing in rung.standings:
                 if standing.name == scheme.name:

@@ -1,4 +1,4 @@
-"""Which scheme to ship: within the budgets, and the best on the road."""
+"""Search for the scheme to ship: within the budgets, and best on the road."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -41,28 +41,28 @@ def search_on_road(
 ) -> RoadSearchResult:
     """Find the scheme within the budgets that drives best, by successive halving.
 
-    Every module group in float or int8, times the modules that are removed: all are
-    made, weighed and timed; those within the budgets drive the same routes with the
-    same seeds, the better half more of them, the last two all. Run again with the same
-    folder of drives, it goes on.
+    The schemes are every module group in float or int8, times the modules that are
+    removed. All are made, weighed and timed; those within the budgets drive the same
+    routes with the same seeds, the better half more of them, the last two all. With the
+    same folder of drives, a search resumes.
 
     Args:
         model: The float ONNX file, or the name of one that ships.
-        frames: Recorded frames: int8 and the means of what is removed are of them.
+        frames: Recorded frames, for int8 calibration and the means of removed modules.
         output: The recipe of the winner.
         options: Budgets, grid and road.
         engine: Where routes are driven; None for one process of this machine.
         listener: Is called with progress and warnings.
-        tell: Is called with what is ahead, and with each rung.
+        tell: Is called with a forecast of the work, and with each rung.
 
     Raises:
-        GraphError: No such model, or the output would harm an input.
-        RecipeError: No such module, or one that cannot be removed.
-        FramesError: Frames that do not fit.
-        StudyError: The folder of drives is of another search.
-        EvaluationError: Nothing fits the budgets; says what the least was. Or the
-            model cannot drive.
-        EnergyError: A counter that answers is not usable.
+        GraphError: There is no such model, or the output would harm an input.
+        RecipeError: A module does not exist or cannot be removed.
+        FramesError: Frames do not fit.
+        StudyError: The folder of drives belongs to another search.
+        EvaluationError: Nothing fits the budgets (the message names the least cost), or
+            the model cannot drive.
+        EnergyError: An energy counter responds but is not usable.
     """
     path, recipe_file = model_path(model), Path(output)
     inputs = (path, frames, options.module_map, options.adapter)
@@ -100,10 +100,9 @@ def planned(
     """Return the study of a grid, and its points by the names of their variants.
 
     Raises:
-        RecipeError: No such module, or one that cannot be removed.
-        EvaluationError: No such routes, or latency.
-        StudyError: A module's name that no file can have, or a latency that no study
-            knows.
+        RecipeError: A module does not exist or cannot be removed.
+        EvaluationError: Routes or latency are unknown.
+        StudyError: A module's name is no file name, or a study cannot use the latency.
     """
     loaded = graph.load(path)
     modules = GridModules.of(loaded, load_map(options.module_map, loaded))
@@ -162,7 +161,7 @@ def within(made: RoadDrives, options: RoadSearchOptions) -> tuple[str, ...]:
     """Return the schemes within the budgets, the cheapest first, each file once.
 
     Raises:
-        EvaluationError: There is none; says what the least was.
+        EvaluationError: There is none; the message names the least cost.
     """
     limits, weighed = options.limits, made.weighed
     ours = [name for name in made.prepared if name != BASELINE]

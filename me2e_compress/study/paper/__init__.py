@@ -1,1 +1,1 @@
-"""The paper's tables, figures and findings, asked again of a driver of one's own."""
+"""The paper's tables, figures and findings, recomputed for another driver."""

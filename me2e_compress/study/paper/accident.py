@@ -1,4 +1,4 @@
-"""One driver's successive plans before its own accident (the paper's figure 6)."""
+"""A driver's successive plans before its own accident (the paper's figure 6)."""
 
 import math
 from dataclasses import dataclass, field
@@ -45,13 +45,9 @@ class SeenBox:
 @with_config(_STRICT)
 @dataclass(frozen=True)
 class PlannedMoment:
-    """Where everyone was, and where the ego wanted to go.
+    """All road users at one moment, and the ego's plan.
 
-    Attributes:
-        time_us: Since the route began.
-        ego: The ego.
-        plan: Its waypoints in the world; empty before the first decision.
-        others: Who was near.
+    ``plan`` holds waypoints in the world, and is empty before the first decision.
     """
 
     time_us: int
@@ -65,14 +61,8 @@ class PlannedMoment:
 class Accident:
     """The last seconds of a route that ended in a collision.
 
-    Attributes:
-        variant: Who drove.
-        condition: Under what.
-        route: Its id.
-        scenario: Its type.
-        partner: What was hit.
-        path: The route's centre line.
-        moments: In order of time, the last one at the collision.
+    ``path`` is the route's centre line; ``moments`` are in order of time, the last one
+    at the collision.
     """
 
     variant: str
@@ -96,10 +86,10 @@ class Accident:
 
     @classmethod
     def load(cls, path: Path) -> "Accident":
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises:
-            StudyError: It cannot be read, or is something else.
+            StudyError: The file cannot be read, or has other content.
         """
         try:
             content = documents.from_json(documents.content(path))
@@ -115,7 +105,7 @@ _ACCIDENT = TypeAdapter(Accident)
 
 
 def first_accident(record: DriveRecord) -> RouteSummary | None:
-    """Return the first route that ended in a collision with someone who moves."""
+    """Return the first route that ended in a collision with a moving actor."""
     moving = (InfractionKind.COLLISION_VEHICLE, InfractionKind.COLLISION_PEDESTRIAN)
     for each in record.routes:
         kinds = [kind for kind, _ in each.collisions]
@@ -127,14 +117,7 @@ def first_accident(record: DriveRecord) -> RouteSummary | None:
 def watched(
     record: DriveRecord, happened: RouteSummary, route: Route, job: Job
 ) -> Accident:
-    """Drive a route again, and keep its last seconds.
-
-    Args:
-        record: The drive that the accident is of.
-        happened: What the route came to.
-        route: The same route.
-        job: Who drives under what.
-    """
+    """Drive the route of an accident again, and keep its last seconds."""
     film = _LastSeconds(happened.duration_us - BEFORE_US)
     drive(route, job.driver.open(), job.conditions, Listeners(on_moment=film.see))
     partner = next(who for kind, _, who in happened.infractions if kind in COLLISIONS)
@@ -152,7 +135,7 @@ def watched(
 
 @dataclass
 class _LastSeconds:
-    """Keeps a moment twice a second, counted back from the end, and the last one."""
+    """Keeps two moments per second, counted back from the end, and the last one."""
 
     from_us: int
     kept: list[PlannedMoment] = field(default_factory=list)

@@ -20,9 +20,9 @@ MARGIN_M = 8.0
 
 
 def plans_before(accident: Accident) -> Figure:
-    """Draw each moment's ego, plan and neighbours, the later the darker.
+    """Draw the ego, plan and neighbours of each moment, later ones darker.
 
-    All as seen from the ego at the last moment: it looks to the right.
+    All are in the frame of the ego at the last moment, which looks to the right.
     """
     with styled():
         figure = Figure(figsize=(WIDTH_IN, 3.6), layout="constrained")
@@ -95,14 +95,14 @@ def _draw(
 
 
 def _seen(points: npt.ArrayLike, here: SeenBox) -> Floats:
-    """Return points of the world in the frame of a box, x forward, y to its left."""
+    """Convert points from the world to a box's frame, x forward, y left."""
     cos, sin = math.cos(here.heading), math.sin(here.heading)
     moved = np.asarray(points, np.float64) - (here.x, here.y)
     return np.asarray(moved @ np.array([[cos, -sin], [sin, cos]]))
 
 
 def _frame(axes: Axes, moments: Sequence[PlannedMoment], here: SeenBox) -> None:
-    """Show what the ego drove and planned, and a little around it."""
+    """Limit the view to the ego's way and plans, with a margin."""
     driven = [(moment.ego.x, moment.ego.y) for moment in moments]
     planned = [point for moment in moments for point in moment.plan]
     points = _seen([*driven, *planned], here)

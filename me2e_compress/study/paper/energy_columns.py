@@ -1,4 +1,4 @@
-"""Joules a frame and EER_AV of drives: measured, and apart from it modelled."""
+"""Joules per frame and EER_AV of drives, measured and modelled separately."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -32,14 +32,7 @@ EER = (
 
 @dataclass(frozen=True)
 class EnergyColumns:
-    """Energy of variants that drove under one condition.
-
-    Attributes:
-        joules: Measured, by variant.
-        modelled_mj: By variant.
-        scores: EER_AV with measured joules.
-        modelled_scores: EER_AV with modelled ones.
-    """
+    """Energy of variants that drove under one condition, with both EER_AV."""
 
     joules: Mapping[str, Estimate]
     modelled_mj: Mapping[str, Measure]
@@ -48,7 +41,7 @@ class EnergyColumns:
 
     @classmethod
     def of(cls, result: "PaperResult", variants: Sequence[str], condition: str) -> Self:
-        """Score the variants that drove; the others have reasons."""
+        """Score the variants that drove; the others get reasons."""
         facts = {name: result.fact(name) for name in variants}
         measured = joules_by_variant(result, variants, "measured")
         modelled = joules_by_variant(result, variants, "modelled")
@@ -75,7 +68,7 @@ class EnergyColumns:
 def joules_by_variant(
     result: "PaperResult", variants: Sequence[str], energy: Energy
 ) -> dict[str, float | None]:
-    """Return joules a frame, of one kind; None where there are none."""
+    """Return joules per frame of one kind; None if unknown."""
     facts = {name: result.fact(name) for name in variants}
     if energy == "modelled":
         return {name: fact.modelled_j for name, fact in facts.items()}
@@ -97,7 +90,7 @@ def measures_by_variant(
 
 
 def ranking_note(result: "PaperResult", variants: Sequence[str], condition: str) -> str:
-    """Say how the variants rank, and whether the normalization decides it."""
+    """Say how the variants rank, and whether that depends on the normalization."""
     energy: Energy = "measured"
     if all(result.fact(name).joules is None for name in variants):
         energy = "modelled"
@@ -113,12 +106,7 @@ def ranking_note(result: "PaperResult", variants: Sequence[str], condition: str)
 
 
 def record_measures(record: DriveRecord, j_per_frame: float | None) -> RouteMeasures:
-    """Return the four measures of each route, as `route_measures` does of episodes.
-
-    Args:
-        record: The drive.
-        j_per_frame: Joules of one inference; None: not measured.
-    """
+    """Return the four measures of each route, as `route_measures` does of episodes."""
     routes = record.routes
     joules = [_route_joules(each, j_per_frame) for each in routes]
     return RouteMeasures(

@@ -1,4 +1,4 @@
-"""What is known of a variant's file apart from how it drives."""
+"""Facts about a variant's file, apart from how it drives."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,7 +28,7 @@ _STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
 @with_config(_STRICT)
 @dataclass(frozen=True)
 class Int8Counts:
-    """What of a graph is int8.
+    """Counts of the int8 part of a graph.
 
     Attributes:
         tensors: Activations with a scale of their own: nodes that quantize.
@@ -47,20 +47,19 @@ class ModelFacts:
     """A variant's file.
 
     Attributes:
-        variant: Its name.
-        sha256: Of the file; None where there is none.
-        pipeline: The passes that made it, as text; empty if none did.
-        size_bytes: Of the file with its weights.
-        parameters: Elements of its weights.
+        sha256: None if there is no file.
+        pipeline: The passes that made it, as text.
+        size_bytes: Size of the file with its weights.
+        parameters: Number of elements of its weights.
         macs: Multiply-accumulates of one inference.
-        int8: What of it is int8; None for a file without a plan.
-        latency_us: Of inferences alone, warm, on the device imagined.
-        modules_us: Of inferences under a profiler, module by module, on the device.
-        modelled_j: Joules a frame by published energies of MACs and bytes: no
-            measurement.
-        joules: Measured joules a frame, and the ends of their 95 % interval; None
-            where nothing counted.
-        no_joules: Why nothing did.
+        int8: None for a file without a plan.
+        latency_us: Latencies of inferences alone, warm, on the target device.
+        modules_us: Latencies by module under a profiler, on the target device.
+        modelled_j: Joules per frame from published energies of MACs and bytes; not
+            measured.
+        joules: Measured joules per frame, and the ends of their 95 % interval; None
+            without a counter.
+        no_joules: Why there is no measurement.
         failure: Why there is no file that can drive; empty if there is one.
     """
 
@@ -79,25 +78,25 @@ class ModelFacts:
     failure: str = ""
 
     def latency_ms(self, percent: float) -> float | None:
-        """Return a percentile of the latencies; None where none were measured."""
+        """Return a percentile of the latencies; None if none were measured."""
         if not self.latency_us:
             return None
         return float(np.percentile(self.latency_us, percent, method="higher")) / 1e3
 
     @property
     def fps(self) -> float | None:
-        """Inferences a second at the mean latency, as the paper's FPS column."""
+        """Inferences per second at the mean latency, as in the paper's FPS column."""
         if not self.latency_us:
             return None
         return 1e6 / float(np.mean(self.latency_us))
 
     @property
     def of_another_stack(self) -> bool:
-        """Whether it was counted for table 4 alone: a variant's name has no space."""
+        """Whether it serves table 4 only: a variant's name has no space."""
         return " " in self.variant
 
     def with_energy(self, found: EnergyResult) -> "ModelFacts":
-        """Return it with what a counter said, or why none did."""
+        """Return it with a counter's measurement, or why there is none."""
         if found.j_per_frame is None:
             return replace(self, no_joules=found.reason)
         low, high = found.low or 0.0, found.high or found.j_per_frame
@@ -110,13 +109,7 @@ _FACTS = TypeAdapter(tuple[ModelFacts, ...])
 def facts_of(
     prepared: PreparedVariant, clock: Clock, known: Mapping[str, ModelFacts]
 ) -> ModelFacts:
-    """Weigh a variant's file, unless that was done before.
-
-    Args:
-        prepared: The variant.
-        clock: Latencies of the variants.
-        known: What was found before, by the variant's name.
-    """
+    """Collect the facts of a variant's file, unless they are already known."""
     name = prepared.variant.name
     trace = clock.traces.get(name)
     latency_us = () if trace is None else _scaled(trace.samples_us, clock.scale)
@@ -146,14 +139,13 @@ def facts_of(
 
 
 def weighed(folder: Path) -> tuple[ModelFacts, ...]:
-    """Count the files of another stack, for table 4 alone.
+    """Count the files of another stack, for table 4 only.
 
-    Args:
-        folder: Holds ``exact.onnx``, ``prediction.onnx``, ``feature-ext.onnx`` and
-            ``full.onnx``, or some of them; its name is the stack's.
+    The folder's name is the stack's. It holds some of ``exact.onnx``,
+    ``prediction.onnx``, ``feature-ext.onnx`` and ``full.onnx``.
 
     Raises:
-        StudyError: It holds none of them.
+        StudyError: The folder holds none of them.
     """
     files = [(scheme, folder / f"{scheme}.onnx") for scheme in SCHEMES]
     there = [(scheme, path) for scheme, path in files if path.is_file()]
@@ -171,7 +163,7 @@ def weighed(folder: Path) -> tuple[ModelFacts, ...]:
 
 
 def int8_counts(path: Path) -> Int8Counts | None:
-    """Count what of a file is int8; None for one that carries no plan."""
+    """Count the int8 part of a file; None for one that carries no plan."""
     loaded = graph.load(path)
     plan = plan_of(loaded)
     if plan is None:
@@ -187,7 +179,7 @@ def int8_counts(path: Path) -> Int8Counts | None:
 def save_facts(
     path: Path, facts: Sequence[ModelFacts], about: Mapping[str, object]
 ) -> None:
-    """Write facts and what they were found on.
+    """Write facts, and what they were measured on.
 
     Raises:
         StudyError: The file cannot be written.
@@ -201,10 +193,10 @@ def save_facts(
 
 
 def load_facts(path: Path) -> tuple[dict[str, object], dict[str, ModelFacts]]:
-    """Read what `save_facts` wrote: what it was found on, and the facts by variant.
+    """Read what `save_facts` wrote: what it was measured on, and facts by variant.
 
     Raises:
-        StudyError: The file cannot be read, or holds something else.
+        StudyError: The file cannot be read, or has other content.
     """
     try:
         content = documents.from_json(documents.content(path))

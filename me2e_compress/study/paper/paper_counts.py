@@ -1,4 +1,4 @@
-"""What is int8 in each file, and what was hit in each drive."""
+"""Int8 parts of each file, and collisions of each drive."""
 
 from collections import Counter
 from typing import TYPE_CHECKING
@@ -22,7 +22,7 @@ COUNTS = ("tensors", "int8 operators", "compute-intensive", "MB")
 
 
 def table_4(result: "PaperResult") -> Table:
-    """Show what of each file is int8, the paper's counts in columns of their own."""
+    """Show the int8 parts of each file, with the paper's counts in separate columns."""
     stacks = dict.fromkeys(
         each.variant.rsplit(" ", 1)[0] for each in result.facts if each.of_another_stack
     )
@@ -70,7 +70,7 @@ def _given(row: PublishedInt8) -> tuple[Cell, ...]:
 
 
 def partners(result: "PaperResult") -> Table:
-    """Show what was hit, and by which share of the collisions."""
+    """Show what was hit, as shares of the collisions."""
     rows = []
     for (variant, condition), cell in result.cells.items():
         found = collisions(cell)

@@ -33,7 +33,7 @@ SLOWEST_SHOWN = 6
 
 
 def safety(result: "PaperResult") -> Figure | None:
-    """Draw figure 5a: driving score over the rate of decisions; None without drives."""
+    """Draw figure 5a: driving score over the decision rate; None without drives."""
     return _over_rates(result, (DS,))
 
 
@@ -43,7 +43,7 @@ def efficiency_and_comfort(result: "PaperResult") -> Figure | None:
 
 
 def where_the_time_goes(result: "PaperResult") -> Figure | None:
-    """Draw figure 7: modules stacked over inferences, and tails; None without both."""
+    """Draw figure 7: stacked module times, and tails; None without both."""
     baseline = result.fact(result.study.baseline)
     timed = [each for each in result.facts if each.latency_us]
     if not timed or not baseline.modules_us:
@@ -193,7 +193,7 @@ def _mean(
 
 
 def _stack(axes: Axes, parts: Mapping[str, tuple[int, ...]], name: str) -> None:
-    """Draw a bar an inference, a colour a module, the largest at the bottom."""
+    """Draw one bar per inference, one colour per module, the largest at the bottom."""
     colours = colormaps["tab10"].colors  # type: ignore[attr-defined]
     ordered = sorted(parts.items(), key=lambda part: -sum(part[1]))
     total = sum(sum(samples) for _, samples in ordered)
@@ -217,7 +217,7 @@ def _stack(axes: Axes, parts: Mapping[str, tuple[int, ...]], name: str) -> None:
 
 
 def _shown_tails(result: "PaperResult") -> list[str]:
-    """Return the baseline and, of the others, those with the longest tails."""
+    """Return the baseline, and the other variants with the longest tails."""
     baseline = result.study.baseline
     others = [each for each in result.facts if each.latency_us]
     ranked = sorted(others, key=lambda each: -(each.latency_ms(99) or 0.0))
@@ -226,7 +226,7 @@ def _shown_tails(result: "PaperResult") -> list[str]:
 
 
 def _tail(axes: Axes, samples_us: Sequence[int], name: str, colour: Any) -> None:
-    """Draw which share of the inferences takes longer than so many milliseconds."""
+    """Draw the share of inferences that exceed each latency."""
     if not samples_us:
         return
     count = len(samples_us)

@@ -1,4 +1,4 @@
-"""What the paper's study leaves on disk."""
+"""Files that the paper's study writes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,17 +20,14 @@ def write_paper(
     *,
     force: bool = False,
 ) -> tuple[Path, ...]:
-    """Write page, Markdown and JSON, each whole or not at all; return the files.
+    """Write page, Markdown and JSON, each atomically; return the files.
 
-    Args:
-        result: What was found.
-        folder: It is made when needed.
-        command: What makes it again, word by word.
-        force: Replace files that are not as we left them, too.
+    ``command`` is the command line that reproduces them; ``force`` also replaces files
+    that were changed since we wrote them.
 
     Raises:
         StudyError: The folder cannot be written.
-        GraphError: One of the files is not as we left it.
+        GraphError: A file was changed since we wrote it.
     """
     folder = Path(folder)
     report, tables, record = folder / HTML, folder / MARKDOWN, folder / JSON

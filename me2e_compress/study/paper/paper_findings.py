@@ -1,4 +1,4 @@
-"""The paper's findings as questions, and what answers each."""
+"""The paper's findings as questions, with the test that answers each."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -52,7 +52,7 @@ def _lost(row: PublishedDrive, whole: PublishedDrive) -> float:
 
 
 def _keeps(cell: tuple[str, str], share: float) -> Callable[[Evidence], Rule]:
-    """Judge that no more than a share of a drive's score is lost."""
+    """Return a rule that no more than a share of a drive's score is lost."""
     return lambda evidence: not_lower_by(share * evidence.mean(cell, DS))
 
 
@@ -121,7 +121,7 @@ RATE_QUESTIONS = (
 
 
 def _of_the_stage(where: str, tail: str, even: str) -> tuple[PaperQuestion, ...]:
-    """Ask for the collision optimisation at one speed of the network."""
+    """Ask about the collision optimisation at one speed of the network."""
     with_it = ("optimizer", tail)
     return (
         PaperQuestion(

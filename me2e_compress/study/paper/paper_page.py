@@ -1,4 +1,4 @@
-"""The paper's questions and answers on one HTML page."""
+"""The paper's questions and answers as one HTML page."""
 
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
@@ -50,12 +50,7 @@ FIGURES: dict[str, tuple[tuple[Callable[[PaperResult], Figure | None], str], ...
 
 
 def paper_html(result: PaperResult, command: Sequence[str] = ()) -> str:
-    """Build the whole page; it refers to nothing outside itself.
-
-    Args:
-        result: What was found.
-        command: What makes it again, word by word.
-    """
+    """Build the whole page, which is self-contained."""
     return template(TEMPLATE).render(
         title=result.title,
         lede=result.headline,
@@ -79,7 +74,7 @@ def paper_html(result: PaperResult, command: Sequence[str] = ()) -> str:
 def _section(
     table: Table, result: PaperResult
 ) -> tuple[str, tuple[Table, ...], tuple[Drawn, ...]]:
-    """Return heading, tables and the figures that there are drives for."""
+    """Return heading, tables and the figures that have drives."""
     heading = table.title.removesuffix(result.preview).partition(":")[0]
     with styled():  # the same figure gives the same names in its SVG
         drawn = [

@@ -1,4 +1,4 @@
-"""What the paper's study found so far."""
+"""Results of the paper's study so far."""
 
 import functools
 from collections.abc import Mapping
@@ -21,16 +21,14 @@ CellKey = tuple[str, str]
 
 @dataclass(frozen=True, repr=False)
 class PaperResult(Result):
-    """The cells that were driven, and what is known of the files that drove.
+    """The drives that were made, and facts about the files that drove.
 
     Attributes:
-        study: What was asked.
-        facts: One a variant, in the study's order.
-        cells: What was driven.
-        failures: Why a cell was not.
+        facts: One per variant, in the study's order.
+        cells: The finished drives.
+        failures: Why a drive failed.
         device_scale: How many times slower the device is than the machine timed on.
-        machine: What it was made on, in words.
-        accident: Of the baseline, for figure 6; None where it had none.
+        accident: An accident of the baseline, for figure 6; None if it had none.
     """
 
     study: Study
@@ -43,29 +41,29 @@ class PaperResult(Result):
 
     @property
     def title(self) -> str:
-        """The study's, and whether not all routes were driven."""
+        """The study's title, with a note if not all routes were driven."""
         return f"{self.study.title}{self.preview}"
 
     @property
     def preview(self) -> str:
-        """What every title says of a part of the routes; empty for all of them."""
+        """Suffix of titles if only a part of the routes is driven; empty otherwise."""
         return self.study.preview
 
     @property
     def headline(self) -> str:
-        """Title and cells."""
+        """Title, and number of drives."""
         wanted = sum(
             len(self.study.driven_under(each)) for each in self.study.conditions
         )
         return f"{self.title}: {len(self.cells)} of {wanted} drives"
 
     def fact(self, variant: str) -> ModelFacts:
-        """Return what is known of a variant; nothing where it was not prepared."""
+        """Return the facts about a variant; empty facts if it was not prepared."""
         found = (each for each in self.facts if each.variant == variant)
         return next(found, ModelFacts(variant))
 
     def cell(self, variant: str, condition: str) -> DriveRecord | None:
-        """Return a drive; None where it was not driven."""
+        """Return a drive; None if it was not driven."""
         return self.cells.get((variant, condition))
 
     def why_not(self, variant: str, condition: str) -> str:
@@ -84,14 +82,14 @@ class PaperResult(Result):
         return findings_table(self.findings, self.preview), *all_paper_tables(self)
 
     def alerts(self) -> tuple[str, ...]:
-        """Return the cells that failed, and why."""
+        """Return the drives that failed, and why."""
         return tuple(
             f"{variant} under {condition} was left out: {why}"
             for (variant, condition), why in self.failures.items()
         )
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row a drive."""
+        """Return one row per drive."""
         return [
             {
                 "variant": variant,
@@ -103,7 +101,7 @@ class PaperResult(Result):
         ]
 
     def to_json(self) -> dict[str, Any]:
-        """Return scores of every drive, and what is known of the files."""
+        """Return the scores of every drive, and the facts about the files."""
         seed = self.study.seed
         return {
             "title": self.title,

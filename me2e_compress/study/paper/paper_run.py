@@ -1,4 +1,4 @@
-"""The paper's study: cells driven one by one, and kept without their frames."""
+"""Run the paper's study: drives one by one, kept without their frames."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -52,18 +52,10 @@ def run_paper(
 ) -> PaperResult:
     """Make the models, time them and drive every cell, block by block.
 
-    Run again with the same folder it goes on: models, traces, routes and finished
-    cells (``records/``) that are there are not made again. A variant that fails, or a
-    cell that cannot be driven, is reported, and the rest goes on.
-
-    Args:
-        study: Whose blocks are the paper's tables.
-        folder: Where models, traces and results go.
-        engine: Where routes are driven; None for one process of this machine.
-        listener: Is called with progress and warnings.
-        on_block: Is called with all there is after each block that was driven now.
-        weigh: Folders of other stacks' files, counted in table 4.
-        force: Replace a report that is not as we left it, too.
+    Run again with the same folder it resumes: finished models, traces, routes and cells
+    (``records/``) are reused. A variant that fails, or a cell that cannot be driven, is
+    reported, and the rest continues. ``on_block`` is called with all results after each
+    block driven now; ``weigh`` are folders of other stacks' files, counted in table 4.
 
     Raises:
         GraphError: The folder is a file or an input.
@@ -81,16 +73,12 @@ def run_paper(
 def read_paper(
     study: Study, records: str | Path, weigh: Sequence[Path] = ()
 ) -> PaperResult:
-    """Read what was driven before, here or elsewhere; nothing is made or driven.
+    """Read finished cells (``records/`` of a run); nothing is made or driven.
 
-    Args:
-        study: Whose blocks are the paper's tables.
-        records: Folder of finished cells, as ``records/`` of a run.
-        weigh: Folders of other stacks' files, counted in table 4 beside those that
-            were counted then.
+    ``weigh`` adds folders of other stacks' files to table 4.
 
     Raises:
-        StudyError: One holds no such files, or one that cannot be read.
+        StudyError: A folder holds no such files, or one that cannot be read.
     """
     folder = Path(records)
     about, facts = load_facts(folder / FILE)
@@ -114,7 +102,7 @@ def read_paper(
 
 
 def _of_these_routes(study: Study, found: Sequence[DriveRecord], folder: Path) -> Study:
-    """Return the study over the routes that were driven, the same by all."""
+    """Return the study over the routes that all cells drove."""
     sets = {each.made_by.get("routes_sha256") for each in found}
     if len(sets) > 1:
         raise StudyError(f"{folder}: drives of different sets of routes")
@@ -193,7 +181,7 @@ def _driven(
     prepared: Sequence[PreparedVariant],
     result: PaperResult,
 ) -> PaperResult:
-    """Drive what a block has and no other had; a cell that fails leaves the others."""
+    """Drive the new cells of a block; a failing one does not stop the others."""
     cells, failures = dict(result.cells), dict(result.failures)
     wanted = (*block.variants, setup.study.baseline)
     for condition in setup.study.conditions:
@@ -218,7 +206,7 @@ def _facts(
     listener: Listener,
     others: tuple[ModelFacts, ...],
 ) -> tuple[ModelFacts, ...]:
-    """Weigh every variant, and profile the baseline by module, unless it is known."""
+    """Collect facts of every variant, and profile the baseline, unless known."""
     path = workspace.folder / "records" / FILE
     known = load_facts(path)[1] if path.is_file() else {}
     found = list[ModelFacts]()
@@ -242,7 +230,7 @@ def _with_joules(
     found: Sequence[ModelFacts],
     listener: Listener,
 ) -> list[ModelFacts]:
-    """Measure joules a frame where a counter of this machine counts them."""
+    """Measure joules per frame if this machine has a counter."""
     models = {
         each.variant.name: each.model
         for each, facts in zip(prepared, found, strict=True)

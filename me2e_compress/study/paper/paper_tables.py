@@ -1,7 +1,7 @@
-"""The paper's tables, from what was driven.
+"""The paper's tables, from the drives made here.
 
-Its own figures stand beside them, in columns of their own: they are of other stacks, on
-other roads, with other traffic.
+The paper's own figures are in separate columns: they are of other stacks, on other
+roads, with other traffic.
 """
 
 from typing import TYPE_CHECKING
@@ -107,7 +107,7 @@ def table_2(result: "PaperResult", block: "StudyBlock") -> Table:
 
 
 def table_3(result: "PaperResult", block: "StudyBlock") -> Table:
-    """Show the driver without modules, each at its own latency."""
+    """Show the driver without some modules, each variant at its own latency."""
     condition = block.conditions[0]
     base = result.fact("exact")
     energy = EnergyColumns.of(result, block.variants, condition)
@@ -230,7 +230,7 @@ def table_6(result: "PaperResult", block: "StudyBlock") -> Table:
 
 
 def tail(result: "PaperResult", block: "StudyBlock") -> Table:
-    """Show a stage that is called in critical frames, and its mean at every one."""
+    """Compare a host stage in critical frames with its mean at every frame."""
     base = result.study.baseline
     rows = [
         (

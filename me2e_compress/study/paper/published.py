@@ -1,6 +1,6 @@
-"""The paper's own figures, given and never mixed with what is computed here.
+"""The paper's own figures, never mixed with values computed here.
 
-All of arXiv 2601.07393, which names its tables as they are named here.
+All are from arXiv 2601.07393; tables are named as there.
 """
 
 from dataclasses import dataclass
@@ -8,16 +8,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class PublishedDrive:
-    """A row of tables 2, 3, 5 or 6.
+    """A row of tables 2, 3, 5 or 6; None where the table has no such column.
 
     Attributes:
-        fps: Frames a second.
+        fps: Frames per second.
         ds: Driving score.
         de: Driving efficiency, percent.
         dc: Driving comfort.
-        joules: Energy a frame; None where the table has none.
-        eer: EER_AV; None where the table has none.
-        watts: Power; None where the table has none.
+        joules: Energy per frame.
+        eer: EER_AV.
+        watts: Power.
     """
 
     fps: float

@@ -1,6 +1,6 @@
-"""What the paper found, each as a question, and the test that answers it here.
+"""The paper's findings as questions, and the tests that answer them here.
 
-Nothing of the answers is written down: every verdict follows from the drives.
+No answer is written down: every verdict follows from the drives.
 """
 
 from collections.abc import Callable
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 class Verdict(StrEnum):
-    """What the interval says of a finding."""
+    """What the interval says about a finding."""
 
     CONFIRMED = "confirmed"
     NOT_CONFIRMED = "not confirmed"
@@ -46,15 +46,14 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """A question of the paper's, and the answer.
+    """A question about a finding of the paper, and the answer.
 
     Attributes:
-        question: So that the paper's answer is yes.
-        paper: What it says, in its figures.
-        test: What is computed here.
-        verdict: What follows.
-        estimate: With its interval; None where nothing could be computed.
-        reason: Why nothing could.
+        question: Phrased so that the paper's answer is yes.
+        paper: What the paper says, with its figures.
+        test: What is computed here, in words.
+        estimate: None if nothing could be computed.
+        reason: Why nothing could be computed.
     """
 
     question: str
@@ -65,7 +64,7 @@ class Finding:
     reason: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """Return all of it."""
+        """Return all fields."""
         return {
             "question": self.question,
             "paper": self.paper,
@@ -77,7 +76,7 @@ class Finding:
 
 
 class UntestedError(Exception):
-    """Something that a test needs was not driven or measured; it says what."""
+    """Data that a test needs are missing; the message names them."""
 
 
 Rule = Callable[[Estimate], Verdict]
@@ -85,12 +84,12 @@ CellName = tuple[str, str]
 
 
 def rises(found: Estimate) -> Verdict:
-    """Judge that a difference is above zero."""
+    """Judge whether a difference is above zero."""
     return _beyond(found, 0.0, 0.0)
 
 
 def falls(found: Estimate) -> Verdict:
-    """Judge that a difference is below zero."""
+    """Judge whether a difference is below zero."""
     turned = {
         Verdict.CONFIRMED: Verdict.OPPOSITE,
         Verdict.OPPOSITE: Verdict.CONFIRMED,
@@ -100,12 +99,12 @@ def falls(found: Estimate) -> Verdict:
 
 
 def not_lower_by(margin: float) -> Rule:
-    """Judge that a difference is not below minus a margin."""
+    """Return a rule that a difference is not below minus a margin."""
     return lambda found: _beyond(found, -margin, -margin)
 
 
 def within(margin: float) -> Rule:
-    """Judge that a difference is no larger than a margin, up or down."""
+    """Return a rule that a difference is no larger than a margin, up or down."""
 
     def judge(found: Estimate) -> Verdict:
         if found.low is None or found.high is None:
@@ -119,7 +118,7 @@ def within(margin: float) -> Rule:
 
 
 def _beyond(found: Estimate, least: float, most: float) -> Verdict:
-    """Judge by where the whole interval lies."""
+    """Judge by the position of the whole interval."""
     if found.low is not None and found.low > least:
         return Verdict.CONFIRMED
     if found.high is not None and found.high < most:
@@ -129,20 +128,20 @@ def _beyond(found: Estimate, least: float, most: float) -> Verdict:
 
 @dataclass(frozen=True)
 class Evidence:
-    """The drives of a study, as tests ask for them."""
+    """The drives of a study, with the statistics that tests need."""
 
     result: "PaperResult"
 
     @property
     def seed(self) -> int:
-        """Of bootstraps."""
+        """Seed of bootstraps."""
         return self.result.study.seed
 
     def cell(self, name: CellName) -> DriveRecord:
         """Return a drive.
 
         Raises:
-            UntestedError: It is not there; the message says why.
+            UntestedError: It is missing; the message says why.
         """
         found = self.result.cell(*name)
         if found is None:
@@ -165,14 +164,14 @@ class Evidence:
     def change_of_change(
         self, first: CellName, middle: CellName, last: CellName
     ) -> Estimate:
-        """Return how much more DS changes from first to middle than from there on."""
+        """Return how much more DS changes from first to middle than to last."""
         early = gaps(self.cell(middle), self.cell(first), DS)
         late = gaps(self.cell(last), self.cell(middle), DS)
         both = {name: gap - late[name] for name, gap in early.items() if name in late}
         return mean_gap(both, self.cell(middle), DS, self.seed, of=2)
 
     def static_share(self, one: CellName, other: CellName) -> Estimate:
-        """Return how much larger the share of collisions with static things is."""
+        """Return the increase of the share of collisions with static objects."""
         drives = self.cell(one), self.cell(other)
         counts = np.array([_static_and_all(drive) for drive in drives], np.float64)
         if not counts[:, :, 1].sum(axis=1).all():
@@ -190,7 +189,7 @@ class Evidence:
         return Estimate(measure, *here, len(types), *anew)
 
     def eer_gap(self, one: str, other: str, condition: str, energy: Energy) -> Estimate:
-        """Return EER_AV of one minus the other's, scored beside all of table 5."""
+        """Return the difference in EER_AV, scored with all of table 5."""
         block = next((b for b in self.result.study.blocks if b.name == "table-5"), None)
         if block is None:
             raise UntestedError("the study has no block table-5")
@@ -230,15 +229,7 @@ def _static_and_all(drive: DriveRecord) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class PaperQuestion:
-    """A finding of the paper before it is tested.
-
-    Attributes:
-        question: So that the paper's answer is yes.
-        paper: What it says.
-        test: What is computed here, in words.
-        compute: What is computed; raises `UntestedError` where it cannot be.
-        rule: Judges it; may look at the drives for its margin.
-    """
+    """A finding of the paper before it is tested; ``rule`` may read the drives."""
 
     question: str
     paper: str

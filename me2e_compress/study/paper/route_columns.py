@@ -1,4 +1,4 @@
-"""Means over routes, and paired differences, of what a drive's record keeps."""
+"""Means over routes, and paired differences, of the values in drive records."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,10 +13,9 @@ class RouteColumn:
     """One number of every route.
 
     Attributes:
-        name: As it heads a table.
-        unit: Of the number.
-        of: Takes it from a route; None where it was not measured.
-        bounds: Smallest and largest value of a route; None where there are none.
+        name: Heading in a table.
+        of: Takes it from a route; None if it was not measured.
+        bounds: Smallest and largest value of a route, if there are any.
     """
 
     name: str
@@ -75,14 +74,9 @@ def mean_gap(
     seed: int = 0,
     of: int = 1,
 ) -> Estimate:
-    """Return the mean of differences with its intervals.
+    """Return the mean of differences by route, with its intervals.
 
-    Args:
-        found: Differences by route.
-        record: A drive of these routes.
-        column: What they are of.
-        seed: Of the bootstrap.
-        of: 2 for differences of differences.
+    ``of`` is 2 for differences of differences, whose bounds are twice as wide.
     """
     unit = "points" if column.unit == "%" else column.unit
     if not found:

@@ -1,4 +1,4 @@
-"""Cells that the paper's tables share."""
+"""Table cells that the paper's tables share."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -47,25 +47,25 @@ def given_cells(row: PublishedDrive | None) -> tuple[Cell, ...]:
 
 
 def rate_cells(frames: int) -> tuple[Cell, Cell]:
-    """Show n of equation 4 and the decisions a second that it leaves."""
+    """Show n of equation 4 and the resulting decisions per second."""
     return Cell(str(frames - 1)), Cell(f"{1e6 / (frames * DT_US):.3g}")
 
 
 def less_cell(whole: int | None, left: int | None, unit: float) -> Cell:
-    """Show how much less there is left."""
+    """Show the reduction from one size to another."""
     if whole is None or left is None:
         return Cell(MISSING, reason="not counted")
     return Cell(f"{(whole - left) / unit:.3f}")
 
 
 def plain_cell(value: float | None, form: str, why: str) -> Cell:
-    """Show a number, or a dash that knows why."""
+    """Show a number, or a dash with its reason."""
     reason = "" if value is not None else why
     return measure_cell(Measure(value, "", reason), form)
 
 
 def given_energy(row: PublishedDrive | None) -> tuple[Cell, Cell]:
-    """Show the paper's joules a frame and EER_AV."""
+    """Show the paper's joules per frame and EER_AV."""
     if row is None:
         return Cell(""), Cell("")
     texts = ("" if each is None else f"{each:.2f}" for each in (row.joules, row.eer))
@@ -74,5 +74,5 @@ def given_energy(row: PublishedDrive | None) -> tuple[Cell, Cell]:
 
 
 def times(joules: float | None, fps: float) -> float | None:
-    """Multiply joules a frame by frames a second."""
+    """Multiply joules per frame by frames per second."""
     return None if joules is None else joules * fps

@@ -1,4 +1,4 @@
-"""One HTML page that holds a study: nothing beside it is needed to read it."""
+"""A study as one self-contained HTML page."""
 
 from me2e_compress.study.report.page import Section, html
 

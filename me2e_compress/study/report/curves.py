@@ -1,4 +1,4 @@
-"""How variants drive from condition to condition."""
+"""Curves of driving scores over the conditions."""
 
 from collections.abc import Callable, Sequence
 
@@ -18,11 +18,7 @@ Score = Callable[[Scores], Estimate]
 
 
 def curves(outcome: StudyResult) -> str | None:
-    """Draw driving score and success rate over the conditions, in their order.
-
-    Returns:
-        SVG; None where there are fewer than three conditions.
-    """
+    """Draw driving score and success rate as SVG; None below three conditions."""
     if len(outcome.study.conditions) < ENOUGH:
         return None
     panels: tuple[tuple[str, Score], ...] = (
@@ -46,7 +42,7 @@ def curves(outcome: StudyResult) -> str | None:
 def _found(
     outcome: StudyResult, variant: str, pick: Score
 ) -> Sequence[Estimate | None]:
-    """Return one estimate a condition; None where the variant was not driven."""
+    """Return one estimate per condition; None if the variant was not driven."""
     return [
         None if drive.scores is None else pick(drive.scores)
         for drive in outcome.drives

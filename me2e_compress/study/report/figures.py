@@ -35,13 +35,9 @@ POINTS_AN_INCH = 72.0
 
 @dataclass(frozen=True)
 class Point:
-    """A variant where cost meets driving score.
+    """A variant in the plane of cost and driving score.
 
-    Attributes:
-        name: The variant.
-        cost: Megabytes or milliseconds; less is better.
-        score: Driving score with its interval; more is better.
-        baseline: Whether the others are held against it.
+    ``cost`` is in megabytes or milliseconds.
     """
 
     name: str
@@ -56,7 +52,7 @@ class Point:
 
 
 def front(points: Sequence[Point]) -> list[Point]:
-    """Return the points that no other beats on both counts, cheapest first."""
+    """Return the points that no other beats in both respects, cheapest first."""
     best, kept = float("-inf"), list[Point]()
     for point in sorted(points, key=lambda p: (p.cost, -p.height)):
         if point.height > best:
@@ -189,13 +185,7 @@ def _whiskers(axes: Axes, found: Sequence[Estimate]) -> None:
 def _place_names(
     figure: Figure, axes: Axes, names: Sequence[tuple[str, float, float]]
 ) -> None:
-    """Write names to the right of their points, moved up or down where they would meet.
-
-    Args:
-        figure: Which the axes are of.
-        axes: Its limits must be final.
-        names: Name, x and y of each point, in the units of the axes.
-    """
+    """Write names right of their points, shifted where they would overlap."""
     scale = POINTS_AN_INCH / figure.dpi
     ends = list[tuple[float, float, float]]()
     spots = [

@@ -1,4 +1,4 @@
-"""A study in sentences: one a variant, with what is sure and what is not."""
+"""A study in sentences: one per variant, with what is certain and what is not."""
 
 from dataclasses import dataclass
 
@@ -12,19 +12,14 @@ TIMES = "\N{MULTIPLICATION SIGN}"
 
 @dataclass(frozen=True)
 class Takeaway:
-    """What a reader should take away about a variant.
-
-    Attributes:
-        variant: Its name.
-        text: One sentence.
-    """
+    """What a reader should remember about a variant, in one sentence."""
 
     variant: str
     text: str
 
 
 def findings(outcome: StudyResult) -> tuple[Takeaway, ...]:
-    """Write for every variant what it costs and how it drives, against the baseline."""
+    """Describe for every variant what it costs and how it drives."""
     baseline = outcome.variant(outcome.study.baseline)
     return tuple(
         Takeaway(variant.name, _sentence(outcome, baseline, variant))
@@ -68,9 +63,9 @@ def _road(drive: Drive, several: bool) -> str:
 
 
 def sure(found: Estimate) -> int:
-    """Return the sign of a difference that is sure, 0 where none is.
+    """Return the sign of a difference that is certain, otherwise 0.
 
-    Judged as it is shown, to a tenth of a point: what rounds to zero is no difference.
+    Bounds are rounded to a tenth of a point, as they are printed.
     """
     if found.low is not None and round(found.low, 1) > 0.0:
         return 1

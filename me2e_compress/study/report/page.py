@@ -1,4 +1,4 @@
-"""The page: tables, figures and pictures put into the template."""
+"""The HTML page of a study, built from a template."""
 
 import base64
 from collections.abc import Sequence
@@ -28,13 +28,7 @@ TEMPLATE = "report.html"
 
 @dataclass(frozen=True)
 class Section:
-    """What a page holds beside the study: a heading, and tables or files below it.
-
-    Attributes:
-        title: The heading.
-        tables: In order.
-        files: What each is, and its path from the page; they are linked.
-    """
+    """An additional section: a heading, tables, and named files to link."""
 
     title: str
     tables: tuple[Table, ...] = ()
@@ -43,13 +37,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Shown:
-    """A contrast, its picture inside the page.
-
-    Attributes:
-        title: The route and the moment.
-        words: How it ended for the baseline and for the variant.
-        uri: The picture, as data.
-    """
+    """A contrast with its picture as a data URI."""
 
     title: str
     words: str
@@ -57,7 +45,7 @@ class Shown:
 
 
 def template(name: str) -> Template:
-    """Return one of the pages' templates: everything in it is escaped."""
+    """Return one of the page templates, with autoescape on."""
     return Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -72,13 +60,7 @@ def html(
     command: Sequence[str] = (),
     sections: Sequence[Section] = (),
 ) -> str:
-    """Build the whole page; it needs nothing outside itself.
-
-    Args:
-        outcome: What was found.
-        command: What makes it again, word by word.
-        sections: What else is to be told.
-    """
+    """Build the whole page, which is self-contained."""
     study = outcome.study
     return template(TEMPLATE).render(
         title=f"{study.title}{study.preview}",
@@ -148,7 +130,7 @@ def _ended(route: RouteOutcome) -> str:
 
 
 def _recipe(name: str, outcome: StudyResult) -> tuple[str, str, str]:
-    """Return name, what it was made of, and the first digits of its digest."""
+    """Return name, source and the first digits of the digest."""
     prepared = outcome.variant(name).prepared
     made_of = prepared.source or prepared.variant.policy
     if prepared.pipeline:

@@ -1,4 +1,4 @@
-"""How figures look: as the page does."""
+"""Style of figures, matching the page."""
 
 import io
 from contextlib import AbstractContextManager
@@ -16,12 +16,12 @@ PAGE_FONT = "Inter, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif"
 
 
 def styled() -> AbstractContextManager[None]:
-    """Draw within this: the reader's own settings of matplotlib do not matter."""
+    """Return a context that ignores the user's matplotlib settings."""
     return context(STYLE, after_reset=True)
 
 
 def svg(figure: Figure) -> str:
-    """Write a figure as an SVG element: the same figure gives the same text."""
+    """Write a figure as an SVG element, reproducibly."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
@@ -29,6 +29,6 @@ def svg(figure: Figure) -> str:
 
 
 def bare(axes: Axes) -> None:
-    """Leave a quiet grid along x, and nothing else."""
+    """Leave only a light grid along x."""
     axes.grid(visible=True, axis="x")
     axes.spines["left"].set_visible(False)

@@ -1,4 +1,4 @@
-"""onnxruntime on the CPU: int8 where it has kernels for it, and in their form."""
+"""onnxruntime on the CPU: int8 in the form for which it has kernels."""
 
 from me2e_compress.targets.onnxruntime.convert import (
     convert,

@@ -1,4 +1,4 @@
-"""Lower a graph that was quantized for TensorRT, by this package or by another."""
+"""Convert a graph quantized for TensorRT, by this package or another."""
 
 import dataclasses
 from collections.abc import Collection
@@ -24,14 +24,10 @@ from me2e_compress.targets.quantized import DEQUANTIZE, QUANTIZE
 def convert(model: ir.Model, ranges: Ranges | None = None) -> ir.Model:
     """Return a copy of an int8 graph that onnxruntime runs in int8 on the CPU.
 
-    As it stands, such a graph is slower than a float one: onnxruntime's convolutions
-    answer uint8 and so need a pair behind them, and it has no fast kernel for int8
-    activations. The copy has the same layers in int8, with the same weights and the
-    same ranges.
-
-    Args:
-        model: a graph with symmetric int8 pairs, e.g. ModelOpt's; it stays as it is.
-        ranges: of the tensors that :func:`unranged` names.
+    Unconverted, such a graph is slower than a float one: onnxruntime's convolutions
+    write uint8 and so need a pair after them, and it has no fast kernel for int8
+    activations. The copy has the same int8 layers, with the same weights and the same
+    ranges. ``ranges`` has those of the tensors that :func:`unranged` lists.
 
     Raises:
         PreconditionError: the pairs are not symmetric int8, or there are none.
@@ -44,10 +40,10 @@ def convert(model: ir.Model, ranges: Ranges | None = None) -> ir.Model:
 
 
 def unranged(model: ir.Model) -> tuple[str, ...]:
-    """Return the tensors whose range is needed and does not stand in the graph.
+    """Return the tensors whose range is needed and is not in the graph.
 
-    They are what convolutions answer where no pair follows: before a residual Add, and
-    where a float node reads them.
+    They are outputs of convolutions without a pair: before a residual Add, and where a
+    float node reads them.
     """
     draft = _draft_of_qdq(model)
     region = find_region(draft.model.graph, draft.weights)
@@ -59,12 +55,8 @@ def int8_layers(
 ) -> tuple[ir.Node, ...]:
     """List the layers whose two operands both come through a DequantizeLinear.
 
-    Whether a program computes them in integers is its own affair: on onnxruntime's CPU
-    those of a graph placed for TensorRT run in float.
-
-    Args:
-        model: the graph.
-        kinds: operators that count as layers.
+    Whether a runtime computes them in integers is another matter: onnxruntime's CPU
+    runs those of a graph placed for TensorRT in float.
     """
     return tuple(
         node
@@ -74,7 +66,7 @@ def int8_layers(
 
 
 def _dequantized(value: ir.Value | None) -> bool:
-    """Return whether a DequantizeLinear makes a value, changes of layout aside."""
+    """Return whether a value is dequantized, possibly with a layout change after it."""
     node = producer_of(value)
     while node is not None and node.op_type in ("Reshape", "Transpose"):
         node = producer_of(node.inputs[0])
@@ -84,12 +76,9 @@ def _dequantized(value: ir.Value | None) -> bool:
 def _draft_of_qdq(model: ir.Model) -> Draft:
     """Copy a quantized graph without the pairs of its activations.
 
-    A layer is to be int8 if both its input and its weight came through a pair, and
-    there is a kernel for it: weights stored as int8 or, as ModelOpt writes them, in
-    float behind a QuantizeLinear. Biases that are stored as int32 become float again.
-
-    Args:
-        model: the quantized graph; it stays as it is.
+    A layer becomes int8 if both its input and its weight come through a pair, and it
+    has a kernel. Weights are stored as int8 or, by ModelOpt, in float before a
+    QuantizeLinear. Biases stored as int32 become float again.
 
     Raises:
         PreconditionError: no activation is quantized, or a pair is not symmetric int8
@@ -116,6 +105,7 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
             name = f"{node.inputs[2].name}_stored" if node.inputs[2] else ""
             node.replace_input_with(2, rewrite.add_constant(copy.graph, bias, name))
     weights = {node: weight_of(node) for node in layers if has_kernel(node)}
+    # Remove the pairs of activations.
     for node, value in pairs.items():
         if rewrite.can_replace(node.outputs[0], value):
             rewrite.replace_value(node.outputs[0], value)
@@ -128,7 +118,7 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
 
 
 def _activation(node: ir.Node) -> ir.Value | None:
-    """Return the tensor that a DequantizeLinear stands for, if it is not a constant."""
+    """Return the tensor that a DequantizeLinear stands for, unless it is constant."""
     quantize = producer_of(node.inputs[0]) if node.op_type == DEQUANTIZE else None
     if quantize is None or quantize.op_type != QUANTIZE:
         return None
@@ -137,11 +127,7 @@ def _activation(node: ir.Node) -> ir.Value | None:
 
 
 def _reach(dequantize: ir.Node) -> float:
-    """Return the largest magnitude on a pair's grid.
-
-    Raises:
-        PreconditionError: the pair has several scales.
-    """
+    """Return the largest magnitude on a pair's grid."""
     step = step_of(dequantize)
     if step.size != 1:
         raise PreconditionError(

@@ -1,4 +1,4 @@
-"""What int8 saves and costs on onnxruntime's CPU: counts, and seconds a piece."""
+"""Estimate what int8 saves and costs on onnxruntime's CPU, from operation counts."""
 
 import dataclasses
 import math
@@ -17,37 +17,36 @@ from me2e_compress.targets.onnxruntime.kernels import JOINS, end_of
 from me2e_compress.targets.onnxruntime.region import Region, find_region
 
 CACHE_BYTES = 2**21
-"""Feature maps of float32 up to this size are sampled as fast as uint8 ones: so many
-bytes of the second-level cache go to one core."""
+"""Float32 feature maps up to this size are sampled as fast as uint8 ones: one core's
+share of the second-level cache."""
 
 Counts: TypeAlias = Mapping[str, int]
-"""How often each constant of :class:`CpuSeconds` goes into a time."""
+"""How often each constant of :class:`CpuSeconds` is added."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CpuSeconds:
-    """Nanoseconds of one core for one piece of work.
+    """Nanoseconds of one core for one unit of work.
 
     Attributes:
-        machine: whose.
-        kernel: of every kernel, whatever it does.
+        machine: description of the machine.
+        kernel: any kernel call.
         float_mac: a multiply-accumulate in float32.
-        float_grouped_mac: one of a grouped convolution.
+        float_grouped_mac: a multiply-accumulate of a grouped convolution.
         float_element: an element that a layer reads or writes.
-        float_reorder: an element that a convolution reads from, or gives to, anything
-            but a convolution: those work on channels in blocks.
+        float_reorder: an element passed between a convolution, which works on channels
+            in blocks, and anything else.
         float_weight: a weight.
         int8_mac: a multiply-accumulate of uint8 and int8.
-        int8_grouped_mac: one of a grouped convolution.
-        int8_patch: a pixel copied into place under a kernel larger than 1.
+        int8_grouped_mac: a multiply-accumulate of a grouped convolution.
+        int8_patch: a pixel copied into place for a kernel larger than 1.
         int8_answer: an element that a convolution rounds to uint8.
-        int8_product: an element that a matrix product gives in float32.
+        int8_product: a float32 output element of a matrix product.
         int8_weight: a weight.
         float_sampled_mac: a multiply-accumulate of a fused operator that samples
             feature maps too large for the cache.
         int8_sampled_mac: the same with uint8 maps.
-        requantize: an element that a matrix product gives as uint8, on top of what it
-            takes in float32.
+        requantize: extra time for a uint8 output element of a matrix product.
         quantize: an element, float32 to uint8.
         dequantize: an element, uint8 to float32.
     """
@@ -72,7 +71,7 @@ class CpuSeconds:
     dequantize: float
 
     def seconds(self, counts: Counts) -> float:
-        """Return how long some work takes."""
+        """Return the time of some work."""
         return 1e-9 * sum(float(getattr(self, each)) * n for each, n in counts.items())
 
 
@@ -97,20 +96,17 @@ ZEN5 = CpuSeconds(
     dequantize=0.17,
 )
 """Fitted to single layers and chains on an AMD EPYC (Zen 5), onnxruntime 1.31, by
-``python -m benchmarks.fit_cpu_costs``; those of sampling and ``requantize`` by hand, to
-what ``python -m benchmarks.bench_int8_sampling`` shows. Ratios carry over to other
+``python -m benchmarks.fit_cpu_costs``; sampling and ``requantize`` by hand, to the
+results of ``python -m benchmarks.bench_int8_sampling``. Ratios carry over to other
 processors with VNNI better than the seconds do."""
 
 
 def costs_of(
     model: ir.Model, chosen: Collection[ir.Node], machine: CpuSeconds = ZEN5
 ) -> Costs:
-    """Estimate what int8 of some layers would save and cost.
+    """Estimate the savings and costs of int8 for some layers.
 
-    Args:
-        model: the float graph, shapes inferred.
-        chosen: what could be int8; what has no kernel is passed over.
-        machine: seconds a piece.
+    Shapes are inferred; candidates without a kernel are ignored.
     """
     weights = constant_values(model)
     names = {
@@ -118,6 +114,7 @@ def costs_of(
         for node in chosen
         if node.inputs[1] in weights or int8_inputs(node)
     }
+    # Layers save their arithmetic, sampling operators their reads.
     region = find_region(model.graph, names)
     saved = {}
     for layer in region.layers:
@@ -129,6 +126,7 @@ def costs_of(
         if macs is not None:
             gain = machine.float_sampled_mac - machine.int8_sampled_mac
             saved[node] = 1e-9 * gain * macs
+    # Each uint8 tensor may cost a conversion at its border.
     flow = _Flow(region)
     borders = tuple(flow.border(value, machine) for value in region.grids)
     return Costs(machine.machine, saved, borders)
@@ -144,6 +142,7 @@ def work_of(layer: ir.Node) -> tuple[Counts, Counts] | None:
     inputs, outputs, weights = map(math.prod, (read, made, weight))
     float_ = {"kernel": 1, "float_element": inputs + outputs, "float_weight": weights}
     int8 = {"kernel": 1, "int8_weight": weights}
+    # Products give float32; convolutions write uint8.
     if layer.op_type != "Conv":
         float_ |= {"float_mac": macs}
         int8 |= {"int8_mac": macs, "int8_product": outputs}
@@ -160,7 +159,7 @@ def work_of(layer: ir.Node) -> tuple[Counts, Counts] | None:
 def sampled_macs(node: ir.Node) -> int | None:
     """Count the products of a fused operator on maps too large for the cache.
 
-    None where shapes are open.
+    Returns None where shapes are open.
     """
     found, shape = find(node), static_shape(node.inputs[0])
     macs = None if found is None else found[0].cost(node, found[1]).macs
@@ -170,7 +169,7 @@ def sampled_macs(node: ir.Node) -> int | None:
 
 
 def _reordered(layer: ir.Node) -> int:
-    """Count the elements that a float convolution takes from or gives to others."""
+    """Count the elements that a float convolution exchanges with other operators."""
     source, end = layer.inputs[0], end_of(layer)
     found = 0
     if source is not None and not _is_convolved(source):
@@ -198,7 +197,7 @@ def _is_convolved(value: ir.Value) -> bool:
 
 
 class _Flow:
-    """Follows the uint8 tensors of a region to the layers before and behind them."""
+    """Follows the uint8 tensors of a region to the layers before and after them."""
 
     def __init__(self, region: Region) -> None:
         self._region = region
@@ -225,7 +224,7 @@ class _Flow:
         )
 
     def _is_product(self, value: ir.Value) -> bool:
-        """Return whether only sampling makes a product of a region give uint8."""
+        """Return whether a product gives uint8 only because of sampling."""
         reader, node = sole_reader(value), value.producer()
         if node is None or reader not in self._region.sampled:
             return False
@@ -234,7 +233,7 @@ class _Flow:
         return any(each in self._region.layers for each in products)
 
     def makers(self, value: ir.Value) -> Layers:
-        """Return the layers that a tensor comes from: the nearest, of a join."""
+        """Return the nearest layers that a tensor comes from."""
         if value not in self._makers:
             self._makers[value] = frozenset()
             self._makers[value] = self._find_makers(value)
@@ -252,7 +251,7 @@ class _Flow:
         return frozenset(near) or frozenset().union(*map(self.makers, sides))
 
     def readers(self, value: ir.Value) -> Layers:
-        """Return the layers that read a tensor: the nearest, behind joins and moves."""
+        """Return the nearest layers that read a tensor, through joins and moves."""
         if value not in self._readers:
             direct, carriers, _ = self._uses(value)
             behind = map(self.readers, map(end_of, carriers))
@@ -260,7 +259,7 @@ class _Flow:
         return self._readers[value]
 
     def _uses(self, value: ir.Value) -> tuple[list[ir.Node], list[ir.Node], bool]:
-        """Sort the readers of a tensor: layers, what carries it on, and others."""
+        """Sort the readers of a tensor into layers, carriers of uint8, and others."""
         layers: list[ir.Node] = []
         carriers: list[ir.Node] = []
         others = False

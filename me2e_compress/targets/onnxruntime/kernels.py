@@ -1,4 +1,4 @@
-"""What onnxruntime's CPU can compute on uint8 activations and int8 weights."""
+"""Determine which layers onnxruntime's CPU computes on uint8 and int8."""
 
 import math
 
@@ -16,18 +16,18 @@ MOVES = frozenset(
         "Slice", "Squeeze", "Transpose", "Unsqueeze",
     }
 )  # fmt: skip
-"""Operators that choose, move or average elements: what they answer lies on the grid,
-or at least in the range, of what they read."""
+"""Operators that choose, move or average elements: their output lies on the input's
+grid, or at least in its range."""
 
 LAYERS = ("Conv", "Gemm", "MatMul")
 """Operators with a weight that have an int8 kernel."""
 
 JOINS = frozenset({"Add", "Concat"})
-"""Operators that read several tensors of the network, each on a grid of its own."""
+"""Operators that read several activations, each on its own grid."""
 
 
 def has_kernel(node: ir.Node) -> bool:
-    """Return whether a layer has an int8 kernel; its weight is taken for granted."""
+    """Return whether a layer has an int8 kernel, given a constant weight."""
     return objection(node) is None
 
 
@@ -63,10 +63,8 @@ def _is_plain_gemm(node: ir.Node) -> bool:
 def is_bias(value: ir.Value | None, rank: int, columns: int | None) -> bool:
     """Return whether a value is a constant that adds one number to every column.
 
-    Args:
-        value: what is added.
-        rank: of the product; a constant of higher rank would lend it that.
-        columns: of the product; one column and a longer constant give more columns.
+    ``rank`` and ``columns`` are those of the product: a constant of higher rank would
+    raise its rank, and a longer one would add columns to a single column.
     """
     array = graph.array_of(value)
     return (
@@ -79,7 +77,7 @@ def is_bias(value: ir.Value | None, rank: int, columns: int | None) -> bool:
 
 
 def biased_end(product: ir.Node) -> ir.Node | None:
-    """Return the Add that puts a bias on a MatMul; None if others read the product."""
+    """Return the Add of a bias to a MatMul; None if others read the product."""
     value = product.outputs[0]
     addition = sole_reader(value)
     rank = rank_of(product.inputs[0]) or 0
@@ -92,7 +90,7 @@ def biased_end(product: ir.Node) -> ir.Node | None:
 
 
 def is_move(node: ir.Node) -> bool:
-    """Return whether a node only moves, picks or averages what it reads first."""
+    """Return whether a node only moves, picks or averages its first input."""
     if not is_standard(node) or node.op_type not in MOVES:
         return False
     if node.op_type == "Resize":
@@ -101,7 +99,7 @@ def is_move(node: ir.Node) -> bool:
 
 
 def end_of(node: ir.Node) -> ir.Value:
-    """Return the value that a layer's kernel answers: behind the ReLU, if one follows.
+    """Return the output of a layer's kernel: after the ReLU, if one follows.
 
     A ReLU costs nothing where its uint8 grid begins at zero: quantization clips.
     """

@@ -1,4 +1,4 @@
-"""Layers in the forms for which onnxruntime has int8 kernels on the CPU."""
+"""Rewrite layers to the forms for which onnxruntime's CPU has int8 kernels."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from me2e_compress.targets.onnxruntime.writer import Writer
 from me2e_compress.targets.weights import QuantizedWeight
 
 BIAS_MAX = 2**30
-"""Largest int32 bias: half the accumulator stays for the products, which need at most
+"""Largest int32 bias: half the accumulator is left for the products, which need at most
 127 * 255 * K: enough for K up to 33,000."""
 
 Floats = npt.NDArray[np.float32]
@@ -25,18 +25,14 @@ def write_layer(
     """Rewrite a layer to read its int8 weight and an int32 bias.
 
     ==================  ==============================================================
-    Conv                stays one: QLinearConv
-    Gemm                stays one: QGemm
+    Conv                remains: QLinearConv
+    Gemm                remains: QGemm
     MatMul, then Add    becomes a Gemm of two dimensions: QGemm. onnxruntime fuses the
                         two before it looks for int8, and then finds nothing
-    MatMul              stays one, of any rank: MatMulIntegerToFloat
+    MatMul              remains, of any rank: MatMulIntegerToFloat
     ==================  ==============================================================
 
-    Args:
-        writer: of the graph.
-        node: the Conv, Gemm or MatMul.
-        weight: its weight.
-        step: of the uint8 tensor it reads.
+    ``step`` is the scale of the uint8 tensor that the layer reads.
     """
     channels = len(weight.scales)
     bias = _bias(node, channels)
@@ -57,8 +53,8 @@ def with_bias(
 ) -> tuple[QuantizedWeight, npt.NDArray[np.int32]]:
     """Round a bias to int32 in units of ``step * weight.scales``.
 
-    Where a channel's weights are so small that its bias does not fit, the channel gets
-    a coarser scale: its products are below the bias's own rounding then.
+    If a channel's weights are so small that its bias does not fit, the channel gets a
+    coarser scale: its products are then below the bias's own rounding.
     """
     least = np.abs(bias) / (np.float64(BIAS_MAX) * step)
     scales = np.maximum(weight.scales, least).astype(np.float32)
@@ -74,7 +70,7 @@ def with_bias(
 
 
 def _bias(node: ir.Node, channels: int) -> Floats | None:
-    """Read the bias of a layer, as one number a channel; None if it has none."""
+    """Read the bias of a layer, one number a channel; None if it has none."""
     if node.op_type == "MatMul":
         end = biased_end(node)
         value = None if end is None else _other(end, node.outputs[0])
@@ -99,21 +95,13 @@ def _store(writer: Writer, node: ir.Node, index: int, weight: QuantizedWeight) -
 
 
 def _write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Node:
-    """Replace a MatMul and the Add behind it by a Gemm of two dimensions.
+    """Replace a MatMul and the Add after it by a Gemm of two dimensions.
 
     Given:   y = Add(MatMul(x, w), b)                           x [..., K], w [K, N]
     Result:  y = Reshape(Gemm(Reshape(x, [-1, K]), w, b), [..., N])
 
-    Args:
-        writer: of the graph.
-        product: the MatMul, of which only the Add reads.
-        size: (K, N).
-
-    Returns:
-        The Gemm; its weight and bias are still to be written.
-
-    Raises:
-        PreconditionError: there is no such Add.
+    ``size`` is (K, N). The weight and bias of the returned Gemm are still to be
+    written.
     """
     addition = biased_end(product)
     left, right = product.inputs
@@ -122,6 +110,7 @@ def _write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Nod
     old = addition.outputs[0]
     name = str(old.name)
     place = _Place(writer, addition, [product, addition])
+    # Flatten the leading dimensions, and restore them afterwards.
     leading = list(left.shape)[:-1]
     rows = left
     if len(leading) > 1:
@@ -136,7 +125,7 @@ def _write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Nod
 
 
 class _Place:
-    """The place of new nodes, and the nodes whose provenance they inherit."""
+    """Inserts new nodes at one place, with the provenance of the old ones."""
 
     def __init__(
         self, writer: Writer, before: ir.Node, sources: Sequence[ir.Node]
@@ -167,6 +156,7 @@ class _Place:
         known = [dim if isinstance(dim, int) else -1 for dim in leading]
         if known.count(-1) <= 1:
             return self.reshaped(rows, [*known, columns], f"{name}_ranked")
+        # Several open dimensions must be read at run time.
         numbers = [
             self._writer.constant(np.array([number], np.int64), f"{name}_end")
             for number in (0, -1, columns)

@@ -1,4 +1,4 @@
-"""Rules of onnxruntime: would its CPU run a graph, and its int8 fast?"""
+"""Lint rules: can onnxruntime's CPU run a graph, and its int8 fast?"""
 
 from collections.abc import Iterator
 
@@ -52,7 +52,7 @@ def operators(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def _remedy(node: ir.Node) -> str:
-    """Say which pass helps a fused operator: functions need a domain, bodies none."""
+    """Name the pass that helps a fused operator: functions need a domain."""
     if find(node) is None:
         return ""
     if is_standard(node) or ORIGINAL_DOMAIN in node.metadata_props:
@@ -61,7 +61,7 @@ def _remedy(node: ir.Node) -> str:
 
 
 def signed_activations(model: ir.Model) -> Iterator[LintFinding]:
-    """Find layers that read int8: kernels are fast for uint8 by int8 only.
+    """Find layers that read int8: only uint8 by int8 has fast kernels.
 
     Measured on AVX512-VNNI: int8 by int8 products run at 34 to 91 GOP/s, uint8 by int8
     at 850 to 1600.
@@ -75,10 +75,10 @@ def signed_activations(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def unanswered(model: ir.Model) -> Iterator[LintFinding]:
-    """Find quantized convolutions whose result is not: they run in float.
+    """Find quantized convolutions whose output is not quantized: they run in float.
 
-    A Relu or Clip may stand in between: it is fused. A convolution with a float weight
-    is meant to run in float, whatever it reads.
+    A Relu or Clip may be between: it is fused. A convolution with a float weight is
+    meant to run in float.
     """
     for node in _layers(model):
         quantized = all(map(is_dequantized, node.inputs[:2]))
@@ -95,10 +95,10 @@ def unanswered(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def padded_pools(model: ir.Model) -> Iterator[LintFinding]:
-    """Find a Pad of zeros before a MaxPool: onnxruntime 1.31 gets those wrong.
+    """Find a Pad of zeros before a MaxPool, which onnxruntime 1.31 computes wrongly.
 
-    Its Pad fusion makes the zeros the pool's own padding, which is minus infinity; what
-    is never negative comes out the same. Our own sessions leave that fusion out.
+    Its Pad fusion turns the zeros into the pool's own padding, which is minus infinity;
+    inputs that are never negative give the same result. Our own sessions disable it.
     """
     for node in nodes_of(model):
         pad = producer_of(node.inputs[0]) if node.op_type == "MaxPool" else None

@@ -1,4 +1,4 @@
-"""From a draft to a graph that onnxruntime runs in int8: pairs, then layers."""
+"""Lower a draft to a graph that onnxruntime runs in int8: pairs, then layers."""
 
 import dataclasses
 from collections.abc import Collection, Mapping
@@ -17,13 +17,13 @@ from me2e_compress.targets.weights import QuantizedWeight
 
 @dataclasses.dataclass(frozen=True)
 class Draft:
-    """A graph in which everything is read as float, and what of it becomes int8.
+    """A float graph, and what of it becomes int8.
 
     Attributes:
-        model: the graph; lowering writes into it.
-        weights: of every layer that is to be int8, by the name of its first output.
+        model: the graph; lowering changes it in place.
+        weights: weights of the layers to quantize, by the name of their first output.
         reach: max(|low|, |high|) of the activations whose range is known, by name.
-        sampled: the fused operators that sample int8, by the name of their output.
+        sampled: output names of the fused operators that sample int8.
     """
 
     model: ir.Model
@@ -36,7 +36,7 @@ def lower(draft: Draft) -> ir.Model:
     """Write the int8 part of a draft into its graph.
 
     Raises:
-        FramesError: the range of a tensor is not known.
+        FramesError: the range of a tensor is unknown.
     """
     main = draft.model.graph
     region = find_region(main, {*draft.weights, *draft.sampled})
@@ -46,6 +46,7 @@ def lower(draft: Draft) -> ir.Model:
             " onnxruntime's convolutions write uint8, so their outputs are calibrated"
             " too"
         )
+    # Choose the grids before the graph changes.
     grids = {
         value: Grid.of(origin, draft.reach[str(origin.name)])
         for value, origin in region.grids.items()
@@ -54,6 +55,7 @@ def lower(draft: Draft) -> ir.Model:
         (layer, draft.weights[str(layer.outputs[0].name)], grids[value].scale)
         for layer, value in region.layers.items()
     ]
+    # Write pairs, then layers; then keep products from fusing.
     writer = Writer(main)
     _write_pairs(writer, region, grids)
     for layer, weight, step in jobs:
@@ -66,17 +68,13 @@ def lower(draft: Draft) -> ir.Model:
 def _write_pairs(
     writer: Writer, region: Region, grids: Mapping[ir.Value, Grid]
 ) -> None:
-    """Write a pair behind every uint8 tensor, for the kernels of a region to read.
+    """Insert a pair after every uint8 tensor, for the kernels of a region to read.
 
-    Whoever else reads such a tensor keeps the float one, unless there is none.
-
-    Args:
-        writer: of the graph.
-        region: what becomes uint8.
-        grids: of every uint8 tensor.
+    Other readers of such a tensor keep the float one, if it exists.
     """
     for value, grid in grids.items():
         born = value in region.born
+        # A tensor that a kernel writes as uint8 has no float version.
         uses = [
             (use.node, use.idx)
             for use in value.uses()
@@ -117,6 +115,6 @@ def _pair(
 
 
 def _hand_over(value: ir.Value, heir: ir.Value, quantize: ir.Node) -> None:
-    """Make the dequantized tensor the output of the graph, under the old name."""
+    """Make the dequantized tensor the graph output, under the old name."""
     rewrite.replace_value(value, heir)
     quantize.replace_input_with(0, value)

@@ -1,4 +1,4 @@
-"""Write a plan into a graph as onnxruntime's CPU kernels read it."""
+"""Apply a plan to a graph in the form of onnxruntime's CPU kernels."""
 
 import dataclasses
 from collections.abc import Collection
@@ -23,26 +23,24 @@ from me2e_compress.targets.weights import weights_of
 
 @dataclasses.dataclass(frozen=True)
 class OnnxRuntime(Target):
-    """onnxruntime's CPU kernels: uint8 activations, quantized answers, 2-D products."""
+    """onnxruntime's CPU kernels: uint8 activations, quantized outputs, 2-D products."""
 
     name: ClassVar[str] = "onnxruntime"
     opens: ClassVar[bool] = True
 
     def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
-        """Return the activations whose range is needed: read or made by layers."""
+        """Return the activations whose range is needed: inputs, outputs of layers."""
         return _region(plan, model).ranged
 
     def place(self, model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
         """Return a copy of a graph in which the plan's layers run in int8 on the CPU.
 
-        Args:
-            model: the float graph that was planned and calibrated; it stays as it is.
-            plan: what becomes int8; the products of attention stay float here.
-            ranges: of every tensor that :meth:`tensors` names.
+        Products of two activations stay float here. ``ranges`` must have every tensor
+        that :meth:`tensors` lists.
 
         Raises:
-            PreconditionError: the graph is older than opset 13, or in a float type
-                without int8 here, or something that the plan calls a weight is not one.
+            PreconditionError: the graph is older than opset 13 or in a float type
+                without int8 here, or a planned weight is not constant.
             FramesError: the range of a tensor is missing.
         """
         self.check_types(plan, model)
@@ -65,26 +63,26 @@ class OnnxRuntime(Target):
         )
 
     def fused_objection(self, node: ir.Node) -> str | None:
-        """Object to none: compiled kernels read uint8 as it is."""
+        """Return None: compiled kernels read uint8 directly."""
         return None
 
     def costs(self, model: ir.Model, layers: Collection[ir.Node]) -> Costs:
-        """Estimate what int8 of some layers saves and costs on one core."""
+        """Estimate the savings and costs of int8 for some layers on one core."""
         return costs_of(model, layers)
 
     def lint_rules(self) -> tuple[LintRule, ...]:
-        """Return the rules of its kernels."""
+        """Return the rules for its kernels."""
         return RULES
 
     def read_back(
         self, model: ir.Model, provider: Provider = CPU
     ) -> tuple[LintFinding, ...]:
-        """Open a graph, and list the layers that are int8 in it and run in float."""
+        """Open a graph, and list its int8 layers that run in float."""
         return tuple(read_back(model, provider))
 
 
 def _layers_of(plan: QuantPlan) -> tuple[Decision, ...]:
-    """Return the int8 layers of a plan: the products of attention have no weight.
+    """Return the int8 layers of a plan without products of two activations.
 
     Int8 makes those slower on this target: 0.55 to 0.9 times the speed of float.
     """

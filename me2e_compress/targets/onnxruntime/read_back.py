@@ -1,4 +1,4 @@
-"""Open a graph in onnxruntime, and find what of its int8 runs in float there."""
+"""Open a graph in onnxruntime, and find int8 layers that run in float there."""
 
 from collections.abc import Iterator
 
@@ -18,18 +18,14 @@ _FLOAT_KERNELS = frozenset(
         "MatMul", "NhwcFusedConv",
     }
 )  # fmt: skip
-"""Layers as onnxruntime's optimizer leaves them where they compute in float."""
+"""Layers in the optimized graph that compute in float."""
 
 
 def read_back(model: ir.Model, provider: Provider = CPU) -> Iterator[LintFinding]:
-    """Find layers that are int8 in a graph, and in float in the session that runs it.
+    """Find layers that are int8 in a graph, but float in the session that runs it.
 
-    onnxruntime looks for int8 after its first fusions, and for whole patterns: a bias,
-    a ReLU or a second reader of what a layer answers hides the layer from it.
-
-    Args:
-        model: the graph; it stays as it is.
-        provider: what runs it.
+    onnxruntime looks for int8 after its first fusions, and for complete patterns: a
+    bias, a ReLU or a second reader of a layer's output hides the layer.
     """
     source = with_unique_names(model)
     try:
@@ -47,7 +43,7 @@ def read_back(model: ir.Model, provider: Provider = CPU) -> Iterator[LintFinding
 
 
 def _layer_of(node: ir.Node) -> ir.Node:
-    """Return the layer that a node ends: itself, or what its ReLU or bias reads."""
+    """Return the layer of a fused node: itself, or the input of its ReLU or bias."""
     maker = graph.producer_of(node.inputs[0])
     if node.op_type in _FLOAT_KERNELS or maker is None:
         return node
@@ -55,7 +51,7 @@ def _layer_of(node: ir.Node) -> ir.Node:
 
 
 def _what(layer: ir.Node, kernel: str) -> str:
-    """Say what runs, and who reads its result: that is mostly the reason."""
+    """Describe the kernel and the readers of its output, which are often the reason."""
     readers = dict.fromkeys(each.op_type for each in layer.outputs[0].consumers())
     told = f"; {' and '.join(readers)} reads it" if readers else ""
     return f"reads int8, and runs in float, as {kernel}{told}"

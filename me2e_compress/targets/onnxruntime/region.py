@@ -1,4 +1,4 @@
-"""The int8 part of a graph: which tensors become uint8, on which grid."""
+"""Find the int8 part of a graph: its uint8 tensors and their grids."""
 
 import dataclasses
 from collections.abc import Collection
@@ -29,11 +29,11 @@ class Region:
     """The int8 part of a graph.
 
     Attributes:
-        layers: convolutions and matrix products in graph order, and what they read.
-        grids: the uint8 tensors, and whose range each of them takes: mostly its own,
-            that of the first tensor where elements are only moved.
-        born: those that an int8 kernel answers, so that no float one exists.
-        readers: what reads uint8 besides the layers.
+        layers: convolutions and matrix products in graph order, with their inputs.
+        grids: the uint8 tensors, and the tensor whose range each one uses: usually its
+            own, or the first of a chain that only moves elements.
+        born: tensors that an int8 kernel writes, so that no float version exists.
+        readers: other nodes that read uint8.
         sampled: fused operators that sample uint8, by the first node that reads it:
             themselves, or a Reshape before them.
     """
@@ -50,7 +50,7 @@ class Region:
         return tuple(dict.fromkeys(str(each.name) for each in self.grids.values()))
 
     def reads(self, node: ir.Node, index: int) -> bool:
-        """Return whether a node takes an input as uint8, wherever that exists."""
+        """Return whether a node reads an input as uint8 where that exists."""
         if node in self.readers:
             return index == 0 or node.op_type in JOINS
         return (node in self.layers or node in self.sampled) and index == 0
@@ -59,19 +59,18 @@ class Region:
 def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
     """Grow the int8 part of a graph from its layers, in one walk.
 
-    * A layer reads uint8. A convolution also answers it, since QLinearConv knows
-      nothing else; a matrix product may answer float (QGemm does).
-    * What only moves elements (pooling, nearest Resize, layout) stays in uint8.
-    * An Add or Concat of uint8 tensors stays if a convolution gave one of them and a
+    * A layer reads uint8. A convolution also writes it, because QLinearConv cannot
+      write anything else; a matrix product may write float (QGemm does).
+    * Nodes that only move elements (pooling, nearest Resize, layout) stay in uint8.
+    * An Add or Concat of uint8 tensors stays if a convolution wrote one of them and a
       layer reads the result: the residual branches and merges of a backbone or neck.
       The sums around a LayerNorm join two float tensors and stay float.
     * A fused operator samples uint8, through the Reshapes before it: its kernel reads
-      the integers as they are.
+      the integers directly.
 
-    Args:
-        graph: read as float everywhere, in topological order.
-        chosen: the layers and fused operators that are to be int8, by the name of
-            their first output; layers without a kernel are left out.
+    ``graph`` is float everywhere and in topological order. ``chosen`` has the first
+    outputs of the layers and fused operators to quantize; layers without a kernel are
+    left out.
     """
     layers = {
         node: node.inputs[0]
@@ -80,6 +79,7 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
         and node.inputs[0] is not None
         and has_kernel(node)
     }
+    # Layers read uint8 in any case; the walk adds what follows.
     grids = {value: value for value in layers.values()}
     born: set[ir.Value] = set()
     readers: set[ir.Node] = set()
@@ -87,6 +87,7 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
     sampling = {n for n in graph if n.outputs[0].name in chosen and int8_inputs(n)}
     wanted = {_sampled(node, ())[0] for node in sampling}
     convolutions = {layer for layer in layers if layer.op_type == "Conv"}
+    # One walk in topological order: inputs are decided first.
     for node in graph:
         first = node.inputs[0] if node.inputs else None
         end = end_of(node)
@@ -113,7 +114,7 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
 
 
 def _sampled(node: ir.Node, born: Collection[ir.Value]) -> tuple[ir.Value, ir.Node]:
-    """Return what a fused operator samples as it was made, and who reads that."""
+    """Return the original tensor that a fused operator samples, and its reader."""
     value = node.inputs[0]
     assert value is not None
     while value not in born and len(value.uses()) == 1:
@@ -136,9 +137,7 @@ def _joins(
 class Grid:
     """The uint8 grid of one tensor: ``value = scale * (uint8 - zero)``.
 
-    Attributes:
-        scale: the step.
-        zero: 128 for a signed tensor, 0 for one that is never negative.
+    ``zero`` is 128 for a signed tensor, 0 for one that is never negative.
     """
 
     scale: np.float32
@@ -148,13 +147,11 @@ class Grid:
     def of(cls, value: ir.Value, reach: float) -> Self:
         """Return the grid of a tensor whose largest magnitude is ``reach``.
 
-        A signed tensor keeps the plan's symmetric int8 grid to the point, moved up by
-        128: onnxruntime's kernels take uint8 activations 10 to 40 times faster than
-        int8 ones on processors with VNNI.
-
-        For a tensor that can never be negative the int8 grid wastes its lower half;
-        here its range [0, reach] is divided into 255 steps, not 127, and a ReLU before
-        it dissolves into the kernel's own clipping.
+        A signed tensor keeps the plan's symmetric int8 grid exactly, moved up by 128:
+        onnxruntime's kernels process uint8 activations 10 to 40 times faster than int8
+        ones on processors with VNNI. For a tensor that can never be negative the int8
+        grid wastes its lower half; here its range [0, reach] is divided into 255 steps,
+        not 127, and the kernel's clipping replaces a ReLU before it.
         """
         if never_negative(value):
             step = np.float32(reach / 255)
@@ -163,9 +160,9 @@ class Grid:
 
 
 def never_negative(value: ir.Value) -> bool:
-    """Prove by what makes a tensor that none of its elements is negative.
+    """Prove from its producers that no element of a tensor is negative.
 
-    Linear in the nodes behind it: what several ways lead to is looked at once.
+    Every node is visited once, so the time is linear.
     """
     pending: list[ir.Value | None] = [value]
     seen: set[ir.Value] = {value}

@@ -1,4 +1,4 @@
-"""Keep layers in int8 that onnxruntime would fuse, or overlook, by who reads them."""
+"""Keep products in int8 that onnxruntime would run in float due to their readers."""
 
 import numpy as np
 import onnx_ir as ir
@@ -11,23 +11,20 @@ _CLIPS = ("Relu", "Clip")
 
 
 def screen_products(writer: Writer) -> None:
-    """Write a Reshape that changes nothing behind products that would run in float.
+    """Insert a Reshape without effect after products that would run in float.
 
     Given:   y = Relu(Gemm(DequantizeLinear(x), DequantizeLinear(w)))
     Result:  y = Relu(Reshape(Gemm(DequantizeLinear(x), DequantizeLinear(w)), [0, 0]))
 
-    onnxruntime (1.31) finds no int8 kernel for a Gemm or MatMul, and says nothing,
+    onnxruntime (1.31) silently finds no int8 kernel for a Gemm or MatMul,
 
     * whose only reader is a Relu or Clip that something else than a QuantizeLinear
-      reads: it looks for the QuantizeLinear behind that one, or fuses the two;
-    * that a QuantizeLinear reads, and something else too;
+      reads: it looks for the QuantizeLinear after that one, or fuses the two;
+    * that both a QuantizeLinear and something else read;
     * that is a MatMul whose only reader is an Add: the two become a float Gemm first.
 
-    The Reshape moves no element. Convolutions need none: what they answer is read
-    through its pair alone.
-
-    Args:
-        writer: of a graph whose int8 layers and pairs are written.
+    The int8 layers and pairs must have been written. Convolutions are not affected:
+    their output is read only through its pair.
     """
     products = [
         node
@@ -60,7 +57,7 @@ def _would_run_in_float(product: ir.Node) -> bool:
 
 
 def _screen(writer: Writer, product: ir.Node) -> None:
-    """Let whoever reads a product read it through a Reshape to its own shape."""
+    """Insert a Reshape to its own shape between a product and its readers."""
     value = product.outputs[0]
     rank = max(graph.rank_of(each) or 2 for each in product.inputs[:2])
     same = writer.constant(np.zeros(rank, np.int64), f"same_{rank}")

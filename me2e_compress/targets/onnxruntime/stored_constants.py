@@ -1,4 +1,4 @@
-"""Constants behind a DequantizeLinear: what a quantized graph stores."""
+"""Read the constants that a quantized graph stores before a DequantizeLinear."""
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +18,8 @@ def step_of(node: ir.Node) -> Floats:
     """Read the scale of a QuantizeLinear or DequantizeLinear.
 
     Raises:
-        PreconditionError: it is computed or not float32, the integers are not int8, or
-            the zero point is not zero.
+        PreconditionError: the scale is not a float32 constant, or the integers are not
+            int8 with zero point 0.
     """
     scale = graph.array_of(node.inputs[1])
     zero = graph.array_of(graph.input_at(node, 2))
@@ -48,12 +48,9 @@ def weight_of(layer: ir.Node) -> QuantizedWeight | None:
     A MatMul by [1, ..., K, N] reads [K, N]. onnxruntime's own quantizer, and so
     ModelOpt, puts scales along axis 1 of such a weight, which is K: no kernel takes it.
 
-    Args:
-        layer: one that has an int8 kernel.
-
     Raises:
-        PreconditionError: it is quantized, but not on the symmetric int8 grid with one
-            scale an output channel, or one in all.
+        PreconditionError: it is not on the symmetric int8 grid with one scale for each
+            output channel, or one in all.
     """
     node = producer_of(layer.inputs[1])
     if node is None or node.op_type != DEQUANTIZE:
@@ -62,6 +59,7 @@ def weight_of(layer: ir.Node) -> QuantizedWeight | None:
     integers = _integers(node, step)
     if integers is None:
         return None
+    # A batch of one matrix is read as that matrix.
     along = node.attributes.get_int("axis", 1) % integers.ndim
     axis = graph.channel_axis(layer)
     if layer.op_type == "MatMul" and integers.ndim > 2:
@@ -91,7 +89,7 @@ def bias_of(layer: ir.Node) -> Floats | None:
 
 
 def _integers(dequantize: ir.Node, step: Floats) -> npt.NDArray[np.int8] | None:
-    """Return what a DequantizeLinear reads, if it is constant, as int8."""
+    """Return the constant input of a DequantizeLinear as int8."""
     source = dequantize.inputs[0]
     stored = graph.array_of(source)
     if stored is not None:

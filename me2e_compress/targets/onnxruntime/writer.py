@@ -1,4 +1,4 @@
-"""Write constants and new nodes into a graph that is being lowered."""
+"""Write constants and new nodes into a graph during lowering."""
 
 import hashlib
 from collections.abc import Sequence
@@ -14,11 +14,7 @@ BY = "quantize-int8"
 
 
 class Writer:
-    """Writes into one graph; equal constants are stored once.
-
-    Args:
-        where: the graph.
-    """
+    """Writes into one graph; equal constants are stored once."""
 
     def __init__(self, where: ir.Graph) -> None:
         self.graph = where
@@ -26,7 +22,7 @@ class Writer:
         self._names = rewrite.value_names(where)
 
     def constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
-        """Return the initializer that holds an array, a new one if there is none."""
+        """Return the initializer of an array, or add one."""
         kind = f"{array.dtype}{array.shape}"
         key = (kind, hashlib.sha256(array.tobytes()).digest())
         if key not in self._constants:
@@ -43,14 +39,10 @@ class Writer:
         sources: Sequence[ir.Node],
         attributes: dict[str, int] | None = None,
     ) -> ir.Node:
-        """Build a node and its output; it stands nowhere yet.
+        """Build a node of a standard operator without inserting it.
 
-        Args:
-            op: a standard operator.
-            inputs: what it reads.
-            name: of the node and of what it answers, or with a number behind it.
-            sources: the nodes whose heir it is, the leading one first.
-            attributes: integers.
+        ``name`` is made unique; provenance comes from ``sources``, the leading one
+        first.
         """
         unique = rewrite.fresh_name(name, self._names)
         node = ir.node(op, inputs, attributes or {}, name=unique)
@@ -66,14 +58,10 @@ class Writer:
         axis: int | None,
         reader: ir.Node,
     ) -> ir.Value:
-        """Store integers and return the float tensor they stand for, before its reader.
+        """Store integers and insert their DequantizeLinear before the reader.
 
-        Args:
-            name: what the new names begin with.
-            integers: int8 or int32.
-            scales: float32 [channels], or a scalar for one step everywhere.
-            axis: which axis of the integers the channels run along; None without.
-            reader: the node that will read it.
+        ``scales`` is float32 [channels] along ``axis`` of the integers, or a scalar
+        with ``axis`` None. Returns the dequantized tensor.
         """
         zeros = np.zeros(scales.shape, integers.dtype)
         stored = self.constant(integers, f"{name}_{integers.dtype}")

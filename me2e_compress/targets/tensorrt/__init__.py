@@ -1,11 +1,10 @@
-"""TensorRT: int8 as explicit, symmetric QDQ, and what its parser would say of it.
+"""TensorRT: int8 as explicit, symmetric QDQ pairs.
 
-The rules (TensorRT 10 developer guide, "Explicit quantization", and what its ONNX
-parser accepts): zero points are 0; activations have one scale a tensor, weights one a
-channel, batches of matrices one; weights are stored as int8 behind a
-DequantizeLinear; biases and outputs have no QDQ, and of an Add only the residual branch
-has; every int8 reader of a tensor shares one pair, every float reader reads the tensor
-itself.
+The rules (TensorRT 10 developer guide, "Explicit quantization", and its ONNX parser):
+zero points are 0; activations have one scale a tensor, weights one a channel, batches
+of matrices one; weights are stored as int8 before a DequantizeLinear; biases and
+outputs have no pair, and of an Add only the residual branch has one; all int8 readers
+of a tensor share one pair, all float readers read the tensor itself.
 """
 
 import dataclasses
@@ -52,32 +51,25 @@ class TensorRT(Target):
     machine: str = ""
 
     def __post_init__(self) -> None:
-        """Check the machine."""
         if self.machine and self.machine not in MACHINES:
             raise ValueError(
                 f"no machine {self.machine}; there are {', '.join(MACHINES)}"
             )
 
     def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
-        """Name what weighted layers and residual branches read."""
+        """List the inputs of weighted layers and residual branches."""
         return tensors_of(plan, model)
 
     def place(self, model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
         """Return a copy of a graph in which the plan's nodes read int8.
 
-        Args:
-            model: the float graph that was planned and calibrated; it stays as it is.
-            plan: what becomes int8.
-            ranges: of every activation that the plan reads.
-
-        Returns:
-            The copy: a QuantizeLinear and a DequantizeLinear for each of those
-            activations (int8, zero point 0, scale = max(|low|, |high|) / 127), and int8
-            initializers behind a DequantizeLinear for the weights.
+        Every activation that the plan reads gets a QuantizeLinear and a
+        DequantizeLinear (int8, zero point 0, scale = max(|low|, |high|) / 127); weights
+        become int8 initializers before a DequantizeLinear.
 
         Raises:
-            PreconditionError: the graph is older than opset 13, or in a float type
-                without int8 here, or something that the plan calls a weight is not one.
+            PreconditionError: the graph is older than opset 13 or in a float type
+                without int8 here, or a planned weight is not constant.
         """
         self.check_types(plan, model)
         weights = weights_of(model, plan.chosen)
@@ -90,11 +82,11 @@ class TensorRT(Target):
         return copy
 
     def fused_objection(self, node: ir.Node) -> str | None:
-        """Say why a plugin gets no int8: most take float alone.
+        """Explain why a plugin gets no int8: most support float only.
 
-        A pair in front of those would be run by kernels of its own. In explicit
-        quantization int8 reaches a plugin as it is, and its scale as an input
-        (SparseDriveV2); BEVFormer_tensorrt's want it by implicit quantization.
+        A pair before those would run as separate kernels. In explicit quantization a
+        plugin gets the int8 directly, and its scale as an input (SparseDriveV2);
+        BEVFormer_tensorrt's plugins expect it by implicit quantization.
         """
         found = find(node)
         if found is None or ir.DataType.INT8 not in found[1].operands[0].types:
@@ -107,7 +99,7 @@ class TensorRT(Target):
         return None
 
     def costs(self, model: ir.Model, layers: Collection[ir.Node]) -> Costs | None:
-        """Predict what int8 of some layers saves and costs on the machine."""
+        """Predict the savings and costs of int8 for some layers on the machine."""
         if not self.machine:
             return None
         return costs_of(model, layers, MACHINES[self.machine])
@@ -118,7 +110,7 @@ class TensorRT(Target):
 
 
 class _Writer:
-    """Writes pairs into one graph, each tensor and each weight once."""
+    """Writes pairs into one graph, once for each tensor and each weight."""
 
     def __init__(self, where: ir.Graph, ranges: Ranges) -> None:
         self._graph = where
@@ -145,7 +137,7 @@ class _Writer:
             node.replace_input_with(at, self._weight(weight, like, node))
 
     def _feed(self, plugin: ir.Node, index: int) -> None:
-        """Give a plugin integers as they are, and their scale for every channel."""
+        """Feed integers to a plugin, with their scale for every channel."""
         value, found = plugin.inputs[index], find(plugin)
         at = None if found is None else found[1].int8_scale
         channels = (static_shape(value) or ())[-1:]
@@ -173,6 +165,7 @@ class _Writer:
             dequantize = self._node(
                 "DequantizeLinear", [quantize.outputs[0], *pair], name, value, reader
             )
+            # All int8 readers share the pair after the producer.
             producer = value.producer()
             if producer is None:
                 self._graph.insert_before(self._graph[0], [quantize, dequantize])
@@ -220,5 +213,5 @@ class _Writer:
 
 
 def _numpy(value: ir.Value) -> np.dtype[np.generic]:
-    """Return the type of a tensor's scale: its own, float32 where that is open."""
+    """Return the type of a tensor's scale: its own, float32 if unknown."""
     return np.dtype(np.float32) if value.dtype is None else value.dtype.numpy()

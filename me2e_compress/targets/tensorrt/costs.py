@@ -1,4 +1,4 @@
-"""What int8 saves and costs on a GPU, predicted from published rates; not measured."""
+"""Predict what int8 saves and costs on a GPU from published rates, not measured."""
 
 import dataclasses
 import math
@@ -17,10 +17,10 @@ class GpuRates:
     """Peak rates of a GPU.
 
     Attributes:
-        machine: which.
-        half_macs: multiply-accumulates a second in float16, dense.
-        int8_macs: in int8, dense.
-        memory: bytes a second.
+        machine: description of the GPU.
+        half_macs: dense multiply-accumulates per second in float16.
+        int8_macs: the same in int8.
+        memory: bytes per second.
     """
 
     machine: str
@@ -37,28 +37,24 @@ sparsity, 204.8 GB/s); a dense MAC is four of those operations, half the rate in
 float16."""
 
 _FUSED = frozenset({"Add", "BatchNormalization", "Clip", "MaxPool", "Relu"})
-"""What a convolution's kernel computes behind it, or moves int8 through."""
+"""Operators that a convolution's kernel includes after it, or that pass int8 on."""
 
 
 def costs_of(model: ir.Model, layers: Collection[ir.Node], rates: GpuRates) -> Costs:
-    """Predict what int8 of some layers would save and cost, against float16.
+    """Predict the savings and costs of int8 for some layers, compared with float16.
 
-    A layer takes as long as its arithmetic or its bytes, whichever is longer. What a
-    convolution gives is quantized in its own kernel; whatever else makes a tensor
-    writes one byte an element more, and an input of the graph is read once more. In
-    the fused regions of transformers a pair in front of a product takes its bias and
-    what follows out of its kernel: its answer is read and written once more. So it was
-    measured on Orin for SparseDriveV2.
-
-    Args:
-        model: the float graph, shapes inferred.
-        layers: what could be int8.
-        rates: of the GPU.
+    A layer takes the longer of its arithmetic and memory time. The output of a
+    convolution is quantized in its own kernel; any other producer writes one more byte
+    per element, and a graph input is read once more. In the fused regions of
+    transformers, a pair before a product moves its bias and what follows out of its
+    kernel: its output is read and written once more, as measured on Orin for
+    SparseDriveV2. Shapes are inferred.
     """
     constants = constant_values(model)
     layers = [layer for layer in layers if layer.op_type in WEIGHTED]
     saved: dict[ir.Node, float] = {}
     readers: dict[ir.Value, list[ir.Node]] = {}
+    # Collect the saving of each layer, and the readers of tensors.
     for layer in layers:
         activations = [v for v in layer.inputs[:2] if v and v not in constants]
         for value in activations:
@@ -107,7 +103,7 @@ def _border(
 
 
 def _convolution(value: ir.Value) -> ir.Node | None:
-    """Return the convolution in whose kernel a tensor is made."""
+    """Return the convolution whose kernel computes a tensor."""
     node = value.producer()
     while node is not None and node.op_type in _FUSED:
         sources = [each.producer() for each in node.inputs if each is not None]

@@ -1,4 +1,4 @@
-"""Build an engine of a graph by TensorRT itself, where it is installed."""
+"""Build an engine of a graph with TensorRT itself, where it is installed."""
 
 import dataclasses
 import importlib
@@ -19,13 +19,13 @@ Precision = Literal["graph", "fp16"]
 
 @dataclasses.dataclass(frozen=True)
 class EngineSettings:
-    """How an engine is built.
+    """Options of an engine build.
 
     Attributes:
         precision: ``graph``: in the types of the graph, int8 pairs as int8; ``fp16``:
-            what is float32 may run in float16 too. TensorRT 11 knows ``graph`` alone.
-        tactic_sources: libraries that kernels are taken from, these and no others, as
-            ``CUBLAS`` of TensorRT 10; none leaves the choice to TensorRT.
+            float32 may also run in float16. TensorRT 11 supports only ``graph``.
+        tactic_sources: the only libraries to take kernels from, such as ``CUBLAS`` of
+            TensorRT 10; empty leaves the choice to TensorRT.
         plugins: libraries of TensorRT plugins that the graph needs.
     """
 
@@ -36,14 +36,7 @@ class EngineSettings:
 
 @dataclasses.dataclass(frozen=True)
 class TensorRTEngine:
-    """What TensorRT built.
-
-    Attributes:
-        content: the engine; it fits this GPU and this version.
-        version: of TensorRT.
-        layers: of the network that was parsed.
-        seconds: that it took.
-    """
+    """A built engine; its ``content`` fits only this GPU and this TensorRT version."""
 
     content: bytes
     version: str
@@ -54,13 +47,9 @@ class TensorRTEngine:
 def build_engine(path: Path, settings: EngineSettings) -> TensorRTEngine:
     """Parse a file and build an engine of it for the GPU of this machine.
 
-    Args:
-        path: the ONNX file, its weights beside it.
-        settings: how it is built.
-
     Raises:
         MissingPackageError: TensorRT is not installed.
-        PreconditionError: it lacks an option, or refuses the graph: the message names
+        PreconditionError: it lacks an option, or refuses the graph; the message names
             the node.
     """
     trt, begun = _tensorrt(), time.perf_counter()
@@ -71,6 +60,7 @@ def build_engine(path: Path, settings: EngineSettings) -> TensorRTEngine:
     parser = trt.OnnxParser(network, log)
     if not parser.parse_from_file(str(path)):
         raise PreconditionError(f"{path}: {_refusal(trt, parser)}")
+    # Set the types and libraries, and build.
     config = builder.create_builder_config()
     _set_types(trt, config, graph.load(path), settings.precision)
     if settings.tactic_sources:
@@ -94,7 +84,7 @@ def _tensorrt() -> Any:
 
 
 def _log(trt: Any) -> Any:
-    """Return a logger that keeps errors and says nothing."""
+    """Return a logger that stores errors without printing them."""
 
     class Messages(trt.ILogger):  # type: ignore[misc]
         def __init__(self) -> None:
@@ -130,11 +120,7 @@ def _refusal(trt: Any, parser: Any) -> str:
 
 
 def _set_types(trt: Any, config: Any, model: ir.Model, precision: Precision) -> None:
-    """Allow the types that TensorRT 10 may choose; 11 takes those of the graph.
-
-    Raises:
-        PreconditionError: float16 of TensorRT 11 for a float32 graph.
-    """
+    """Allow the types that TensorRT 10 may choose; 11 uses those of the graph."""
     flags = trt.BuilderFlag
     if not hasattr(flags, "FP16"):
         if precision == "fp16":
@@ -152,11 +138,7 @@ def _set_types(trt: Any, config: Any, model: ir.Model, precision: Precision) -> 
 
 
 def _sources(trt: Any, names: Sequence[str]) -> int:
-    """Return the bits of some tactic sources.
-
-    Raises:
-        PreconditionError: this TensorRT has no such source; the message lists its own.
-    """
+    """Return the bit mask of some tactic sources."""
     known = getattr(getattr(trt, "TacticSource", None), "__members__", {})
     if missing := [name for name in names if name.upper() not in known]:
         raise PreconditionError(

@@ -1,1 +1,1 @@
-"""A bird's eye view from cameras: the blocks that VAD-tiny and UniAD-tiny share."""
+"""Bird's eye view from cameras: the blocks that VAD-tiny and UniAD-tiny share."""

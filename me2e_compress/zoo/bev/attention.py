@@ -12,7 +12,7 @@ Levels = tuple[tuple[int, int], ...]
 """Height and width of each feature level."""
 
 MASKED_LOGIT = -1.0e4
-"""Softmax makes it 0, and unlike minus infinity it fits float16 and any observer."""
+"""Softmax makes it 0; unlike minus infinity it fits float16 and any observer."""
 
 
 HEAD_SCALE = (EMBED // ATTENTION_HEADS) ** -0.5
@@ -30,17 +30,12 @@ class PackedAttention(nn.Module):
     def forward(
         self, query: Tensor, key: Tensor, value: Tensor, ignore: Tensor | None = None
     ) -> Tensor:
-        """Attend.
+        """Map queries [B, Q, 256] and keys [B, K, 256] to [B, Q, 256].
 
-        Args:
-            query: [B, Q, 256].
-            key: [B, K, 256].
-            value: [B, K, 256], or [1, K, 256] when all of the batch shares it.
-            ignore: [B, K] or [B, Q, K] bool, true where a key must not be seen.
-
-        Returns:
-            [B, Q, 256].
+        ``value`` is [B, K, 256], or [1, K, 256] for the whole batch; ``ignore`` is [B,
+        K] or [B, Q, K] bool, true where a key must not be seen.
         """
+        # Project and split into heads
         weights = self.in_proj_weight.chunk(3)
         biases = self.in_proj_bias.chunk(3)
         q, k, v = (
@@ -49,6 +44,7 @@ class PackedAttention(nn.Module):
                 (query, key, value), weights, biases, strict=True
             )
         )
+        # Mask ignored keys
         logits = torch.matmul(q * HEAD_SCALE, k.transpose(-2, -1))
         if ignore is not None:
             one_for_all = ignore.dim() == 2
@@ -64,7 +60,7 @@ def _split_heads(x: Tensor) -> Tensor:
 
 
 class MultiheadAttention(nn.Module):
-    """Attention with positions added to query and key, and the residual."""
+    """Attention with positions added to query and key, and a residual."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -106,20 +102,17 @@ def deformable_attention(
     weights: Tensor,
     sampling: Sampling,
 ) -> Tensor:
-    """Sum samples of feature levels, weighted (Zhu et al. 2021, equation 2).
+    """Return the weighted sum of samples of feature levels, [B, Q, heads * 32].
 
-    Args:
-        value: [B, cells of all levels, heads, 32].
-        hws: Height and width of each level.
-        locations: [B, Q, heads, L, P, 2], x then y; 0 and 1 are the outer edges.
-        weights: [B, Q, heads, L, P], summing to 1 over the last two axes.
-        sampling: See `sample`; ``fused`` exports one node for all of it.
-
-    Returns:
-        [B, Q, heads * 32].
+    Zhu et al. 2021, equation 2. ``value`` is [B, cells of all levels, heads, 32],
+    ``hws`` the height and width of each level, ``locations`` [B, Q, heads, L, P, 2], x
+    then y with 0 and 1 at the outer edges, and ``weights`` [B, Q, heads, L, P], summing
+    to 1 over the last two axes. ``sampling="fused"`` exports one node for all of it;
+    see `sample`.
     """
     if sampling == "fused":
         return fused_deformable_attention(value, hws, locations, weights).flatten(2)
+    # One image per level and head
     batch, _, heads, channels = value.shape
     queries, points = locations.shape[1], len(hws) * locations.shape[4]
     cells = value.flatten(2).transpose(1, 2)
@@ -128,12 +121,14 @@ def deformable_attention(
         each.reshape(batch * heads, channels, *hw)
         for each, hw in zip(maps, hws, strict=True)
     ]
+    # grid_sample takes -1..1
     grids = 2 * locations - 1
     parts = [
         sample(image, grids[:, :, :, level].transpose(1, 2).flatten(0, 1), sampling)
         for level, image in enumerate(images)
     ]
     sampled = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+    # Weight the samples and sum
     parts.clear()  # of UniAD's cameras they are 2 GB
     weights = weights.transpose(1, 2).reshape(batch * heads, 1, queries, points)
     out = (sampled * weights).sum(-1).view(batch, heads * channels, queries)
@@ -143,14 +138,11 @@ def deformable_attention(
 class DecoderAttention(nn.Module):
     """Queries attend to the BEV around their reference points.
 
-    Args:
-        hw: Rows and columns of the BEV.
-        sampling: See `sample`.
-        held: Levels to hold weights for. There is one; for more, samples are where the
-            kernel of mmcv takes them: it walks through offsets and weights as if they
-            were for one level, so that a part of the queries speaks for all. Published
-            models were trained so (UniAD's map head holds four).
-        boxes: Whether the reference points are boxes.
+    ``held`` is the number of levels to hold weights for, though there is only one. For
+    more than one, samples follow mmcv's kernel: it reads offsets and weights as if they
+    were for one level, so that the first part of the queries supplies those of all.
+    Published models were trained so (UniAD's map head holds four). ``boxes`` says that
+    the reference points are boxes.
     """
 
     points = 4
@@ -178,25 +170,22 @@ class DecoderAttention(nn.Module):
     size_xy: Tensor
 
     def forward(self, query: Tensor, pos: Tensor, bev: Tensor, at: Tensor) -> Tensor:
-        """Attend.
+        """Map queries [1, Q, 256] to [1, Q, 256], with the residual.
 
-        Args:
-            query: [1, Q, 256].
-            pos: [1, Q, 256], added to the query.
-            bev: [1, cells, 256].
-            at: [1, Q, 2] reference points, or [1, Q, 4] boxes (cx, cy, w, h), 0..1.
-
-        Returns:
-            [1, Q, 256], with the residual.
+        ``pos`` [1, Q, 256] is added to the query; ``bev`` is [1, cells, 256]; ``at``
+        holds reference points [1, Q, 2] or boxes [1, Q, 4] (cx, cy, w, h), 0..1.
         """
+        # Only the first queries supply offsets if several levels are held
         asked = query + pos
         batch, queries, _ = asked.shape
         value = self.value_proj(bev)
         value = value.view(batch, value.shape[1], ATTENTION_HEADS, -1)
         speak, samples = queries, self.held * self.points
+        # Reread them as mmcv's kernel does
         if self.held > 1:
             speak = (queries + self.held - 1) // self.held
             asked, at = asked[:, :speak], at[:, :speak]
+        # Offsets and weights per head, level and point
         offsets = self.sampling_offsets(asked)
         offsets = offsets.view(batch, speak, ATTENTION_HEADS, self.held, self.points, 2)
         weights = self.attention_weights(asked)
@@ -213,7 +202,7 @@ class DecoderAttention(nn.Module):
         return query + read
 
     def _locations(self, at: Tensor, offsets: Tensor) -> Tensor:
-        """Add offsets, in cells around points and in parts of a half around boxes."""
+        """Add offsets, in cells around points or relative to half the size of boxes."""
         if not self.boxes:
             return at + offsets / self.size_xy
         return at[..., :2] + offsets * at[..., 2:] * (0.5 / self.points)

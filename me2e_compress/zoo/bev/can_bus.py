@@ -1,4 +1,4 @@
-"""What the vehicle says of its own motion."""
+"""The vehicle's own motion as an input."""
 
 from torch import nn
 
@@ -10,7 +10,7 @@ rate (3), yaw in radians, change of yaw in degrees."""
 
 
 class CanBusEncoder(nn.Sequential):
-    """Ego motion to a vector that is added to every BEV query."""
+    """Maps ego motion to a vector that is added to every BEV query."""
 
     def __init__(self) -> None:
         super().__init__(

@@ -21,16 +21,16 @@ def inverse_sigmoid(x: Tensor) -> Tensor:
 
 
 def precise_sigmoid(x: Tensor) -> Tensor:
-    """Return 1 / (1 + exp(-x)), exact to its last digits however small it is.
+    """Return 1 / (1 + exp(-x)) with full relative precision for small results.
 
-    onnxruntime's Sigmoid is exact to 8e-8 whatever it returns: beside 1e-5, where
+    onnxruntime's Sigmoid has an absolute error of 8e-8: near 1e-5, where
     `inverse_sigmoid` ends, that moves the logit by 8e-3.
     """
     return torch.reciprocal(1 + torch.exp(-x))
 
 
 def in_metres(raw: Tensor, at: Tensor, grid: BevGrid) -> Tensor:
-    """Return boxes [..., 10]: raw ones whose refined centres (0..1) are in metres."""
+    """Convert raw boxes [..., 10] with refined centres (0..1) to metres."""
     x0, y0, z0, x1, y1, z1 = grid.pc_range
     x = at[..., 0:1] * (x1 - x0) + x0
     y = at[..., 1:2] * (y1 - y0) + y0
@@ -39,7 +39,7 @@ def in_metres(raw: Tensor, at: Tensor, grid: BevGrid) -> Tensor:
 
 
 class DecoderLayer(nn.Module):
-    """Self-attention, cross-attention to the BEV, feed-forward."""
+    """Self-attention, cross-attention to the BEV, and feed-forward."""
 
     def __init__(self, hw: tuple[int, int], sampling: Sampling) -> None:
         super().__init__()
@@ -70,12 +70,8 @@ class DecoderLayer(nn.Module):
 class Decoder(nn.Module):
     """`DecoderLayer`s with a regression branch after each.
 
-    Args:
-        hw: Cells of the BEV.
-        layers: How many.
-        sampling: How attention is exported.
-        height: References have a third coordinate.
-        precise: For references that are fed back as logits, from frame to frame.
+    ``height`` adds a third coordinate to references; ``precise`` is for references that
+    are fed back as logits from frame to frame.
     """
 
     def __init__(
@@ -101,20 +97,16 @@ class Decoder(nn.Module):
         branches: nn.ModuleList,
         ignore: Tensor | None = None,
     ) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
-        """Decode.
+        """Decode queries [1, Q, 256] with references [1, Q, 2 or 3], 0..1.
 
-        Args:
-            query: [1, Q, 256].
-            pos: [1, Q, 256].
-            bev: [1, cells, 256].
-            reference: [1, Q, 2 or 3], 0..1; the third is the height.
-            branches: One regression branch a layer; columns 0 and 1, and 4 where there
-                is a height, move the reference.
-            ignore: [1, Q] bool, true for queries that the others must not see.
+        ``pos`` is [1, Q, 256] and ``bev`` [1, cells, 256]. Columns 0 and 1 of a layer's
+        branch, and 4 with heights, move the reference. ``ignore`` is [1, Q] bool, true
+        for queries that the others must not see.
 
         Returns:
             For every layer: queries [1, Q, 256], raw regressions [1, Q, code] and
-            refined references [1, Q, 2 or 3].
+                refined
+            references [1, Q, 2 or 3].
         """
         queries, regressions, references = [], [], []
         for layer, branch in zip(self.layers, branches, strict=True):
@@ -155,7 +147,7 @@ class InteractionLayer(nn.Module):
 
 
 class Interaction(nn.Module):
-    """Cross-attention of one kind of query to another: a single `InteractionLayer`."""
+    """Cross-attention of one kind of query to another: one `InteractionLayer`."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Camera features and the previous BEV to a bird's eye view (BEVFormer)."""
+"""Encode camera features and the previous BEV to a bird's eye view (BEVFormer)."""
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from me2e_compress.zoo.bev.sizes import (
 
 
 class TemporalSelfAttention(nn.Module):
-    """BEV queries attend to the previous BEV and the present queries."""
+    """BEV queries attend to the previous BEV and the current queries."""
 
     points = 4
     queue = 2
@@ -32,17 +32,13 @@ class TemporalSelfAttention(nn.Module):
         self.register_buffer("size_xy", torch.tensor(hw[::-1]).float(), False)
 
     def forward(self, query: Tensor, pos: Tensor, queue: Tensor, at: Tensor) -> Tensor:
-        """Attend.
+        """Map queries [1, cells, 256] to [1, cells, 256], with the residual.
 
-        Args:
-            query: [1, cells, 256].
-            pos: [1, cells, 256], added to the query.
-            queue: [2, cells, 256], the previous BEV and the present one.
-            at: [1, cells, 2] reference points, 0..1.
-
-        Returns:
-            [1, cells, 256], with the residual.
+        ``pos`` [1, cells, 256] is added to the query; ``queue`` [2, cells, 256] is the
+        previous BEV and the current one; ``at`` [1, cells, 2] are reference points,
+        0..1.
         """
+        # Offsets and weights come from both BEVs
         asked = torch.cat([queue[:1], query + pos], -1)
         cells = asked.shape[1]
         heads, points = ATTENTION_HEADS, self.points
@@ -53,6 +49,7 @@ class TemporalSelfAttention(nn.Module):
         weights = self.attention_weights(asked)
         weights = weights.view(1, cells, heads, self.queue, points).softmax(-1)
         weights = weights.permute(0, 3, 1, 2, 4).flatten(0, 1).unsqueeze(3)
+        # Sample both, then average
         locations = at[:, :, None, None, None, :] + offsets / self.size_xy
         hws = (self.hw,)
         out = deformable_attention(value, hws, locations, weights, self.sampling)
@@ -61,7 +58,7 @@ class TemporalSelfAttention(nn.Module):
 
 
 class CameraAttention(nn.Module):
-    """The deformable attention inside of `SpatialCrossAttention`."""
+    """The deformable attention within `SpatialCrossAttention`."""
 
     points = 8
 
@@ -78,25 +75,22 @@ class CameraAttention(nn.Module):
         self.register_buffer("size_xy", size_xy, False)
 
     def forward(self, query: Tensor, tokens: Tensor, at: Tensor) -> Tensor:
-        """Read every camera for every cell, visible or not.
+        """Read every camera for every cell, visible or not: [cameras, cells, 256].
 
-        Args:
-            query: [1, cells, 256].
-            tokens: [cameras, tokens of all levels, 256].
-            at: [cameras, cells, pillar points, 2] in the image, 0..1.
-
-        Returns:
-            [cameras, cells, 256].
+        ``query`` is [1, cells, 256], ``tokens`` [cameras, tokens of all levels, 256]
+        and ``at`` [cameras, cells, pillar points, 2] in the image, 0..1.
         """
         heads, points, levels = ATTENTION_HEADS, self.points, len(self.hws)
         cameras, cells = at.shape[:2]
         value = self.value_proj(tokens).view(cameras, tokens.shape[1], heads, -1)
+        # Each pillar point has an equal share of the samples
         offsets = self.sampling_offsets(query)
         offsets = offsets.view(1, cells, heads, levels, points, 2)
         groups = levels * points // PILLAR_POINTS
         offsets = (offsets / self.size_xy).view(
             1, cells, heads, groups, PILLAR_POINTS, 2
         )
+        # Weights are the same for all cameras
         weights = self.attention_weights(query).view(1, cells, heads, levels * points)
         weights = _by_level(weights.softmax(-1), levels)
         weights = weights.expand(cameras, cells, heads, levels, points)
@@ -106,7 +100,7 @@ class CameraAttention(nn.Module):
 
 
 def _by_level(weights: Tensor, levels: int) -> Tensor:
-    """Cut [..., levels * points] to [..., levels, points]."""
+    """Split [..., levels * points] into [..., levels, points]."""
     return weights.unsqueeze(3) if levels == 1 else weights.unflatten(3, (levels, -1))
 
 
@@ -126,14 +120,8 @@ class SpatialCrossAttention(nn.Module):
     ) -> Tensor:
         """Attend as `CameraAttention`, averaged over the cameras that see the cell.
 
-        Args:
-            query: [1, cells, 256].
-            tokens: [cameras, h * w, 256].
-            at: [cameras, cells, pillar points, 2].
-            visible: [cameras, cells, 1] float32, 1 or 0.
-
-        Returns:
-            [1, cells, 256], with the residual.
+        ``visible`` is [cameras, cells, 1] float32, 1 or 0. Returns [1, cells, 256],
+        with the residual.
         """
         seen = self.deformable_attention(query, tokens, at) * visible
         count = torch.maximum(visible.sum(0, keepdim=True), ONE)
@@ -142,7 +130,7 @@ class SpatialCrossAttention(nn.Module):
 
 
 class EncoderLayer(nn.Module):
-    """Temporal attention, camera attention, feed-forward; normalised after each."""
+    """Temporal attention, camera attention and feed-forward, each normalised."""
 
     def __init__(self, hw: tuple[int, int], hws: Levels, sampling: Sampling) -> None:
         super().__init__()
@@ -170,14 +158,7 @@ class EncoderLayer(nn.Module):
 
 
 class BevEncoder(nn.Module):
-    """`EncoderLayer`s over a grid of cells.
-
-    Args:
-        grid: The cells.
-        image_hw: Pixels of a camera.
-        hws: Feature levels of a camera.
-        layers: How many.
-        sampling: See `sample`.
+    """`EncoderLayer`s over a grid of cells; ``hws`` are the feature levels of a camera.
     """
 
     pillars: Tensor
@@ -216,20 +197,17 @@ class BevEncoder(nn.Module):
         tokens: Tensor,
         lidar2img: Tensor,
     ) -> Tensor:
-        """Encode one frame.
+        """Encode one frame to [1, cells, 256].
 
         Args:
             query: [1, cells, 256], learned embedding plus ego motion.
             pos: [1, cells, 256].
-            previous: [1, cells, 256], the last BEV turned to the present heading.
+            previous: [1, cells, 256], the last BEV turned to the current heading.
             first: bool scalar: there is no previous BEV.
-            shift: [1, 2], ego translation as a part of the grid. As in the original,
-                it moves the reference points of both halves of the queue.
+            shift: [1, 2], ego translation relative to the grid. As in the original, it
+                moves the reference points of both halves of the queue.
             tokens: [cameras, h * w, 256].
             lidar2img: [1, cameras, 4, 4].
-
-        Returns:
-            [1, cells, 256].
         """
         pillars_at, visible = project(self.pillars, lidar2img, self.image_hw)
         cells_at = self.cells + shift[:, None]
@@ -243,7 +221,7 @@ class BevEncoder(nn.Module):
 
 
 class GridPosition(nn.Module):
-    """Learned embedding of a row and a column."""
+    """Learned embedding of rows and columns."""
 
     def __init__(self, hw: tuple[int, int]) -> None:
         super().__init__()

@@ -21,7 +21,7 @@ def fused_deformable_attention(
     locations: Tensor,
     weights: Tensor,
 ) -> Tensor:
-    """Map as `deformable_attention` does, to [B, Q, heads, 32]; exports one node."""
+    """Compute `deformable_attention` as [B, Q, heads, 32], exported as one node."""
     apply: Callable[..., Tensor] = _Fused.apply
     flat = tuple(n for hw in hws for n in hw)  # the exporter takes no nested tuple
     return apply(value, flat, locations, weights)
@@ -38,7 +38,8 @@ class _Fused(torch.autograd.Function):
         locations: Tensor,
         weights: Tensor,
     ) -> Tensor:
-        """Compute it by torch's own sampler."""
+        """Compute it with torch's own sampler."""
+        # Sample level by level
         hws = _pairs(sizes)
         batch, _, heads, channels = value.shape
         queries, points = locations.shape[1], locations.shape[4]
@@ -52,6 +53,7 @@ class _Fused(torch.autograd.Function):
             share = weights[:, :, :, level].transpose(1, 2)
             share = share.reshape(batch * heads, 1, queries, points)
             parts.append((sampled * share).sum(-1))
+        # Add up the levels
         summed = functools.reduce(torch.add, parts)
         return summed.view(batch, heads, channels, queries).permute(0, 3, 1, 2)
 
@@ -63,7 +65,7 @@ class _Fused(torch.autograd.Function):
         locations: Any,
         weights: Any,
     ) -> Any:
-        """Write the node, its sizes constants, with the shape of what it gives."""
+        """Write the node with constant sizes, and the shape of its output."""
         shapes = torch.tensor(_pairs(sizes), dtype=torch.int32)
         cells = shapes.prod(1)
         starts = (cells.cumsum(0) - cells).to(torch.int32)

@@ -24,11 +24,9 @@ class ConvModule(nn.Module):
 class FeaturePyramid(nn.Module):
     """Stages to 256 channels each, and coarser levels on top (Lin et al. 2017).
 
-    Args:
-        channels: Of the stages, the finest first.
-        extra: Levels beyond, each by a strided convolution of the one before.
-        hws: Rows and columns of the stages, where there are several. The exporter
-            would write arithmetic on shapes for them.
+    ``channels`` of the stages are listed from the finest. Each of the ``extra`` levels
+    is a strided convolution of the level before. ``hws`` are the rows and columns of
+    several stages: without them the exporter would write shape arithmetic.
     """
 
     def __init__(

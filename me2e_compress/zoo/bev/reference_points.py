@@ -1,4 +1,4 @@
-"""Reference points: pillars in the images, the previous BEV under the present one."""
+"""Reference points: pillars in the images, and the previous BEV in the current one."""
 
 import math
 
@@ -27,15 +27,12 @@ def pillars(hw: tuple[int, int], pc_range: tuple[float, ...], heights: int) -> T
 def project(
     points: Tensor, lidar2img: Tensor, image_hw: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Project pillars into the cameras.
+    """Project pillars [heights, cells, 4, 1] into the cameras.
 
-    Args:
-        points: [heights, cells, 4, 1] from `pillars`.
-        lidar2img: [1, cameras, 4, 4], metres to pixels times depth.
-        image_hw: Pixels.
+    ``lidar2img`` [1, cameras, 4, 4] maps metres to pixels times depth.
 
     Returns:
-        Positions [cameras, cells, heights, 2], 0..1 inside of the image, and float32
+        Positions [cameras, cells, heights, 2], 0..1 within the image, and float32
         [cameras, cells, 1]: 1 where a camera sees any point of the pillar.
     """
     seen = torch.matmul(lidar2img[0][:, None, None], points.unsqueeze(0)).squeeze(-1)
@@ -48,16 +45,13 @@ def project(
 
 
 def ego_shift(can_bus: Tensor, grid: BevGrid) -> Tensor:
-    """Return the last frame's translation as a part of the BEV grid, [1, 2] (x, y).
+    """Return the last frame's translation relative to the BEV grid, [1, 2] (x, y).
 
-    The original takes length t and angle of the translation (dx, dy) and then
-    y = t cos(ego - angle), x = t sin(ego - angle). Expanding the differences needs
-    neither square root nor arc tangent: y = cos(ego) dx + sin(ego) dy and
-    x = sin(ego) dx - cos(ego) dy.
-
-    Args:
-        can_bus: [18]; 0 and 1 are dx and dy in metres (world), 16 the yaw in radians.
-        grid: Whose part it is.
+    ``can_bus`` [18] holds dx and dy in metres (world) at 0 and 1 and the yaw in radians
+    at 16. The original takes length t and angle of the translation (dx, dy), then y = t
+    cos(ego - angle), x = t sin(ego - angle). Expanding the differences needs neither
+    square root nor arc tangent: y = cos(ego) dx + sin(ego) dy, x = sin(ego) dx -
+    cos(ego) dy.
     """
     dx, dy, yaw = can_bus[0:1], can_bus[1:2], can_bus[16:17]
     cos, sin = torch.cos(yaw), torch.sin(yaw)
@@ -80,17 +74,10 @@ def cell_positions(grid: BevGrid) -> Tensor:
 def turn(
     bev: Tensor, can_bus: Tensor, cells: Tensor, grid: BevGrid, sampling: Sampling
 ) -> Tensor:
-    """Rotate the previous BEV to the present heading, to the nearest cell.
+    """Rotate the previous BEV [cells, 1, 256] to the current heading, to the nearest cell.
 
-    Args:
-        bev: [cells, 1, 256].
-        can_bus: [18]; the last is the change of yaw in degrees.
-        cells: [cells, 2] from `cell_positions`.
-        grid: Of the cells.
-        sampling: See `sample`.
-
-    Returns:
-        [1, cells, 256].
+    The last of ``can_bus`` [18] is the change of yaw in degrees; ``cells`` [cells, 2]
+    are from `cell_positions`. Returns [1, cells, 256].
     """
     height, width = grid.hw
     centre_column, centre_row = grid.rotation_centre

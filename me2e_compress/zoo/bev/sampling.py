@@ -1,4 +1,4 @@
-"""Sampling of a feature map at fractional positions."""
+"""Sample a feature map at fractional positions."""
 
 import functools
 from typing import Literal
@@ -16,27 +16,26 @@ def sample(
     sampling: Sampling,
     mode: Literal["bilinear", "nearest"] = "bilinear",
 ) -> Tensor:
-    """Sample ``image`` at ``grid``; outside of the image is zero.
+    """Sample ``image`` at ``grid``: [N, C, Q, P] float32; outside of the image is zero.
 
     Args:
         image: [N, C, H, W] float32.
         grid: [N, Q, P, 2] float32, x then y, -1 and 1 are the outer edges.
         sampling: ``operator`` uses grid_sample (ONNX opset 16 and later), the others
             write the same in operators of opset 13.
-        mode: How values between pixels are made.
-
-    Returns:
-        [N, C, Q, P] float32.
+        mode: interpolation between pixels.
     """
     if sampling == "operator":
         return functional.grid_sample(
             image, grid, mode=mode, padding_mode="zeros", align_corners=False
         )
+    # Pixels as rows
     batch, channels, height, width = image.shape
     rows = image.flatten(2).transpose(1, 2).reshape(-1, channels)
     start = (torch.arange(batch) * (height * width)).view(-1, 1, 1)
     x = ((grid[..., 0] + 1) * width - 1) / 2
     y = ((grid[..., 1] + 1) * height - 1) / 2
+    # Corners around each position, with their shares
     if mode == "nearest":
         corners = [(torch.round(x), torch.round(y), torch.ones_like(x))]
     else:
@@ -48,6 +47,7 @@ def sample(
             (left, top + 1, (1 - right_part) * bottom_part),
             (left + 1, top + 1, right_part * bottom_part),
         ]
+    # Corners outside of the image have no share
     parts = []
     for column, row, weight in corners:
         inner_column = column.clamp(0, width - 1)

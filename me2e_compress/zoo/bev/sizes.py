@@ -25,10 +25,10 @@ class BevGrid:
     """Cells around the vehicle.
 
     Attributes:
-        hw: Rows and columns.
+        hw: rows and columns.
         pc_range: x, y, z minima then maxima in metres; lidar frame, x right, y forward,
             z up.
-        rotation_centre: Of the previous BEV, in cells: column and row.
+        rotation_centre: of the previous BEV, in cells: column and row.
     """
 
     hw: tuple[int, int]
@@ -37,5 +37,5 @@ class BevGrid:
 
     @property
     def cells(self) -> int:
-        """Cells in all."""
+        """The number of cells."""
         return self.hw[0] * self.hw[1]

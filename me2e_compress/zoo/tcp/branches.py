@@ -11,7 +11,7 @@ from me2e_compress.zoo.tcp.config import TcpConfig
 
 
 class ImageTrunk(ResNet):
-    """ResNet-34 with its classifier: the strip to a vector and a map."""
+    """ResNet-34 with its classifier: maps the strip to a vector and a feature map."""
 
     def __init__(self, config: TcpConfig) -> None:
         super().__init__(BasicBlock, BLOCKS, config.stem)
@@ -24,9 +24,9 @@ class ImageTrunk(ResNet):
 
 
 class RecurrentCell(nn.Module):
-    """A gated recurrent unit (Cho et al. 2014) under the names of ``nn.GRUCell``.
+    """A gated recurrent unit (Cho et al. 2014) with the names of ``nn.GRUCell``.
 
-    Written out, since the exporter knows no ``GRUCell``.
+    The exporter does not support ``GRUCell``.
     """
 
     def __init__(self, size: int, hidden: int) -> None:
@@ -47,7 +47,7 @@ class RecurrentCell(nn.Module):
 
 
 class MapReader(nn.Sequential):
-    """A vector to weights over the cells of the image map, which sum to 1."""
+    """Maps a vector to weights over the cells of the image map, which sum to 1."""
 
     def __init__(self, size: int, config: TcpConfig) -> None:
         rows, columns = config.map_hw
@@ -67,7 +67,7 @@ class MapReader(nn.Sequential):
 
 
 def layers(*sizes: int) -> nn.Sequential:
-    """Build linear layers from size to size, each with a ReLU."""
+    """Build linear layers of the given sizes, each with a ReLU."""
     built = nn.Sequential()
     for size, out in itertools.pairwise(sizes):
         built.extend([nn.Linear(size, out), nn.ReLU()])
@@ -75,7 +75,7 @@ def layers(*sizes: int) -> nn.Sequential:
 
 
 def scorer(size: int, hidden: int) -> nn.Sequential:
-    """Build two layers and one number, with the dropout that training has."""
+    """Build two layers and a scalar output, with the dropout of training."""
     return nn.Sequential(
         nn.Linear(size, hidden),
         nn.ReLU(),

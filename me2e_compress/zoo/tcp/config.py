@@ -20,27 +20,27 @@ DISTRIBUTIONS = 2
 """The original: one Beta distribution of acceleration and one of steer."""
 
 EXPERT_FEATURES = 1536
-"""Of Bench2Drive's expert, which training imitates."""
+"""Features of Bench2Drive's expert, which training imitates."""
 
 ACTION_SIZE: dict[ActionHeads, int] = {
     "bench2drive": ACTIONS,
     "beta": 2 * DISTRIBUTIONS,
 }
-"""Numbers that say an action: logits, or both parameters of each distribution."""
+"""Outputs per action: logits, or both parameters of each distribution."""
 
 
 @dataclass(frozen=True)
 class TcpConfig:
-    """Sizes; the defaults are the published ones.
+    """Sizes of TCP; the defaults are the published ones.
 
     Attributes:
-        image_hw: Pixels of the strip of three cameras.
-        stem: Channels of the first stage of the image trunk, a ResNet's.
-        classes: Width of the image vector.
-        measured: Width of the measurement vector.
-        joint: Width of the layers that join image and measurements.
-        hidden: Width of the recurrent cells.
-        steps: Waypoints and actions, 0.5 s apart.
+        image_hw: pixels of the strip of three cameras.
+        stem: channels of the first stage of the image trunk, a ResNet.
+        classes: width of the image vector.
+        measured: width of the measurement vector.
+        joint: width of the layers that join image and measurements.
+        hidden: width of the recurrent cells.
+        steps: number of waypoints and actions, 0.5 s apart.
     """
 
     image_hw: tuple[int, int] = (256, 900)

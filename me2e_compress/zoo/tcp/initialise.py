@@ -1,4 +1,4 @@
-"""Weights of TCP from a seed, used to what three cameras see."""
+"""Build TCP with weights from a seed, calibrated on images of three cameras."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""The whole of TCP."""
+"""The whole TCP model."""
 
 import torch
 from torch import Tensor, nn
@@ -24,19 +24,19 @@ PUBLISHED = TcpConfig()
 
 
 class Tcp(nn.Module):
-    """A strip of three cameras and the ego state to waypoints and to actions.
+    """Maps a strip of three cameras and the ego state to waypoints and actions.
 
-    Wu et al. 2022, written from the published description, at the published dimensions
-    and with the parameter names of the original. Nothing is remembered between frames.
-    PID control of the waypoints, the choice or the mode of an action and the fusion of
-    both heads are the host's.
+    Wu et al. 2022, written from the published description, with the published
+    dimensions and the original's parameter names. Nothing is remembered between frames.
+    PID control of the waypoints, the choice of an action and the fusion of both heads
+    are up to the host.
 
     Args:
-        heads: ``bench2drive`` scores 39 actions, ``beta``, the original, gives Beta
+        heads: ``bench2drive`` scores 39 actions; ``beta``, the original, returns Beta
             distributions of acceleration and steer.
-        training_branches: Hold the weights of the branches that only training reads:
+        training_branches: hold the weights of the branches used only in training:
             1,375,491 parameters of Bench2DriveZoo's 26,593,444, which never run here.
-        config: Sizes.
+        config: sizes.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Tcp(nn.Module):
     def forward(
         self, img: Tensor, state: Tensor, target_point: Tensor
     ) -> tuple[Tensor, ...]:
-        """Drive one frame.
+        """Compute waypoints and actions of one frame.
 
         Args:
             img: [1, 3, 256, 900] float32, normalised: front left, front, front right.
@@ -103,10 +103,10 @@ class Tcp(nn.Module):
             target_point: [1, 2] float32, metres: x forward, y right, as in CARLA.
 
         Returns:
-            Waypoints [1, 4, 2], metres, in the frame of the target point; then, of
-            ``bench2drive``, the logits of 39 actions now [1, 39] and in the four steps
-            after [1, 4, 39]; of ``beta``, alpha and beta of acceleration and steer now
-            and in the four steps after, [1, 2], [1, 2], [1, 4, 2] and [1, 4, 2].
+            Waypoints [1, 4, 2], metres, in the frame of the target point; then for
+            ``bench2drive`` the logits of 39 actions now [1, 39] and in the next four
+            steps [1, 4, 39]; for ``beta`` alpha and beta of acceleration and steer now
+            and in the next four steps, [1, 2], [1, 2], [1, 4, 2] and [1, 4, 2].
         """
         with region("backbone"):
             vector, features = self.perception(img)

@@ -1,4 +1,4 @@
-"""Dimensions of UniAD-tiny: of Bench2DriveZoo, and of DL4AGX."""
+"""Dimensions of UniAD-tiny in Bench2DriveZoo and in DL4AGX."""
 
 from dataclasses import dataclass
 
@@ -7,10 +7,10 @@ from me2e_compress.zoo.bev.sizes import BevGrid
 AGENT_MODES = 6
 AGENT_STEPS = 12
 PLAN_STEPS = 6
-"""Of 0.5 s each."""
+"""Steps of 0.5 s each."""
 
 MEMORY = 4
-"""Past embeddings that are kept of a track."""
+"""Number of past embeddings kept per track."""
 
 OCC_REACH_M = 50.0
 """Half the side of the square in which occupancy is predicted."""
@@ -23,13 +23,13 @@ GRID = BevGrid((100, 100), RANGE, (100.0, 100.0))
 
 @dataclass(frozen=True)
 class DatasetClasses:
-    """Classes of a data set, and what else differs between them.
+    """Classes of a data set, and other differences between data sets.
 
     Attributes:
-        groups: Of every class of objects, the group whose motion anchors it has.
-        vehicles: Classes whose occupancy is predicted.
-        things: Map classes that are instances.
-        commands: Of the navigator.
+        groups: the group of motion anchors of every object class.
+        vehicles: classes whose occupancy is predicted.
+        things: number of map classes that are instances.
+        commands: number of navigation commands.
     """
 
     groups: tuple[int, ...]
@@ -39,7 +39,7 @@ class DatasetClasses:
 
     @property
     def classes(self) -> int:
-        """Classes of objects."""
+        """The number of object classes."""
         return len(self.groups)
 
 
@@ -55,22 +55,23 @@ pedestrian, cone."""
 
 @dataclass(frozen=True)
 class UniadConfig:
-    """Sizes; the defaults are Bench2DriveZoo's.
+    """Sizes of UniAD; the defaults are Bench2DriveZoo's.
 
     Attributes:
-        image_hw: Pixels of a camera.
-        stem: Channels of the first stage of the backbone.
-        stages: Of the backbone that the neck reads, from 0.
-        strides: Of the feature levels.
-        grid: Cells of the bird's eye view.
-        upsampled: By which the heads behind tracking see the view enlarged.
-        labels: Of the data set.
-        queries: New track queries a frame, the last of which is the ego vehicle's.
-        tracks: Slots for tracks that survive a frame.
-        encoder_layers: Of the BEV encoder.
-        decoder_layers: Of the track decoder, and of both halves of the map head.
-        map_queries: Lanes.
-        map_levels: For which the published map attention has weights; it reads one.
+        image_hw: pixels of a camera.
+        stem: channels of the first stage of the backbone.
+        stages: stages of the backbone that the neck reads, from 0.
+        strides: of the feature levels.
+        grid: cells of the bird's eye view.
+        upsampled: scale of the view for the heads after tracking.
+        labels: of the data set.
+        queries: new track queries per frame, the last of which is the ego vehicle's.
+        tracks: slots for tracks that survive a frame.
+        encoder_layers: of the BEV encoder.
+        decoder_layers: of the track decoder, and of both halves of the map head.
+        map_queries: number of lanes.
+        map_levels: levels for which the published map attention has weights; it reads
+            one.
     """
 
     image_hw: tuple[int, int] = (928, 1600)
@@ -95,7 +96,7 @@ class UniadConfig:
 
     @property
     def head_hw(self) -> tuple[int, int]:
-        """Rows and columns of the enlarged view."""
+        """Rows and columns of the upsampled view."""
         rows, columns = self.grid.hw
         return rows * self.upsampled, columns * self.upsampled
 

@@ -1,4 +1,4 @@
-"""Weights of UniAD from a seed, used to what six cameras see."""
+"""Build UniAD with weights from a seed, calibrated on images of six cameras."""
 
 import torch
 from torch import Tensor, nn
@@ -45,21 +45,21 @@ GAINS = Gains(
     last_norm=r"bn3\.weight$",
 )
 """Found by trial: the tests state what they must achieve. Strong regressions would move
-reference points by whole cells at the least noise, so theirs are small, as are those of
-logits whose inputs are strong: a sharp softmax or sigmoid tells rounding errors
-apart."""
+reference points by whole cells at the least noise, so their gains are small, as are
+those of logits with strong inputs: a sharp softmax or sigmoid amplifies rounding
+errors."""
 
 BEGINNING = 0.03
-"""Part of the queries that find something in a first frame."""
+"""Fraction of the queries that find something in a first frame."""
 
 OWN_MOTION = 0.2
-"""Part of its motion in what the vehicle sees: another speed is not another world."""
+"""Scale of the ego motion's influence on the view, which should depend on images."""
 
 CENTRE = [0, 1, 4]
-"""Of a box: x, y and z."""
+"""Columns of a box with x, y and z."""
 
 STEADY = 0.1
-"""Part of the move of a centre that is left."""
+"""Remaining fraction of the move of a centre."""
 
 AGENTS = 8
 
@@ -90,19 +90,21 @@ def initialise(
     """Draw all parameters, then take statistics, in place.
 
     Args:
-        model: Of any size.
-        images: [6, 3, H, W], normalised. Smaller ones would not do: what features have
-            in common differs by scale, and with it the number of tracks.
+        model: of any size.
+        images: [6, 3, H, W], normalised. Use full-size ones: the common part of
+            features differs by scale, and with it the number of tracks.
         lidar2img: [1, 6, 4, 4].
-        seed: Of everything.
-        beginning: Part of the queries that find something in what these cameras see.
+        seed: of everything.
+        beginning: fraction of the queries that find something in these images.
     """
     draw_weights(model, GAINS, seed)
+    # Weaken ego motion, steady the centres, open the masks
     norm = model.pts_bbox_head.transformer.can_bus_mlp.get_submodule("norm")
     for parameter in norm.parameters():
         parameter.mul_(OWN_MOTION)
     _hold_centres(model)
     _open_masks(model)
+    # Normalise the features, then balance classes and occupancy
     with one_thread():
         take_statistics(model.img_backbone, images)
         levels = _normalised(model.img_neck, model.img_backbone(images))
@@ -113,10 +115,10 @@ def initialise(
 
 
 def _hold_centres(model: UniadTiny) -> None:
-    """Let the layers move the centre of a box a little.
+    """Make the layers move the centre of a box only a little.
 
-    Where a query reads depends on where it stands, and that on what it read: of centres
-    that move by whole cells the last bit grows from layer to layer and frame to frame.
+    Where a query reads depends on its position, and that on what it read: if centres
+    move by whole cells, rounding errors grow from layer to layer and frame to frame.
     """
     for branch in model.pts_bbox_head.reg_branches:
         for parameter in branch.get_submodule("4").parameters():
@@ -126,14 +128,14 @@ def _hold_centres(model: UniadTiny) -> None:
 def _open_masks(model: UniadTiny) -> None:
     """Let cells see instances by a margin: features of cells are positive on average.
 
-    Of millions of random logits some are at the threshold, where the last bit decides.
+    Of millions of random logits some are at the threshold, where rounding decides.
     """
     last = model.occ_head.temporal_mlp_for_mask.layers[-1]
     last.get_parameter("bias").abs_()
 
 
 def _normalised(neck: FeaturePyramid, stages: list[Tensor]) -> list[Tensor]:
-    """Give every level unit deviation, channel by channel, and return the levels."""
+    """Give every level unit deviation per channel, and return the levels."""
     maps = [
         _unit(conv, stage)
         for conv, stage in zip(neck.lateral_convs, stages, strict=True)
@@ -171,7 +173,7 @@ def _unit(module: nn.Module, x: Tensor) -> Tensor:
 
 
 def _balance_classes(model: UniadTiny, cells: Tensor, beginning: float) -> None:
-    """Move the class logits so that few queries become tracks, and of every class."""
+    """Shift the class logits so that few queries become tracks, of every class."""
     head, query = model.pts_bbox_head, model.query_embedding.weight[None]
     pos, content = query.chunk(2, 2)
     at = model.reference_points(pos).sigmoid()
@@ -185,7 +187,7 @@ def _balance_classes(model: UniadTiny, cells: Tensor, beginning: float) -> None:
 
 
 class _Occupancy(nn.Module):
-    """The occupancy head with some agents made up."""
+    """The occupancy head with some invented agents."""
 
     def __init__(self, model: UniadTiny, noise: torch.Generator) -> None:
         super().__init__()

@@ -8,9 +8,6 @@ from me2e_compress.zoo.bev.sizes import EMBED, FEED_FORWARD
 
 class TransformerLayer(nn.Module):
     """Self-attention, cross-attention, feed-forward, as ``nn.TransformerDecoderLayer``.
-
-    Args:
-        cross: Whether there is something to cross-attend to.
     """
 
     def __init__(self, *, cross: bool = True) -> None:
@@ -28,12 +25,9 @@ class TransformerLayer(nn.Module):
     def forward(
         self, x: Tensor, memory: Tensor | None = None, ignore: Tensor | None = None
     ) -> Tensor:
-        """Map [B, Q, 256], reading [B or 1, K, 256], to [B, Q, 256].
+        """Map [B, Q, 256], reading keys and values [B or 1, K, 256], to [B, Q, 256].
 
-        Args:
-            x: Queries.
-            memory: Keys, which are the values too.
-            ignore: [B, K] bool, true where a key must not be seen.
+        ``ignore`` is [B, K] bool, true where a key must not be seen.
         """
         x = self.norm1(x + self.self_attn(x, x, x))
         if self.cross:
@@ -44,7 +38,7 @@ class TransformerLayer(nn.Module):
 
 
 def mlp(*sizes: int) -> nn.Sequential:
-    """Build linear layers from size to size with ReLUs between them."""
+    """Build linear layers of the given sizes with ReLUs between them."""
     built = nn.Sequential()
     for index in range(len(sizes) - 1):
         if index:

@@ -19,11 +19,11 @@ from me2e_compress.zoo.uniad.positions import CellSines
 
 THING_BLOCKS, STUFF_BLOCKS = 4, 6
 LEVEL_EMBEDDINGS = 4
-"""Of which the first alone is read."""
+"""Level embeddings, of which only the first is read."""
 
 
 class CellLayer(nn.Module):
-    """Cells attend to cells around them, feed-forward."""
+    """Cells attend to cells around them, then feed-forward."""
 
     def __init__(self, hw: tuple[int, int], sampling: Sampling, levels: int) -> None:
         super().__init__()
@@ -32,7 +32,7 @@ class CellLayer(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(2))
 
     def forward(self, cells: Tensor, pos: Tensor, at: Tensor) -> Tensor:
-        """Map [1, cells, 256] to [1, cells, 256]; ``at`` are their places, 0..1."""
+        """Map [1, cells, 256] to [1, cells, 256]; ``at`` are their positions, 0..1."""
         cells = self.norms[0](self.attentions[0](cells, pos, cells, at))
         out: Tensor = self.norms[1](self.ffns[0](cells))
         return out
@@ -49,7 +49,7 @@ class CellEncoder(nn.Module):
         )
 
     def forward(self, cells: Tensor, pos: Tensor, at: Tensor) -> Tensor:
-        """Map [1, cells, 256] to the same; ``at`` are their places, 0..1."""
+        """Map [1, cells, 256] to the same; ``at`` are their positions, 0..1."""
         for layer in self.layers:
             cells = layer(cells, pos, at)
         return cells
@@ -94,8 +94,7 @@ class LaneDecoder(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Refine lanes: content and position, [1, lanes, 256], at points 0..1.
 
-        Returns:
-            Queries [1, lanes, 256] and boxes [1, lanes, 4] (cx, cy, w, h, 0..1).
+        Returns queries [1, lanes, 256] and boxes [1, lanes, 4] (cx, cy, w, h, 0..1).
         """
         query, pos = lanes
         layers = zip(self.layers, branches, strict=True)
@@ -111,7 +110,7 @@ class LaneDecoder(nn.Module):
 
 
 class MapTransformer(nn.Module):
-    """Cells to cells, and queries that read them (deformable DETR)."""
+    """A cell encoder, and lane queries that read its result (deformable DETR)."""
 
     def __init__(self, config: UniadConfig, sampling: Sampling, levels: int) -> None:
         super().__init__()
@@ -132,17 +131,10 @@ class MapTransformer(nn.Module):
     def forward(
         self, cells: Tensor, pos: Tensor, lanes: Tensor, branches: nn.ModuleList
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Decode lanes.
+        """Decode lanes [lanes, 512], position then content.
 
-        Args:
-            cells: [1, cells, 256].
-            pos: [1, cells, 256].
-            lanes: [lanes, 512], position then content.
-            branches: One regression branch a layer.
-
-        Returns:
-            Cells [1, cells, 256], lane queries [1, lanes, 256], boxes [1, lanes, 4]
-            (cx, cy, w, h, 0..1).
+        ``cells`` and ``pos`` are [1, cells, 256]. Returns cells, lane queries [1,
+        lanes, 256] and boxes [1, lanes, 4] (cx, cy, w, h, 0..1).
         """
         pos = pos + self.level_embeds[0]
         cells = self.encoder(cells, pos, self.places)
@@ -153,7 +145,7 @@ class MapTransformer(nn.Module):
 
 
 class Lanes(NamedTuple):
-    """What the map head finds."""
+    """The result of the map head."""
 
     query: Tensor  # [1, lanes, 256]
     pos: Tensor  # [1, lanes, 256]
@@ -163,14 +155,15 @@ class Lanes(NamedTuple):
 
 
 class MapHead(nn.Module):
-    """Lanes of the enlarged view.
+    """Finds lanes in the upsampled view.
 
     Args:
-        config: Sizes.
-        sampling: See `sample`.
-        dead: Hold what inference never reads: an embedding of the cells, the background
-            head, the branches of the mask heads, attention for three levels more.
-        trained: Hold that attention, read as it was trained (see `DecoderAttention`).
+        config: sizes.
+        sampling: see `sample`.
+        dead: hold weights that inference never reads: an embedding of the cells, the
+            background head, the branches of the mask heads, attention for three more
+            levels.
+        trained: hold that attention and use it as in training (see `DecoderAttention`).
     """
 
     def __init__(
@@ -206,7 +199,7 @@ class MapHead(nn.Module):
             )
 
     def forward(self, bev: Tensor) -> Lanes:
-        """Find lanes in the enlarged view, [1, cells, 256]."""
+        """Find lanes in the upsampled view, [1, cells, 256]."""
         lanes, pos = self.query_embedding.weight, self.positional_encoding()
         cells, query, boxes = self.transformer(bev, pos, lanes, self.reg_branches)
         lane_pos = lanes[None, :, :EMBED]

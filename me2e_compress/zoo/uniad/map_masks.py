@@ -1,4 +1,4 @@
-"""Masks of lanes, read off the attention of queries to cells (Panoptic SegFormer)."""
+"""Masks of lanes from the attention of queries to cells (Panoptic SegFormer)."""
 
 import torch
 from torch import Tensor, nn
@@ -10,7 +10,7 @@ MASK_FEED_FORWARD = 1024
 
 
 class MaskAttention(nn.Module):
-    """Queries attend to cells, and a mask is read off the attention."""
+    """Attention of queries to cells, from which a mask is computed."""
 
     def __init__(self, *, tail: bool = False) -> None:
         super().__init__()
@@ -29,7 +29,7 @@ class MaskAttention(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Map [1, Q, 256] and cells [1, K, 256] to [1, Q, 256] and masks [1, Q, K].
 
-        The last layer, the tail, gives its query back as it is.
+        The last layer, the tail, returns its query unchanged.
         """
         q, k = _heads(self.q(query)), _heads(self.k(key))
         logits = torch.matmul(q, k.transpose(-2, -1)) * HEAD_SCALE
@@ -70,7 +70,7 @@ class GeluFeedForward(nn.Module):
 
 
 class MaskBlock(nn.Module):
-    """`MaskAttention` and `GeluFeedForward`, normalised after each."""
+    """`MaskAttention` and `GeluFeedForward`, each normalised."""
 
     def __init__(self, *, self_attention: bool) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ class MaskBlock(nn.Module):
 
 
 class MaskHead(nn.Module):
-    """Queries to masks over the cells."""
+    """Maps queries to masks over the cells."""
 
     def __init__(self, blocks: int, *, self_attention: bool = False) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The motion head of UniAD: where the agents and the ego vehicle will go."""
+"""The motion head of UniAD: forecasts of the agents and the ego vehicle."""
 
 from typing import NamedTuple
 
@@ -20,11 +20,11 @@ TRACK_LAYERS = 6
 
 
 Goals = tuple[Tensor, Tensor, Tensor]
-"""A goal as the agent sees it, along the axes of the ego, and from the ego."""
+"""A goal in the agent's frame, along the axes of the ego, and from the ego."""
 
 
 class ModeIntent(NamedTuple):
-    """Where the modes of the agents are going, [A, 6, 256] each."""
+    """The intended goals of the agents' modes, [A, 6, 256] each."""
 
     static: Tensor  # what the anchors say, the same in all layers
     goals: Goals  # what the trajectories so far say
@@ -71,27 +71,26 @@ class MotionFormer(nn.Module):
         bev: Tensor,
         at: Tensor,
     ) -> Tensor:
-        """Let the modes of a layer read agents, lanes and the view.
+        """Let the modes [A, 6, 256] read agents, lanes and the view in one layer.
 
         Args:
-            layer: Which.
-            query: [A, 6, 256], of the layer before.
-            intent: Where the modes are going.
-            agents: Track queries [1, A, 256], their positions [1, A, 256], and where a
-                slot holds no agent [1, A] bool.
-            lanes: Lane queries with their positions, [1, lanes, 256].
-            bev: [1, cells, 256], the enlarged view.
+            layer: index of the layer.
+            query: [A, 6, 256], of the previous layer.
+            intent: goals of the modes.
+            agents: track queries [1, A, 256], their positions [1, A, 256], and [1, A]
+                bool, true where a slot holds no agent.
+            lanes: lane queries with their positions, [1, lanes, 256].
+            bev: [1, cells, 256], the upsampled view.
             at: [A, 6, 12, 2], the trajectories so far, metres, lidar frame.
-
-        Returns:
-            [A, 6, 256].
         """
+        # Fuse the goals into the query
         dynamic = self.dynamic_embed_fuser(torch.cat(intent.goals, -1))
         fused = self.static_dynamic_fuser(torch.cat([intent.static, dynamic], -1))
         query = self.in_query_fuser(torch.cat([query, fused], -1))
         track, track_pos, empty = agents
         pos = track_pos[0][:, None].expand_as(query)
         asked = query + pos
+        # Read agents, lanes and the view around the goal
         social = self.track_agent_interaction_layers[layer](
             asked, track + track_pos, empty
         )
@@ -109,7 +108,7 @@ def _repeat(layer: type[Wrapped]) -> nn.ModuleList:
 
 
 class Agents(NamedTuple):
-    """Tracks in their slots, the ego vehicle behind them."""
+    """Tracks in their slots, followed by the ego vehicle."""
 
     query: Tensor  # [1, A, 256]
     boxes: Tensor  # [A, 10], metres
@@ -118,7 +117,7 @@ class Agents(NamedTuple):
 
 
 class Forecasts(NamedTuple):
-    """Where agents will go."""
+    """The predicted motion of all agents."""
 
     trajectories: Tensor  # [3, 1, A, 6, 12, 5], metres from where the agent is
     scores: Tensor  # [3, 1, A, 6], logarithms of probabilities
@@ -127,12 +126,9 @@ class Forecasts(NamedTuple):
 
 
 class MotionHead(nn.Module):
-    """Anchors, embeddings, `MotionFormer`, branches.
+    """Anchors, embeddings, `MotionFormer` and its branches.
 
-    Args:
-        config: Sizes.
-        sampling: See `sample`.
-        dead: Hold ``layer_track_query_fuser``, which inference never reads.
+    ``dead`` holds ``layer_track_query_fuser``, which inference never reads.
     """
 
     def __init__(
@@ -171,11 +167,10 @@ class MotionHead(nn.Module):
     def forward(self, agents: Agents, lanes: Tensor, bev: Tensor) -> Forecasts:
         """Predict the motion of all agents in all modes.
 
-        Args:
-            agents: Tracks and the ego vehicle.
-            lanes: Lane queries with their positions, [1, lanes, 256].
-            bev: [1, cells, 256], the enlarged view.
+        ``lanes`` are lane queries with their positions, [1, lanes, 256]; ``bev`` [1,
+        cells, 256] is the upsampled view.
         """
+        # Anchors and positions in the frames of the agents
         frames = AgentFrames.of(agents.boxes)
         pos = self.boxes_query_embedding_layer(self.sines(agents.boxes[:, :2]))
         pos = pos.unsqueeze(0)
@@ -183,6 +178,7 @@ class MotionHead(nn.Module):
         anchor = self.kmeans_anchors[group]
         offsets = frames.turned(anchor)
         goals = self._goals(anchor, offsets, offsets + frames.centre)
+        # The static part of the intent
         learned = self.learnable_motion_query_embedding.weight
         learned = learned.unflatten(0, (-1, AGENT_MODES))[group]
         own = self.motionformer.intention_interaction_layers(goals[0])
@@ -191,6 +187,7 @@ class MotionHead(nn.Module):
         query = torch.zeros_like(static)
         read = agents.query, pos, agents.empty
         trajectories, scores = [], []
+        # Refine the trajectories layer by layer
         for layer in range(LAYERS):
             at = offsets + frames.centre
             intent = ModeIntent(static, goals)
@@ -210,7 +207,7 @@ class MotionHead(nn.Module):
         )
 
     def _goals(self, own: Tensor, offsets: Tensor, places: Tensor) -> Goals:
-        """Embed the last points of [A, 6, 12, 2], seen in three ways."""
+        """Embed the last points of [A, 6, 12, 2] in three frames."""
         return (
             self.agent_level_embedding_layer(self.sines(own[:, :, -1])),
             self.scene_level_offset_embedding_layer(self.sines(offsets[:, :, -1])),

@@ -1,4 +1,4 @@
-"""Where the motion head begins: six ways to go on, in the frame of an agent."""
+"""Motion anchors: six arcs in the frame of an agent."""
 
 from typing import NamedTuple, Self
 
@@ -10,19 +10,19 @@ from me2e_compress.zoo.uniad.config import AGENT_STEPS
 STEP_S = 0.5
 
 WAYS = ((0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (1.5, 0.0), (0.7, 0.4), (0.7, -0.4))
-"""Parts of a group's speed, and radians that are turned every second."""
+"""Fraction of a group's speed, and radians per second, for each arc."""
 
 SPEEDS_MPS = (8.0, 4.0, 1.5, 0.5)
-"""Of vehicles, bicycles, pedestrians and what else nuScenes has."""
+"""Speeds of vehicles, bicycles, pedestrians and nuScenes' other objects."""
 
 TINY = torch.tensor(1.0e-5)
 
 
 def anchors(groups: int) -> Tensor:
-    """Return [groups, 6, 12, 2], metres, the agent's frame, y ahead.
+    """Return [groups, 6, 12, 2], metres, in the agent's frame, y ahead.
 
     The published anchors are k-means centres of the data set's trajectories; they are
-    in no checkpoint, and these six arcs a group stand for them.
+    in no checkpoint, and six arcs per group replace them.
     """
     seconds = torch.arange(1, AGENT_STEPS + 1) * STEP_S
     ways = []
@@ -35,7 +35,7 @@ def anchors(groups: int) -> Tensor:
 
 
 class AgentFrames(NamedTuple):
-    """Where agents are and how they are turned, in the lidar frame."""
+    """Positions and orientations of agents in the lidar frame."""
 
     centre: Tensor  # [A, 1, 1, 2], metres
     cos: Tensor  # [A, 1, 1]
@@ -43,7 +43,8 @@ class AgentFrames(NamedTuple):
 
     @classmethod
     def of(cls, boxes: Tensor) -> Self:
-        """Read boxes [A, 10]. As in the original, an agent faces yaw - pi."""
+        """Return the frames of boxes [A, 10]. As in the original, an agent faces yaw - pi.
+        """
         sin, cos = boxes[:, 6:7], boxes[:, 7:8]
         length = torch.maximum((sin * sin + cos * cos).sqrt(), TINY)
         return cls(
@@ -53,7 +54,7 @@ class AgentFrames(NamedTuple):
         )
 
     def turned(self, points: Tensor) -> Tensor:
-        """Turn points [A, modes, steps, 2] of the agents to the axes of the lidar."""
+        """Rotate points [A, modes, steps, 2] of the agents to the axes of the lidar."""
         x, y = points[..., 0], points[..., 1]
         return torch.stack(
             [self.cos * x - self.sin * y, self.sin * x + self.cos * y], -1

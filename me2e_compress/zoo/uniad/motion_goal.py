@@ -1,4 +1,4 @@
-"""Modes of an agent read the view around the trajectory that they hold so far."""
+"""Attention of an agent's modes to the view around their trajectories."""
 
 import torch
 from torch import Tensor, nn
@@ -12,12 +12,10 @@ GOAL_POINTS = 4
 
 
 class GoalAttention(nn.Module):
-    """Four samples a head around each of the twelve points of a trajectory.
+    """Four samples per head around each of the twelve points of a trajectory.
 
-    Args:
-        grid: Whose metres the trajectory is in.
-        hw: Rows and columns of the enlarged view.
-        sampling: See `sample`.
+    ``grid`` defines the trajectory's metres; ``hw`` are the rows and columns of the
+    upsampled view.
     """
 
     def __init__(self, grid: BevGrid, hw: tuple[int, int], sampling: Sampling) -> None:
@@ -39,24 +37,20 @@ class GoalAttention(nn.Module):
     size_xy: Tensor
 
     def forward(self, query: Tensor, pos: Tensor, bev: Tensor, at: Tensor) -> Tensor:
-        """Attend.
+        """Map queries [1, Q, 256], one per agent and mode, to [1, Q, 256].
 
-        Args:
-            query: [1, Q, 256], one for every agent and mode.
-            pos: [1, Q, 256], added to the query.
-            bev: [1, cells, 256].
-            at: [1, Q, 12, 2], metres in the ego frame.
-
-        Returns:
-            [1, Q, 256], with the residual.
+        ``pos`` [1, Q, 256] is added to the query; ``bev`` is [1, cells, 256] and ``at``
+        [1, Q, 12, 2], metres in the ego frame. The residual is included.
         """
         asked = query + pos
         heads, steps, points = ATTENTION_HEADS, AGENT_STEPS, GOAL_POINTS
         value = self.value_proj(bev).unflatten(2, (heads, -1))
+        # Offsets and weights for every point of the trajectory
         offsets = self.sampling_offsets(asked)
         offsets = offsets.unflatten(2, (heads, steps, 1, points, 2))
         weights = self.attention_weights(asked).unflatten(2, (heads, steps, points))
         weights = weights.softmax(-1).unsqueeze(4)
+        # Sample the points, then join them
         places = ((at - self.low) / self.extent)[:, :, None, :, None, None]
         locations = places + offsets / self.size_xy
         read = deformable_attention(
@@ -72,7 +66,7 @@ class GoalAttention(nn.Module):
 
 
 class GoalLayer(nn.Module):
-    """`GoalAttention` and a feed-forward, normalised after each."""
+    """`GoalAttention` and a feed-forward, each normalised."""
 
     def __init__(self, grid: BevGrid, hw: tuple[int, int], sampling: Sampling) -> None:
         super().__init__()

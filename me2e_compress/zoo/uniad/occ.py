@@ -1,4 +1,4 @@
-"""The occupancy head of UniAD: which cells the agents will fill."""
+"""The occupancy head of UniAD: the cells that the agents will occupy."""
 
 import torch
 from torch import Tensor, nn
@@ -22,11 +22,11 @@ FUTURES = 5
 
 WIDE_FEED_FORWARD = 2048
 REACH = 0.5
-"""Cells of this probability and more belong to an instance."""
+"""Cells of at least this probability belong to an instance."""
 
 
 class StateAttention(nn.Module):
-    """`PackedAttention` with the residual, under the names of mmcv."""
+    """`PackedAttention` with a residual, under the names of mmcv."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -42,7 +42,7 @@ class StateAttention(nn.Module):
 
 
 class StateLayer(nn.Module):
-    """Cells attend to cells, then to the instances that are theirs."""
+    """Cells attend to cells, then to their own instances."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -59,7 +59,7 @@ class StateLayer(nn.Module):
 
 
 class WideFeedForward(nn.Module):
-    """Linear, ReLU, linear, residual, four times as wide as elsewhere."""
+    """Linear, ReLU, linear and residual, four times as wide as elsewhere."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class WideFeedForward(nn.Module):
 
 
 class StateDecoder(nn.Module):
-    """One `StateLayer` a step, and a normalisation that only the whole would apply."""
+    """One `StateLayer` per step, and a normalisation that is never applied here."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -105,12 +105,7 @@ class Layered(nn.Module):
 
 
 class OccHead(nn.Module):
-    """The view and the agents to the probability that a cell is taken.
-
-    Args:
-        config: Sizes.
-        sampling: See `sample`.
-    """
+    """Maps the view and the agents to occupancy probabilities of cells."""
 
     def __init__(self, config: UniadConfig, sampling: Sampling) -> None:
         super().__init__()
@@ -145,30 +140,35 @@ class OccHead(nn.Module):
     def forward(
         self, bev: Tensor, agents: Agents, motion: Forecasts, scores: Tensor
     ) -> Tensor:
-        """Predict the ground that the agents, without the ego, will take.
+        """Predict the occupancy by all agents except the ego.
 
         Args:
-            bev: [1, cells, 256], the enlarged view.
-            agents: A of them and the ego.
-            motion: Of the same.
-            scores: [A], of the tracks. What is empty or no vehicle takes no ground.
+            bev: [1, cells, 256], the upsampled view.
+            agents: A agents and the ego.
+            motion: of the same agents.
+            scores: [A], of the tracks; empty slots and other classes than vehicles
+                occupy nothing.
 
         Returns:
-            [1, 5, rows, columns], probabilities times the score of who takes the cell.
+            [1, 5, rows, columns], probabilities times the score of the occupying track.
         """
+        # Which tracks are no vehicles
         state = self.base_downscale(self.bev_light_proj(self.bev_sampler(bev)))
         hidden = agents.empty[:, :-1] | torch.logical_not(
             self.is_vehicle[agents.labels[:-1]]
         )
+        # One query per agent
         instances = self.mode_fuser(motion.modes[:, :-1]).amax(2)
         parts = [instances, agents.query[:, :-1], motion.pos[:, :-1]]
         instances = self.multi_query_fuser(torch.cat(parts, -1))
         states, embeddings = [], []
+        # Advance the state step by step
         for step in range(FUTURES):
             asked = self.temporal_mlps[step](instances)
             state, embedding = self._step(step, state, asked, hidden)
             states.append(state)
             embeddings.append(embedding)
+        # Occupancy is the product of masks and dense features
         dense = self.dense_decoder(torch.cat(states))
         dense = dense[:, :, : self.hw[0], : self.hw[1]].flatten(2)
         masks = self.query_to_occ_feat(torch.cat(embeddings))
@@ -185,6 +185,7 @@ class OccHead(nn.Module):
         small = self.downscale_convs[step](state)
         embedding = self.temporal_mlp_for_mask(asked)
         cells = small.flatten(2).transpose(1, 2)
+        # Cells attend only to instances whose mask holds them
         mine = torch.matmul(cells, embedding.transpose(1, 2)).sigmoid() >= REACH
         mine = mine & torch.logical_not(hidden).unsqueeze(1)
         ignore = torch.logical_not(mine) & mine.any(2, keepdim=True)

@@ -1,4 +1,4 @@
-"""Convolutions of the occupancy head, and the area that it cuts out of the view."""
+"""Convolutions of the occupancy head, and the area that it samples from the view."""
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +22,7 @@ def halved(hw: Size) -> Size:
 class AreaSampler(nn.Module):
     """The square of 100 m around the vehicle, in as many cells as the view has.
 
-    As in the original, the outermost cells of the view lie on the edge of its range.
+    As in the original, the centres of the outermost cells lie on the edge of its range.
     """
 
     def __init__(self, grid: BevGrid, hw: Size, sampling: Sampling) -> None:
@@ -46,12 +46,12 @@ class AreaSampler(nn.Module):
 
 
 def convolution(channels: int, out: int, kernel: int, stride: int = 1) -> nn.Conv2d:
-    """Build a convolution that a normalisation follows."""
+    """Build a convolution that is followed by a normalisation."""
     return nn.Conv2d(channels, out, kernel, stride, kernel // 2, bias=False)
 
 
 class NormalisedConv(nn.Module):
-    """Convolution, normalisation, ReLU under the names of the published weights."""
+    """Convolution, normalisation and ReLU, with the published names."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class LightProjection(nn.Module):
 
 
 class Downscale(nn.Module):
-    """A bottleneck that halves rows and columns, of which odd ones are rounded up."""
+    """A bottleneck that halves rows and columns, rounded up."""
 
     def __init__(self, hw: Size) -> None:
         super().__init__()
@@ -107,7 +107,7 @@ class Downscale(nn.Module):
 
 
 class UpsamplingAdd(nn.Module):
-    """Twice the rows and columns, projected, and what stood there before."""
+    """Doubles rows and columns, projects, and adds the earlier state."""
 
     def __init__(self, hw: Size) -> None:
         super().__init__()
@@ -124,7 +124,7 @@ class UpsamplingAdd(nn.Module):
 
 
 class DecoderBlock(nn.Module):
-    """Twice the rows and columns, with the state as it came in added."""
+    """Doubles rows and columns and adds the original state."""
 
     def __init__(self, hw: Size, *, last: bool) -> None:
         super().__init__()
@@ -150,7 +150,7 @@ class DecoderBlock(nn.Module):
 
 
 class DenseDecoder(nn.Module):
-    """States to four times their rows and columns."""
+    """Quadruples the rows and columns of states."""
 
     def __init__(self, hw: Size) -> None:
         super().__init__()

@@ -29,7 +29,7 @@ PAST_STEPS = 8
 
 
 class Motions(NamedTuple):
-    """What the vehicle says of itself and of the last frame."""
+    """The vehicle's motion and the previous view."""
 
     lidar2img: Tensor  # [1, cameras, 4, 4]
     can_bus: Tensor  # [18]
@@ -45,7 +45,7 @@ class Queries(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What the track decoder gives."""
+    """The result of the track decoder."""
 
     bev: Tensor  # [1, cells, 256]
     bev_pos: Tensor  # [1, cells, 256]
@@ -79,6 +79,7 @@ class TrackTransformer(nn.Module):
         self, levels: list[Tensor], query: Tensor, pos: Tensor, motions: Motions
     ) -> Tensor:
         """Encode levels [cameras, 256, h, w] to [1, cells, 256]."""
+        # Tokens of all cameras and levels
         tokens = torch.cat(
             [
                 level.flatten(2).transpose(1, 2)
@@ -88,6 +89,7 @@ class TrackTransformer(nn.Module):
             ],
             1,
         )
+        # The previous view, turned to the current heading
         lidar2img, can_bus, prev_bev = motions
         first = torch.logical_not(torch.any(prev_bev != 0))
         previous = turn(prev_bev, can_bus, self.cells, self.grid, self.sampling)
@@ -106,17 +108,10 @@ class TrackTransformer(nn.Module):
         queries: Queries,
         branches: nn.ModuleList,
     ) -> tuple[Tensor, tuple[list[Tensor], ...]]:
-        """Encode, then decode.
+        """Encode levels [cameras, 256, h, w], then decode the track queries.
 
-        Args:
-            levels: Of features, [cameras, 256, h, w] each.
-            cells: BEV queries and their positions, [1, cells, 256] each.
-            motions: Of the vehicle.
-            queries: Of tracks.
-            branches: One regression branch a layer.
-
-        Returns:
-            BEV [1, cells, 256] and what `Decoder` returns.
+        ``cells`` are BEV queries and their positions, [1, cells, 256] each. Returns the
+        BEV [1, cells, 256] and the result of `Decoder`.
         """
         with region("bev_encoder"):
             bev = self.bev(levels, *cells, motions)
@@ -157,7 +152,7 @@ class TrackHead(nn.Module):
     def forward(
         self, levels: list[Tensor], motions: Motions, queries: Queries
     ) -> Found:
-        """See the view and find what the queries ask for."""
+        """Encode the view and decode the queries."""
         with region("bev_encoder"):
             pos = self.positional_encoding()
             cells = self.bev_embedding.weight.unsqueeze(0), pos

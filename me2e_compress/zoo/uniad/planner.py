@@ -1,4 +1,4 @@
-"""The planning head of UniAD: where the ego vehicle will go."""
+"""The planning head of UniAD: the path of the ego vehicle."""
 
 import torch
 from torch import Tensor, nn
@@ -26,7 +26,7 @@ class PlannerDecoder(nn.Module):
 
 
 class PlanningHead(nn.Module):
-    """One query a frame, made of the ego's track, its motion and the command."""
+    """Plans with one query, made of the ego's track, its motion and the command."""
 
     def __init__(self, hw: tuple[int, int], commands: int) -> None:
         super().__init__()
@@ -55,22 +55,21 @@ class PlanningHead(nn.Module):
         bev: Tensor,
         bev_pos: Tensor,
     ) -> Tensor:
-        """Plan.
+        """Plan [1, 6, 2], metres in the lidar frame, every 0.5 s.
 
         Args:
             modes: [1, 6, 256], the ego's queries of the last motion layer.
             track: [1, 256], the ego's track query.
             command: [1] int64.
-            bev: [1, cells, 256], the enlarged view.
+            bev: [1, cells, 256], the upsampled view.
             bev_pos: [1, cells, 256].
-
-        Returns:
-            [1, 6, 2], metres in the lidar frame, every 0.5 s.
         """
+        # Fuse command, track and modes into one query
         told = self.navi_embed(command).unsqueeze(1).expand_as(modes)
         known = track.unsqueeze(1).expand_as(modes)
         fused = self.mlp_fuser(torch.cat([modes, known, told], -1))
         query = fused.amax(1, keepdim=True) + self.pos_embed.weight
+        # Adapt the view, then decode
         memory = bev + bev_pos
         image = memory.transpose(1, 2).unflatten(2, self.hw)
         memory = (image + self.bev_adapter(image)).flatten(2).transpose(1, 2)

@@ -9,7 +9,7 @@ from me2e_compress.zoo.bev.sizes import EMBED
 
 TEMPERATURE = 10_000.0
 HALF = EMBED // 2
-"""Numbers that say one coordinate."""
+"""Size of the embedding of one coordinate."""
 
 
 def _divisors() -> Tensor:
@@ -18,17 +18,13 @@ def _divisors() -> Tensor:
 
 
 def _waves(at: Tensor, divisors: Tensor) -> Tensor:
-    """Map coordinates [...] in 0..2 pi to sine and cosine in turn, [..., 128]."""
+    """Map coordinates [...] in 0..2 pi to alternating sine and cosine, [..., 128]."""
     angles = at.unsqueeze(-1) / divisors
     return torch.stack([angles.sin(), angles.cos()], -1).flatten(-2)
 
 
 class CellSines(nn.Module):
-    """A fixed embedding of a row and a column (DETR, offset by half a cell).
-
-    Args:
-        hw: Rows and columns.
-    """
+    """A fixed embedding of rows and columns (DETR, offset by half a cell)."""
 
     def __init__(self, hw: tuple[int, int]) -> None:
         super().__init__()
@@ -50,11 +46,7 @@ class CellSines(nn.Module):
 
 
 class PointSines(nn.Module):
-    """Points in metres to an embedding.
-
-    Args:
-        pc_range: x, y, z minima then maxima in metres.
-    """
+    """Embeds points in metres; ``pc_range`` is x, y, z minima then maxima."""
 
     def __init__(self, pc_range: tuple[float, ...]) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The whole of UniAD-tiny."""
+"""The whole UniAD-tiny model."""
 
 from typing import NamedTuple
 
@@ -28,7 +28,7 @@ from me2e_compress.zoo.uniad.tracking import MemoryBank, QueryInteraction
 
 
 class CameraTrunk(ResNet):
-    """ResNet-50 to the feature maps that the neck reads."""
+    """ResNet-50 up to the feature maps that the neck reads."""
 
     def __init__(self, stem: int, stages: tuple[int, ...]) -> None:
         super().__init__(Bottleneck, BLOCKS, stem)
@@ -42,7 +42,7 @@ class CameraTrunk(ResNet):
 
 
 class Seen(NamedTuple):
-    """Tracks of this frame in their slots, and the ego vehicle behind them."""
+    """Tracks of this frame in their slots, followed by the ego vehicle."""
 
     agents: Agents
     boxes: Tensor  # [slots, 10], metres
@@ -51,21 +51,21 @@ class Seen(NamedTuple):
 
 
 class UniadTiny(nn.Module):
-    """Cameras, ego motion and the tracks so far to tracks, map, forecasts and a plan.
+    """Maps cameras, ego motion and tracks to tracks, map, forecasts and a plan.
 
-    Hu et al. 2023, written from the published description, at the published dimensions
-    and with the parameter names of the original. What differs is what a graph of fixed
-    shapes asks for: camera attention reads every camera for every cell and masks;
-    tracks stand in slots, of which the empty ones are masked (see `TrackLife`); all
-    agents keep their slot in motion and occupancy, where the original gathers those
-    that it sees. The host's: which earlier view is fed as the previous one, the
-    threshold of occupancy and the optimisation of the plan against it.
+    Hu et al. 2023, written from the published description, with the published
+    dimensions and the original's parameter names. Fixed shapes require some
+    differences: camera attention reads every camera for every cell and masks; tracks
+    are in slots, of which the empty ones are masked (see `TrackLife`); all agents keep
+    their slot in motion and occupancy, where the original gathers the visible ones. The
+    host chooses which earlier view is fed back, the threshold of occupancy, and
+    optimises the plan against it.
 
     Args:
-        config: Sizes.
-        sampling: See `sample`.
-        dead: Hold the weights that inference never reads, as the published file does.
-        trained: Have the map head's attention as weights of the published file need it.
+        config: sizes.
+        sampling: see `sample`.
+        dead: hold the weights that inference never reads, as the published file does.
+        trained: build the map head's attention for the weights of the published file.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class UniadTiny(nn.Module):
         prev_timestamp: Tensor,
         *prev_tracks: Tensor,
     ) -> tuple[Tensor, ...]:
-        """Drive one frame.
+        """Process one frame.
 
         Args:
             img: [1, 6, 3, rows, columns] float32, normalised.
@@ -117,18 +117,19 @@ class UniadTiny(nn.Module):
             can_bus: [18] float32.
             command: [1] int64, of the navigator.
             l2g_r_mat: [1, 3, 3] float32, rows are the lidar's axes in the world.
-            l2g_t: [1, 3] float32, metres: where the lidar is.
-            timestamp: [1] float32, seconds; from any beginning, so that they are small.
-            prev_bev: [cells, 1, 256] float32; all zeros at the start of a scene, as
-                all that is remembered.
-            prev_l2g_r_mat: Of the last frame, as are the next two.
+            l2g_t: [1, 3] float32, metres: position of the lidar.
+            timestamp: [1] float32, seconds since any start, so that they are small.
+            prev_bev: [cells, 1, 256] float32; this and all other recurrent inputs are
+                zeros at the start of a scene.
+            prev_l2g_r_mat: of the last frame, like the next two.
             prev_l2g_t: [1, 3].
             prev_timestamp: [1].
-            prev_tracks: The fields of `TrackSlots`.
+            prev_tracks: the fields of `TrackSlots`.
 
         Returns:
-            The answers to all that is remembered, then the other outputs of the stack.
+            The outputs for all recurrent inputs, then the other outputs of the stack.
         """
+        # Images to features
         before = LidarPose(prev_l2g_r_mat, prev_l2g_t, prev_timestamp)
         tracks = TrackSlots(*prev_tracks)
         now = LidarPose(l2g_r_mat, l2g_t, timestamp)
@@ -138,12 +139,14 @@ class UniadTiny(nn.Module):
             levels = self.img_neck(stages)
         with region("track"):
             queries = self._queries(tracks, before, now)
+        # View and tracks
         motions = Motions(lidar2img, can_bus, prev_bev)
         found = self.pts_bbox_head(levels, motions, queries)
         with region("track"):
             seen, kept = self._track(found, queries.query, tracks)
         with region("bev_encoder"):
             bev, bev_pos = self.enlarged(found.bev), self.enlarged(found.bev_pos)
+        # Map, motion, occupancy and plan
         with region("map"):
             lanes = self.seg_head(bev)
         with region("motion"):
@@ -178,7 +181,7 @@ class UniadTiny(nn.Module):
         )
 
     def enlarged(self, cells: Tensor) -> Tensor:
-        """Map [1, cells, 256] to what the heads behind tracking see."""
+        """Upsample [1, cells, 256] for the heads after tracking."""
         if self.config.upsampled == 1:
             return cells
         image = cells.transpose(1, 2).unflatten(2, self.config.grid.hw)
@@ -188,7 +191,8 @@ class UniadTiny(nn.Module):
     def _queries(
         self, tracks: TrackSlots, before: LidarPose, now: LidarPose
     ) -> Queries:
-        """Return new queries, the last of them the ego's, and the tracks' behind."""
+        """Return the new queries, the last of them the ego's, then those of the tracks.
+        """
         new = self.query_embedding.weight
         at = self.reference_points(new[:, :EMBED])
         carried = self.velo_update(tracks.ref_pts, tracks.velocity, before, now)
@@ -202,10 +206,11 @@ class UniadTiny(nn.Module):
     def _track(
         self, found: Found, query: Tensor, before: TrackSlots
     ) -> tuple[Seen, TrackSlots]:
-        """Decide what is tracked, and make the queries of the next frame."""
+        """Update the tracks and make the queries of the next frame."""
         new = self.config.queries
         last, boxes = found.scores[-1, 0], found.boxes[-1, 0]
         scores, labels = last.sigmoid().amax(1), last.argmax(1)
+        # Which queries are tracks now, and where their history is
         lives = self.track_base(scores, before)
         chosen, ids = lives.chosen, lives.obj_idxes
         seen = self._seen(found, chosen, ids, (boxes, scores, labels))
@@ -214,6 +219,7 @@ class UniadTiny(nn.Module):
         kept = old.to(scores.dtype)
         period = before.save_period[place] * old
         due = (period == 0) & (ids > 0)
+        # Update the memory and the time to the next save
         track, bank, held = self.memory_bank(
             found.embeddings[chosen],
             before.mem_bank[place],
@@ -242,7 +248,7 @@ class UniadTiny(nn.Module):
         ids: Tensor,
         of_all: tuple[Tensor, Tensor, Tensor],
     ) -> Seen:
-        """Return what the heads behind tracking read: slots, then the ego vehicle."""
+        """Return the input of the heads after tracking: slots, then the ego vehicle."""
         boxes, scores, labels = of_all
         behind = self.config.queries
         ego = behind - 1

@@ -1,8 +1,8 @@
-"""When a track begins, sleeps and ends, in a fixed number of slots.
+"""Begin, hide and end tracks in a fixed number of slots.
 
-The original keeps a list of tracks that grows and shrinks between frames, on the host.
-Here a list is so many slots, of which the empty ones, those without an id, are seen by
-nobody. All of it is one graph, and no shape depends on the data.
+The original keeps a list of tracks on the host that grows and shrinks between frames.
+Here a list has a fixed number of slots; empty ones, without an id, are masked. All of
+it is one graph, and no shape depends on the data.
 """
 
 from typing import NamedTuple
@@ -14,21 +14,21 @@ from me2e_compress.zoo.bev.decoder import inverse_sigmoid, precise_sigmoid
 from me2e_compress.zoo.uniad.config import UniadConfig
 
 BEGINS = torch.tensor(0.4)
-"""Score from which a query becomes a track."""
+"""Least score of a new track."""
 
 SLEEPS = torch.tensor(0.35)
-"""Score below which a track is not seen."""
+"""Score below which a track is hidden."""
 
 PATIENCE = 5
 """Frames out of sight after which a track ends. All three: UniAD's tracker. Tensors:
 the exporter would write a Python number as float64."""
 
 SAVE_PERIOD = 3
-"""Frames between two embeddings that the memory keeps."""
+"""Frames between two embeddings in the memory."""
 
 
 class TrackSlots(NamedTuple):
-    """Slots for tracks, from frame to frame; all zeros hold none."""
+    """Slots for tracks, from frame to frame; all zeros are empty."""
 
     query: Tensor  # [slots, 512], position then content
     ref_pts: Tensor  # [slots, 3], logits of x y z as parts of the range
@@ -42,7 +42,7 @@ class TrackSlots(NamedTuple):
 
 
 class Lives(NamedTuple):
-    """Which queries are tracks, of a frame."""
+    """Which queries of a frame are tracks."""
 
     chosen: Tensor  # [slots] int64: the query that each slot takes
     obj_idxes: Tensor  # [slots] int64, 0 for none
@@ -51,7 +51,7 @@ class Lives(NamedTuple):
 
 
 class LidarPose(NamedTuple):
-    """Where the lidar frame is, and when."""
+    """The pose of the lidar, and its time."""
 
     rotation: Tensor  # [1, 3, 3]: rows are the axes of the lidar frame in the world
     position: Tensor  # [1, 3], metres
@@ -59,11 +59,10 @@ class LidarPose(NamedTuple):
 
 
 class TrackLife(nn.Module):
-    """Decide which of the frame's queries are tracks, and give every track a slot.
+    """Decides which of the frame's queries are tracks, and assigns their slots.
 
-    Queries come new ones first, then slots. A track keeps its place before all that
-    are new; new ones take what is free in their order, and those that find no slot are
-    forgotten.
+    Queries are the new ones first, then slots. Tracks keep their order and come before
+    new ones, which take the free slots in order; those without a slot are dropped.
     """
 
     def __init__(self, config: UniadConfig) -> None:
@@ -83,19 +82,22 @@ class TrackLife(nn.Module):
     may_begin: Tensor
 
     def forward(self, scores: Tensor, before: TrackSlots) -> Lives:
-        """Map scores [queries] and the slots of the last frame to those of this."""
+        """Map scores [queries] and the slots of the last frame to those of this one."""
         ids = torch.cat([self.none, before.obj_idxes])
         missed = torch.cat([self.none, before.disappear_time])
+        # New tracks get the next ids
         seen = scores >= BEGINS
         begins = (seen & self.may_begin).to(torch.int64)
         # TensorRT adds up in float alone; numbers of queries are exact there
         nth = begins.to(self.rank.dtype).cumsum(0).to(torch.int64)
         ids = ids + begins * (before.max_obj_id + nth)
+        # Tracks out of sight for too long end
         unseen = (ids > 0) & (scores < SLEEPS)
         missed = missed * torch.logical_not(seen).to(torch.int64)
         missed = missed + unseen.to(torch.int64)
         ids = ids * (missed < PATIENCE).to(torch.int64)
         missed = missed * (ids > 0).to(torch.int64)
+        # Fill the slots: old tracks first
         urgency = self.rank + self.places * (ids > 0).to(self.rank.dtype)
         chosen = torch.topk(urgency, self.slots).indices
         newest = before.max_obj_id + begins.sum(0, keepdim=True)
@@ -103,7 +105,8 @@ class TrackLife(nn.Module):
 
 
 class VelocityUpdate(nn.Module):
-    """Carry reference points on to the present: their own motion, and the vehicle's."""
+    """Moves reference points to the current frame, by their velocity and the ego motion.
+    """
 
     def __init__(self, pc_range: tuple[float, ...]) -> None:
         super().__init__()
@@ -117,9 +120,9 @@ class VelocityUpdate(nn.Module):
     def forward(
         self, ref_pts: Tensor, velocity: Tensor, before: LidarPose, now: LidarPose
     ) -> Tensor:
-        """Map logits [slots, 3] and metres a second [slots, 2] to logits [slots, 3].
+        """Map logits [slots, 3] and metres per second [slots, 2] to logits [slots, 3].
 
-        The world turns back by the transpose, which of a rotation is the inverse.
+        The world rotates back by the transpose, which is a rotation's inverse.
         """
         points = precise_sigmoid(ref_pts) * self.extent + self.low
         seconds = now.seconds - before.seconds

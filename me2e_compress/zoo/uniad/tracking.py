@@ -1,4 +1,4 @@
-"""What UniAD keeps of a track between frames: its memory and its next query."""
+"""UniAD's state of a track between frames: its memory and its next query."""
 
 import torch
 from torch import Tensor, nn
@@ -8,7 +8,7 @@ from me2e_compress.zoo.bev.sizes import EMBED
 
 
 class MemoryBank(nn.Module):
-    """A track attends to its own past, and what is due is remembered."""
+    """A track attends to its own past, and the memory is updated when due."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -22,24 +22,23 @@ class MemoryBank(nn.Module):
     def forward(
         self, track: Tensor, bank: Tensor, held: Tensor, due: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Recall, then remember.
+        """Return tracks [tracks, 256], and ``bank`` and ``held`` of the next frame.
 
         Args:
             track: [tracks, 256].
             bank: [tracks, 4, 256], the newest last.
-            held: [tracks, 4] float32, 1 where an entry of the bank holds something. A
-                track whose newest entry holds nothing stays as it is.
-            due: [tracks] bool: the oldest entry goes and a new one comes.
-
-        Returns:
-            Tracks [tracks, 256], bank and ``held`` of the next frame.
+            held: [tracks, 4] float32, 1 where an entry of the bank is set. A track
+                whose newest entry is empty stays unchanged.
+            due: [tracks] bool: a new entry replaces the oldest.
         """
+        # Recall: mix the track with its past
         empty = held < 1
         recalled = self.temporal_attn(track[:, None], bank, bank, empty)[:, 0]
         mixed = self.temporal_norm1(track + recalled)
         changed = self.temporal_fc2(self.temporal_fc1(mixed).relu())
         mixed = self.temporal_norm2(mixed + changed)
         track = torch.where(empty[:, -1:], track, mixed)
+        # Remember: shift the bank where it is due
         newer = torch.cat([bank[:, 1:], self.save_proj(track)[:, None]], 1)
         fuller = torch.cat([held[:, 1:], torch.ones_like(held[:, :1])], 1)
         bank = torch.where(due[:, None, None], newer, bank)
@@ -64,15 +63,9 @@ class QueryInteraction(nn.Module):
         self.norm2 = nn.LayerNorm(EMBED)
 
     def forward(self, query: Tensor, track: Tensor, ignore: Tensor) -> Tensor:
-        """Update.
+        """Update queries [1, tracks, 512], position then content, by tracks [1, tracks, 256].
 
-        Args:
-            query: [1, tracks, 512], position then content.
-            track: [1, tracks, 256].
-            ignore: [1, tracks] bool, true where a slot holds no track.
-
-        Returns:
-            [1, tracks, 512].
+        ``ignore`` is [1, tracks] bool, true where a slot holds no track.
         """
         pos, content = query.chunk(2, 2)
         asked = pos + track

@@ -10,15 +10,15 @@ HeadsName = Literal["nuscenes", "bench2drive"]
 RANGE = (-15.0, -30.0, -2.0, 15.0, 30.0, 2.0)
 
 GRID = BevGrid((100, 100), RANGE, (100.0, 100.0))
-"""The previous BEV turns about the centre of the 200 x 200 base model, which all public
-tiny models keep although it is the corner of their 100 x 100 grid."""
+"""The previous BEV rotates about the centre of the 200 x 200 base model, which all
+public tiny models keep although it is the corner of their 100 x 100 grid."""
 
 LAYERS = 3
-"""Of the BEV encoder, of the detection decoder and of the map decoder."""
+"""Layers of the BEV encoder, the detection decoder and the map decoder each."""
 
 AGENT_MODES = 6
 STEPS = 6
-"""Of 0.5 s, for the agents and for the ego vehicle."""
+"""Steps of 0.5 s, for the agents and for the ego vehicle."""
 
 MAP_SCORE = 0.5
 """A map vector is kept for motion above this probability."""
@@ -29,15 +29,15 @@ MAP_REACH = 0.2
 
 @dataclass(frozen=True)
 class VadConfig:
-    """Sizes; the defaults are the published ones.
+    """Sizes of VAD; the defaults are the published ones.
 
     Attributes:
-        image_hw: Pixels: 0.4 of 900 x 1600, padded to a multiple of 32.
-        stem: Channels of the first stage of the backbone.
-        grid: Cells of the bird's eye view.
-        agents: Queries of the detection decoder.
-        vectors: Of the map.
-        vector_points: Of a map vector.
+        image_hw: pixels: 0.4 of 900 x 1600, padded to a multiple of 32.
+        stem: channels of the first stage of the backbone.
+        grid: cells of the bird's eye view.
+        agents: queries of the detection decoder.
+        vectors: number of map vectors.
+        vector_points: points per map vector.
     """
 
     image_hw: tuple[int, int] = (384, 640)
@@ -59,7 +59,7 @@ PUBLISHED = VadConfig()
 
 @dataclass(frozen=True)
 class Heads:
-    """What differs between the data sets: the sizes of the last layers."""
+    """The sizes of the last layers, which differ between data sets."""
 
     det_classes: int
     map_classes: int

@@ -1,12 +1,12 @@
-"""Weights from a seed, shaped so that the untrained network reacts to its input.
+"""Draw weights from a seed so that the untrained network reacts to its input.
 
-A network drawn at random forgets its input on the way: activations of different images
+A network drawn at random loses its input on the way: activations of different images
 share a large common part, averages over hundreds of keys cancel, and the plan hardly
-moves when a camera changes. So statistics of the backbone and of the neck are taken
-from rendered frames, residual branches that carry information are stronger than what
-they are added to, and the weights of a linear layer sum to zero, which cancels the
-common part that a ReLU leaves. No two tensors are equal and none is constant, as in a
-trained model: an exporter merges equal ones.
+changes with a camera. So the statistics of backbone and neck are taken from rendered
+frames, residual branches that carry information are stronger than their shortcuts, and
+the weights of a linear layer sum to zero, which cancels the common part that a ReLU
+leaves. No two tensors are equal and none is constant, as in a trained model: an
+exporter merges equal ones.
 """
 
 from collections.abc import Iterator
@@ -49,10 +49,7 @@ CALIBRATION_STRIDE = 2
 def initialise(model: VadTiny, images: Tensor, seed: int) -> None:
     """Draw all parameters, then the statistics of the image branch, in place.
 
-    Args:
-        model: Of any size.
-        images: [N, 3, H, W], normalised.
-        seed: Of the parameters.
+    ``images`` are [N, 3, H, W], normalised.
     """
     draw_weights(model, Gains(GAINS, last_norm=r"bn3\.weight$"), seed)
     with one_thread():
@@ -60,13 +57,7 @@ def initialise(model: VadTiny, images: Tensor, seed: int) -> None:
 
 
 def rendered(spec: Stack, seed: int, step: int = 1) -> Tensor:
-    """Return images of several scenes, [N, 3, H, W], every `step`-th of their pixels.
-
-    Args:
-        spec: Whose cameras see them.
-        seed: Of the scenes.
-        step: 1 for all pixels.
-    """
+    """Return images of several scenes, [N, 3, H, W], with every ``step``-th pixel."""
     return torch.cat(
         [
             torch.from_numpy(frame["img"])[0, :, :, ::step, ::step]
@@ -76,7 +67,6 @@ def rendered(spec: Stack, seed: int, step: int = 1) -> Tensor:
 
 
 def _calibrate(model: VadTiny, images: Tensor) -> None:
-    """Take normalisation statistics from images."""
     features = take_statistics(model.img_backbone, images)
     for conv in _convolutions(model.img_neck):
         out = conv(features)

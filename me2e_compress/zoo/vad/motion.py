@@ -1,4 +1,4 @@
-"""The motion part of the head: where the agents will go."""
+"""The motion part of the head: forecasts of the agents."""
 
 from typing import NamedTuple
 
@@ -48,7 +48,7 @@ class PointMlp(nn.Module):
 
 
 class LaneNet(nn.Module):
-    """The points of a vector to one query (VectorNet's sub-graph)."""
+    """Maps the points of a vector to one query (VectorNet's sub-graph)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -68,8 +68,8 @@ class LaneNet(nn.Module):
 def nearest_points(points: Tensor) -> Tensor:
     """Return the point of each vector nearest to the origin: [1, V, 2].
 
-    As in the original, the points are normalised, so their origin is a corner of
-    the grid and not the ego vehicle.
+    As in the original, the points are normalised: the origin is a corner of the grid
+    and not the ego vehicle.
     """
     index = points.square().sum(-1).argmin(-1, keepdim=True)
     return points.gather(2, index.unsqueeze(-1).expand(-1, -1, -1, 2)).squeeze(2)
@@ -90,7 +90,8 @@ class MotionHead(PerceptionHead):
         self.traj_cls_branches = nn.ModuleList([classifier(1, 2 * EMBED)])
 
     def lanes(self, vectors: MapOutputs) -> tuple[Tensor, Tensor]:
-        """Return one query [1, 100, 256] and one position [1, 100, 2] a map vector."""
+        """Return one query [1, 100, 256] and one position [1, 100, 2] per map vector.
+        """
         with region("map"):
             return self.lane_encoder(vectors.queries), nearest_points(
                 vectors.points[-1]
@@ -127,10 +128,11 @@ class MotionHead(PerceptionHead):
     ) -> Tensor:
         """Let each agent-mode attend to the likely map vectors near it.
 
-        The original gathers the vectors that pass; here all of them stay, and those
-        that do not pass are masked, which gives the same attention at fixed shapes.
-        One empty vector can always be attended to.
+        The original gathers these vectors; here all of them stay and the others are
+        masked, which gives the same attention at fixed shapes. One empty vector is
+        always visible.
         """
+        # Mask unlikely and distant vectors
         lane_query, lane_at = lanes
         unlikely = vectors.scores[-1].sigmoid().amax(-1) <= MAP_SCORE
         offset = lane_at.unsqueeze(1) - centres.unsqueeze(2)
@@ -138,6 +140,7 @@ class MotionHead(PerceptionHead):
         ignore = torch.logical_or(far, unlikely.unsqueeze(1))[0]
         ignore = _append_zero(ignore)
         offset = _append_zero(offset[0])
+        # Attend, one batch entry per agent-mode
         key = _append_zero(lane_query)
         query = query.transpose(0, 1)
         key_pos = self.pos_mlp(offset)

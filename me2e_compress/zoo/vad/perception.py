@@ -86,6 +86,7 @@ class PerceptionHead(nn.Module):
                 self.map_instance_embedding.weight.unsqueeze(1)
                 + self.map_pts_embedding.weight.unsqueeze(0)
             ).flatten(0, 1)
+        # Encode and decode; then the branches
         bev, found, mapped = self.transformer(
             features,
             cells,

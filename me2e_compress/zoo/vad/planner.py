@@ -1,4 +1,4 @@
-"""The planning part of the head: where the ego vehicle will go."""
+"""The planning part of the head: the path of the ego vehicle."""
 
 import torch
 from torch import Tensor, nn
@@ -57,7 +57,7 @@ class PlanningHead(MotionHead):
     def plan(
         self, agents: AgentOutputs, motion: MotionOutputs, lanes: tuple[Tensor, Tensor]
     ) -> Tensor:
-        """Return [1, modes, 6, 2]: metres a step of 0.5 s, for every command."""
+        """Return [1, modes, 6, 2]: metres per step of 0.5 s, for every command."""
         with region("planner"):
             lane_query, lane_at = lanes
             ego = self.ego_query.weight.unsqueeze(0)

@@ -1,4 +1,4 @@
-"""The whole of VAD-tiny."""
+"""The whole VAD-tiny model."""
 
 from torch import Tensor, nn
 
@@ -11,13 +11,13 @@ from me2e_compress.zoo.vad.planner import Outputs, PlanningHead
 
 
 class VadTiny(nn.Module):
-    """Cameras, ego motion and the previous BEV to a plan (Jiang et al. 2023).
+    """Maps cameras, ego motion and the previous BEV to a plan (Jiang et al. 2023).
 
-    Written from the published description, at the published dimensions and with the
-    parameter names of the original but for the layers of `LaneNet`, so that a module
-    map fits both (`published_names` has the difference). What else differs is
-    what an export at fixed shapes asks for: camera attention reads every camera for
-    every cell and masks, and the map for the motion is masked instead of gathered.
+    Written from the published description, with the published dimensions and the
+    original's parameter names except for the layers of `LaneNet`; a module map fits
+    both (`published_names` has the difference). An export at fixed shapes requires two
+    more differences: camera attention reads every camera for every cell and masks, and
+    the map for the motion is masked instead of gathered.
     """
 
     def __init__(
@@ -34,18 +34,11 @@ class VadTiny(nn.Module):
     def forward(
         self, img: Tensor, lidar2img: Tensor, can_bus: Tensor, prev_bev: Tensor
     ) -> Outputs:
-        """Drive one frame.
+        """Process one frame and return the outputs in the order of the stack.
 
-        Args:
-            img: [1, 6, 3, 384, 640] float32, normalised.
-            lidar2img: [1, 6, 4, 4] float32.
-            can_bus: [18] float32.
-            prev_bev: [10000, 1, 256] float32; all zeros at the start of a scene.
-
-        Returns:
-            bev_embed, all_cls_scores, all_bbox_preds, all_traj_preds,
-            all_traj_cls_scores, map_all_cls_scores, map_all_bbox_preds,
-            map_all_pts_preds, ego_fut_preds.
+        ``img`` is [1, 6, 3, 384, 640], normalised, ``lidar2img`` [1, 6, 4, 4],
+        ``can_bus`` [18] and ``prev_bev`` [10000, 1, 256], zeros at the start of a
+        scene; all float32.
         """
         with region("backbone"):
             features = self.img_backbone(img.flatten(0, 1))

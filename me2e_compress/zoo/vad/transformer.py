@@ -65,20 +65,12 @@ class PerceptionTransformer(nn.Module):
         can_bus: Tensor,
         prev_bev: Tensor,
     ) -> tuple[Tensor, tuple[list[Tensor], ...], tuple[list[Tensor], ...]]:
-        """Encode and decode.
+        """Encode features [cameras, 256, h, w] and decode agents and map points.
 
-        Args:
-            features: [cameras, 256, h, w].
-            cells: BEV queries and their positions, [1, cells, 256] each.
-            agents: [300, 512], position then content.
-            points: [2000, 512], position then content.
-            branches: Regression branches of detection and map.
-            lidar2img: [1, cameras, 4, 4].
-            can_bus: [18].
-            prev_bev: [cells, 1, 256].
-
-        Returns:
-            BEV [1, cells, 256] and what `Decoder` returns for agents and map points.
+        ``cells`` are BEV queries and their positions, [1, cells, 256] each; ``agents``
+        [300, 512] and ``points`` [2000, 512] are position then content; ``branches``
+        are those of detection and map. Returns the BEV [1, cells, 256] and the results
+        of both `Decoder`s.
         """
         with region("bev_encoder"):
             bev = self.bev(features, *cells, lidar2img, can_bus, prev_bev)

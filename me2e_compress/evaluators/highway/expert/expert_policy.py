@@ -1,4 +1,4 @@
-"""The expert: one decision, a pure function of its arguments, and the policy on it."""
+"""The expert policy, and its decision as a pure function."""
 
 from dataclasses import dataclass, field
 
@@ -35,7 +35,7 @@ WAYPOINTS = np.searchsorted(TIMES_S, np.arange(0.5, 3.01, 0.5))
 
 @dataclass(frozen=True)
 class Memory:
-    """What one decision leaves to the next; the default is no past.
+    """State that one decision passes to the next; empty by default.
 
     Args:
         at_m: Arc length at which the ego was last seen.
@@ -50,14 +50,13 @@ class Memory:
 
 @dataclass(frozen=True, eq=False)
 class ExpertDecision:
-    """What the expert decided.
+    """A decision of the expert.
 
     Args:
         waypoints: [6, 2] metres in the ego frame, every 0.5 s.
-        acceleration_mps2: What the chosen future begins with.
-        target_m: Metres left of the route at which it aims.
-        cost: Of the chosen future.
-        memory: For the next decision.
+        acceleration_mps2: Initial acceleration of the chosen future.
+        target_m: Lateral target, metres left of the route.
+        cost: Cost of the chosen future.
     """
 
     waypoints: Plan
@@ -76,12 +75,9 @@ def decide(
 ) -> ExpertDecision:
     """Plan from any state.
 
-    Args:
-        scene: What there is.
-        known: What the actors intend, and which signals are on the route.
-        path: The route.
-        top: [N] speed ceiling along it, of `speed.ceiling`.
-        memory: What the last decision left, or ``Memory()``.
+    ``known`` are the actors' intents and the signals on the route, ``top`` is the [N]
+    speed ceiling along the route from `speed_limits.ceiling`, ``memory`` comes from the
+    last decision, or is ``Memory()``.
     """
     # where the ego is on its route
     ego = scene.ego
@@ -121,8 +117,7 @@ def decide(
 class Expert:
     """Drives by `decide`, and keeps its target lane and the signs it obeyed.
 
-    Args:
-        last: The last decision, for labels and pictures; None before the first.
+    ``last`` is the last decision, for labels and pictures; None before the first.
     """
 
     needs_images: bool = field(default=False, init=False)

@@ -1,4 +1,4 @@
-"""Forecasts of every actor, by its own intent, for the next six seconds."""
+"""Forecasts of all actors for the next six seconds, from their intents."""
 
 import math
 from collections.abc import Mapping
@@ -27,21 +27,16 @@ EASY_MPS2 = 0.3
 class Forecast:
     """Boxes of A actors now and at the 18 times of `TIMES_S` (T = 19 columns).
 
+    Positions and sizes are in metres, angles in radians.
+
     Args:
-        x: [A, T] metres.
-        y: [A, T] metres.
-        heading: [A, T] radians.
-        speed_mps: [A, T].
-        goal_mps: [A] the speed it wants.
-        length: [A] metres.
-        width: [A] metres.
+        goal_mps: [A] desired speed.
         moves: [A] whether it can move at all.
         yields: [A] whether it brakes for the ego.
-        emergency: [A] whether it is an emergency vehicle.
         walks: [A] whether it is a pedestrian.
         along_m: [A, T] arc length on the route.
         lateral_m: [A, T] metres left of the route.
-        away: [A, T] heading against the route's (radians).
+        away: [A, T] heading relative to the route's.
     """
 
     x: Floats
@@ -61,13 +56,13 @@ class Forecast:
 
     @property
     def half_span(self) -> Floats:
-        """[A, T] half of the room that a box takes along the route."""
+        """[A, T] half of the box's extent along the route."""
         cos, sin = np.abs(np.cos(self.away)), np.abs(np.sin(self.away))
         return (cos * self.length[:, None] + sin * self.width[:, None]) / 2
 
     @property
     def half_breadth(self) -> Floats:
-        """[A, T] half of the room that a box takes across the route."""
+        """[A, T] half of the box's extent across the route."""
         cos, sin = np.abs(np.cos(self.away)), np.abs(np.sin(self.away))
         return (sin * self.length[:, None] + cos * self.width[:, None]) / 2
 
@@ -79,15 +74,9 @@ FIXED = (ActorKind.PARKED, ActorKind.DOOR, ActorKind.CONE, ActorKind.BARRIER)
 def forecast(
     scene: Scene, intents: Mapping[int, Intent], path: RoutePath, ego_s_m: float
 ) -> Forecast:
-    """Roll every actor near the ego out along its intent.
-
-    Args:
-        scene: What there is.
-        intents: By actor id; an actor without one keeps its course and speed.
-        path: The route, onto which the actors are projected.
-        ego_s_m: Arc length of the ego.
-    """
+    """Roll out all actors near the ego; without intent they keep course and speed."""
     ego = scene.ego
+    # poses of the actors that can matter, [A, 4, T]
     near = [
         actor
         for actor in scene.actors
@@ -96,6 +85,7 @@ def forecast(
     rolled = [_roll_out(actor, intents.get(actor.id)) for actor in near]
     poses = np.array(rolled).reshape(len(near), 4, len(NOW_S))
     x, y, heading, speed = poses.transpose(1, 0, 2)
+    # their places relative to the route
     along, lateral, away = _on_route(path, x, y, heading, ego_s_m)
     return Forecast(
         *(x, y, heading, speed),
@@ -121,9 +111,11 @@ def _roll_out(actor: Actor, intent: Intent | None) -> Floats:
     first = 0.0 if intent is None else intent.acceleration_mps2
     briskest = max(first, EASY_MPS2)
     goal = _goal(actor, intent)
+    # people on foot or bicycle start and stop at once
     if actor.kind in ON_FOOT:
         first = briskest = 4.0 if goal > actor.speed_mps else 0.0
     speed, travel = _speeds(actor.speed_mps, goal, first, briskest)
+    # without a path an actor goes straight on
     if intent is None or len(intent.path) < 2:
         x = actor.x + travel * np.cos(actor.heading)
         y = actor.y + travel * np.sin(actor.heading)
@@ -138,14 +130,10 @@ def _goal(actor: Actor, intent: Intent | None) -> float:
 def _speeds(
     now: float, goal: float, first: float, briskest: float
 ) -> tuple[Floats, Floats]:
-    """Return speeds and distances at `NOW_S`: hold for 1 s, then to the goal.
+    """Return speeds and distances at `NOW_S`: hold for 1 s, then move to the goal.
 
-    Args:
-        now: Speed.
-        goal: Wanted speed.
-        first: Acceleration of the first second.
-        briskest: Strongest acceleration later; an actor that crawls behind another
-            will not leap ahead.
+    ``first`` is the acceleration of the first second, ``briskest`` the strongest one
+    later: an actor that crawls behind another will not leap ahead.
     """
     hardest = min(first, -2.0)
     speed, travel = [now], [0.0]
@@ -161,7 +149,7 @@ def _speeds(
 
 
 def _along(actor: Actor, line: Floats, travel: Floats) -> Floats:
-    """Return [3, T], x, y and heading on a line that begins at the actor."""
+    """Return [3, T] x, y and heading on a line that begins at the actor."""
     steps = line[1:] - line[:-1]
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
     headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
@@ -176,13 +164,15 @@ def _along(actor: Actor, line: Floats, travel: Floats) -> Floats:
 def _on_route(
     path: RoutePath, x: Floats, y: Floats, heading: Floats, ego_s_m: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Return arc length, lateral offset and relative heading: each [A, T]."""
+    """Return arc length, lateral offset and relative heading, each [A, T]."""
     low = int(max(ego_s_m + ROUTE_SPAN_M[0], 0))
     high = int(min(ego_s_m + ROUTE_SPAN_M[1], len(path.points)))
     points, headings = path.points[low:high], path.headings[low:high]
+    # nearest point of the route, one per metre
     gap_x, gap_y = x[..., None] - points[:, 0], y[..., None] - points[:, 1]
     nearest = np.argmin(gap_x * gap_x + gap_y * gap_y, axis=-1)
     at, course = points[nearest], headings[nearest]
+    # offsets along and across the route there
     dx, dy = x - at[..., 0], y - at[..., 1]
     along = low + nearest + np.cos(course) * dx + np.sin(course) * dy
     lateral = np.cos(course) * dy - np.sin(course) * dx

@@ -33,8 +33,8 @@ def collision_cost(
 ) -> Floats:
     """Return the [K] cost of touching, nearly touching, or cutting off an actor.
 
-    The ego is four discs of its width, an actor its rectangle, longer in front by
-    what it drives in `PRIORITY_S`. Who follows in the ego's own lane is left out.
+    The ego is four discs of its width; an actor is its rectangle, extended in front by
+    its travel in `PRIORITY_S`. Followers in the ego's own lane are ignored.
     """
     others = ~followers(seen, ego, place) & _in_reach(future, seen)
     if not np.any(others):
@@ -46,7 +46,7 @@ def collision_cost(
 
 
 def followers(seen: Forecast, ego: Ego, place: Place) -> Flags:
-    """Return [A]: whether an actor follows the ego, in a lane that the ego is in."""
+    """Return [A] whether an actor follows the ego in a lane that the ego is in."""
     aligned = np.cos(seen.away[:, 0]) > 0.5
     apart = np.abs(seen.lateral_m[:, 0] - place.lateral_m)
     beside = apart < seen.half_breadth[:, 0] + ego.width / 2
@@ -55,7 +55,7 @@ def followers(seen: Forecast, ego: Ego, place: Place) -> Flags:
 
 
 def _in_reach(future: SampledFutures, seen: Forecast) -> Flags:
-    """Return [A]: whether an actor comes near any future of the ego."""
+    """Return [A] whether an actor comes near any future of the ego."""
     margin = REACH_M + PRIORITY_S * seen.speed_mps[:, 1:]
     near = np.ones_like(margin, bool)
     for mine, other in ((future.x, seen.x), (future.y, seen.y)):
@@ -65,7 +65,7 @@ def _in_reach(future: SampledFutures, seen: Forecast) -> Flags:
 
 
 def _worst(clearance: Floats, margin: float) -> Floats:
-    """Return [A, K], the largest faded intrusion into a margin, 0 to 1."""
+    """Return [A, K] the largest faded intrusion into a margin, 0 to 1."""
     inside = np.clip((margin - clearance) / margin, 0.0, 1.0)
     return np.asarray(np.max(inside * FADE, axis=-1))
 
@@ -74,6 +74,7 @@ def _clearances(
     future: SampledFutures, seen: Forecast, ego: Ego, others: Flags
 ) -> tuple[Floats, Floats]:
     """Return [A, K, T] metres from the ego to each actor, and to its way ahead."""
+    # sizes of the ego's discs and of the actors' boxes
     radius = ego.width / 2 + CORNER_M
     reach = (ego.length - ego.width) / 2 + SWEEP_S * future.speed_mps
     x, y, heading, speed = (
@@ -84,6 +85,7 @@ def _clearances(
     half_length = seen.length[others, None, None] / 2 + SWEEP_S * speed
     half_width = seen.width[others, None, None] / 2
     front = half_length + speed * PRIORITY_S * seen.moves[others, None, None]
+    # squared distances from each disc, the smallest counts
     shift = reach * np.stack([np.cos(future.heading), np.sin(future.heading)])
     apart = np.full((len(x), *future.x.shape), np.inf)
     cut = apart
@@ -127,19 +129,22 @@ def rule_cost(
 ) -> Floats:
     """Return the [K] cost of leaving the road, the wrong side, and stop lines.
 
-    An ego that is off the road already pays only for going farther.
+    An ego that is already off the road pays only for going farther.
     """
+    # edges of the road along each future
     half = ego.width / 2 - 0.05
     metre = np.clip(np.rint(future.along_m).astype(np.int64), 0, len(path.left_m) - 1)
     left, both, right = path.left_m[metre], path.oncoming_m[metre], path.right_m[metre]
     edge = np.where(future.oncoming[:, None], both, left)
     over = np.maximum(future.lateral_m + half - both, -right - future.lateral_m + half)
+    # how far off the road the ego already is
     already = max(
         place.lateral_m + half - float(path.value(path.oncoming_m, place.s_m)),
         half - place.lateral_m - float(path.value(path.right_m, place.s_m)),
         0.0,
     )
     wrong = np.clip(future.lateral_m + half - edge, 0.0, 1.0)
+    # road edge, oncoming lane, stop line
     cost = OFF_ROAD * np.max(np.clip(over - already, 0.0, 1.0) * FADE, axis=1)
     cost += WRONG_SIDE * np.sum(wrong * FADE, axis=1)
     if stop_m is not None:
@@ -152,15 +157,16 @@ def headway_cost(
 ) -> Floats:
     """Return the [K] cost of driving too close to a leader or an obstacle.
 
-    A slow leader on a passable road is followed at the distance that lets the ego swing
-    out.
+    On a passable road a slow leader is followed with room to swing out.
     """
+    # leaders: actors ahead that the ego cannot pass
     along, lateral = seen.along_m[:, None, 1:], seen.lateral_m[:, None, 1:]
     ahead = along - future.along_m[None]
     room = seen.half_breadth[:, None, 1:] + ego.width / 2 + BESIDE_M
     leads = (np.abs(lateral - future.lateral_m[None]) < room) & (ahead > 0)
     leads &= (~followers(seen, ego, place))[:, None, None]
     gap = ahead - seen.half_span[:, None, 1:] - ego.length / 2
+    # the gap that is missing, of the worst leader
     slow = (np.max(seen.speed_mps, axis=1) < SLOW_MPS)[:, None, None]
     standing = np.where(slow & passable, SWING_OUT_M, STANDOFF_M)
     wanted = standing + GAP_S * future.speed_mps[None]
@@ -174,13 +180,15 @@ def emergency_cost(
 ) -> Floats:
     """Return the [K] cost of holding up an emergency vehicle from behind.
 
-    First the ego leaves its lane, then it slows down.
+    The ego first leaves its lane, then slows down.
     """
+    # emergency vehicles close behind
     behind = place.s_m - seen.along_m[:, 0]
     urgent = seen.emergency & (behind > -ego.length) & (behind < EMERGENCY_M)
     urgent &= (np.cos(seen.away[:, 0]) > 0.5) & (seen.speed_mps[:, 0] > SLOW_MPS)
     if not np.any(urgent):
         return np.zeros(len(future.acceleration))
+    # cost of blocking their lane, and of not slowing down
     lateral, speed = seen.lateral_m[urgent][:, -1], np.min(seen.speed_mps[urgent])
     room = ego.width / 2 + seen.width[urgent] / 2 + BESIDE_M
     blocked = np.abs(future.lateral_m[:, -1, None] - lateral) < room
@@ -189,20 +197,16 @@ def emergency_cost(
 
 
 def drive_cost(future: SampledFutures, ego: Ego, place: Place, kept_m: float) -> Floats:
-    """Return the [K] cost of little progress, of effort and of restlessness.
-
-    Args:
-        future: The sampled futures.
-        ego: The ego.
-        place: The same on its route.
-        kept_m: The lateral target of the last plan.
-    """
+    """Return the [K] cost of little progress, effort, and changes of target."""
     rate = future.acceleration
     begun = (future.speed_mps[:, 1] - place.speed_mps) / 0.5
+    # progress and speed are gains
     cost = -PROGRESS_PER_M * (future.along_m[:, -1] - place.s_m)
     cost -= SPEED_PER_MPS * future.speed_mps[:, -1]
+    # effort and jerk
     cost += EFFORT * np.abs(rate) + BRAKE_HARD * (rate < -3.5)
     cost += JERK * np.abs(begun - ego.acceleration_mps2)
+    # offsets and changes of the lateral target
     cost += OFFSET_PER_M * np.abs(future.target_m)
     moved = np.abs(future.target_m - kept_m)
     cost += np.where(moved > LANE_CHANGE_M, SWITCH, NUDGE_PER_M * moved)

@@ -22,17 +22,14 @@ FULL_CHANGE_M = 3.5
 
 @dataclass(frozen=True, eq=False)
 class SampledFutures:
-    """K futures at the 18 times of `TIMES_S`.
+    """K futures at the 18 times of `TIMES_S`; positions in metres.
 
     Args:
-        x: [K, T] metres.
-        y: [K, T] metres.
-        heading: [K, T] radians, of the body: in a bend it points out of the way that
-            the centre goes, by the slip angle.
+        heading: [K, T] radians, of the body: in a bend it differs from the direction of
+            travel by the slip angle.
         along_m: [K, T] arc length.
         lateral_m: [K, T] metres left of the route.
-        speed_mps: [K, T].
-        acceleration: [K] what each begins with.
+        acceleration: [K] initial acceleration.
         target_m: [K] lateral target.
         oncoming: [K] whether the target is in the oncoming lane.
     """
@@ -58,25 +55,23 @@ def sample(
 ) -> SampledFutures:
     """Roll out every pair of acceleration and lateral target.
 
-    Args:
-        path: The route.
-        top: [N] speed ceiling along it.
-        ego: The ego.
-        place: The same on its route.
-        options: Lateral targets.
-        stop_m: Arc length at which the ego's centre should stand, if any: one more
-            acceleration, that stops exactly there.
+    ``top`` is the [N] speed ceiling along the route. ``stop_m`` is the arc length at
+    which the ego's centre should stop, if any; it adds an acceleration that stops
+    there.
     """
+    # candidate accelerations, one of which stops at the line
     rates = list(ACCELERATIONS_MPS2)
     if stop_m is not None:
         room = max(stop_m - place.s_m, 0.05)
         rates.append(max(-(place.speed_mps**2) / (2 * room), -8.0))
+    # every acceleration with every target
     along, speed = _speeds(top, place, np.array(rates))
     repeat, count = len(options.target_m), len(rates)
     along, speed = np.tile(along, (repeat, 1)), np.tile(speed, (repeat, 1))
     target = np.repeat(options.target_m, count)
     lateral = _laterals(place, along - place.s_m, target)
     x, y, heading = beyond(path, along, lateral)
+    # body heading: course minus slip angle
     moved = np.diff(along, axis=1, prepend=place.s_m)
     shifted = np.diff(lateral, axis=1, prepend=place.lateral_m)
     slip = np.clip(path.value(path.curvature, along) * ego.length / 2, -0.5, 0.5)

@@ -1,4 +1,4 @@
-"""The lateral offsets that the expert may aim at: lanes, nudges, oncoming lane."""
+"""Lateral offsets that the expert may aim at: lanes, nudges, oncoming lane."""
 
 from dataclasses import dataclass
 
@@ -27,15 +27,12 @@ PASS_MPS2 = 1.8
 
 @dataclass(frozen=True)
 class Place:
-    """The ego on its route.
+    """The ego on its route; ``lateral_m`` is positive to the left.
 
     Args:
-        s_m: Arc length.
-        lateral_m: Metres left of the route.
-        slope: Metres to the left per metre of route, see `reference.slope_of`.
-        speed_mps: Speed.
-        acceleration_mps2: Along the route.
-        top_mps: What the road ahead allows.
+        slope: Metres to the left per metre of route, see `reentry.slope_of`.
+        acceleration_mps2: Acceleration along the route.
+        top_mps: Speed that the road ahead allows.
     """
 
     s_m: float
@@ -48,7 +45,7 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """Where the expert may aim.
+    """Lateral targets.
 
     Args:
         target_m: [L] metres left of the route.
@@ -63,13 +60,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Block:
-    """What blocks the ego's lane.
-
-    Args:
-        start_m: From the ego's centre to the nearest end of it.
-        end_m: To its farthest end.
-        speed_mps: How fast it moves on.
-    """
+    """An obstruction of the ego's lane, with distances from the ego's centre."""
 
     start_m: float
     end_m: float
@@ -79,17 +70,20 @@ class Block:
 def lateral_targets(path: RoutePath, place: Place, ego: Ego, seen: Forecast) -> Options:
     """Return the lateral offsets that the road a little ahead allows.
 
-    The oncoming lane is offered only behind a blocked own lane and with a gap, or when
-    the ego is already in it.
+    The oncoming lane is offered only if the own lane is blocked and there is a gap, or
+    if the ego is already in it.
     """
+    # widths of the road where the ego will be shortly
     ahead = place.s_m + max(6.0, 0.8 * place.speed_mps)
     columns = (path.lane_widths, path.left_m, path.right_m, path.oncoming_m)
     lane, left, right, both = (float(path.value(c, ahead)) for c in columns)
     room = ego.width / 2
+    # nudges and neighbouring lanes that fit into the width
     beside = [lane, min(lane + ASIDE_M, left - room), 2 * lane]
     beside += [-lane, max(-lane - ASIDE_M, room - right), -2 * lane]
     offsets = [n for n in (*NUDGES_M, *beside) if room - right <= n <= left - room]
     oncoming = [False] * (1 + len(offsets))
+    # the oncoming lane
     facing = left + lane / 2
     around = both > facing + room
     if around and left < 1.4 * lane and _may_face(path, place, ego, seen, left, lane):
@@ -107,7 +101,7 @@ def _may_face(
     left_m: float,
     lane_m: float,
 ) -> bool:
-    """Return whether the oncoming lane may be used: with a gap, or if already in it."""
+    """Return whether the oncoming lane may be used."""
     if place.lateral_m + ego.width / 2 > left_m + 0.3:
         return True
     block = blocked_stretch(place, ego, seen)
@@ -129,15 +123,17 @@ def gap_for_passing(
 ) -> bool:
     """Return whether the blocker can be passed before oncoming traffic arrives.
 
-    The stretch beside the blockers must be left before the first oncoming car
-    reaches its end, with `CLEAR_S` to spare.
+    The ego must be past the blockers before the first oncoming car gets there, with
+    `CLEAR_S` to spare.
     """
+    # distance and time of passing a blocker that moves on
     top, seconds = min(place.top_mps, 10.0), 0.0
     beside = block.end_m + ego.length + 6.0
     distance = beside
     for _ in range(3):
         distance = beside + block.speed_mps * seconds
         seconds = _seconds_for(distance, place.speed_mps, top)
+    # when oncoming cars reach the end of that stretch
     gap = seen.along_m[:, 0] - place.s_m
     coming = (np.cos(seen.away[:, 0]) < -0.5) & (seen.speed_mps.max(axis=1) > 0.5)
     coming &= np.abs(seen.lateral_m[:, 0] - left_m - lane_m / 2) < lane_m
@@ -153,6 +149,7 @@ def blocked_stretch(place: Place, ego: Ego, seen: Forecast) -> Block | None:
     That is anything slow along the centre line (0.3 m to spare) that does not cross it;
     neighbours within `CHAIN_M` count as one.
     """
+    # slow actors in the way that do not cross it
     lateral, half = seen.lateral_m[:, 0], seen.half_breadth[:, 0]
     fastest = np.max(seen.speed_mps[:, :9], axis=1)
     crosses = (np.abs(np.sin(seen.away[:, 0])) > 0.5) & (fastest > 0.3)
@@ -164,6 +161,7 @@ def blocked_stretch(place: Place, ego: Ego, seen: Forecast) -> Block | None:
     blocking &= ends > -ego.length / 2
     if not np.any(blocking):
         return None
+    # chain neighbours, starting with the nearest
     order = np.argsort(gap[blocking])
     starts = (gap - seen.half_span[:, 0])[blocking][order]
     stops = ends[blocking][order]

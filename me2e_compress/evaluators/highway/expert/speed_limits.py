@@ -1,4 +1,4 @@
-"""How fast the expert may drive: limits and bends, and stops at lights and signs."""
+"""Speed limits of the expert: limits, bends, and stops at lights and signs."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -26,11 +26,13 @@ SLOWEST_MPS = 2.5
 
 
 def ceiling(path: RoutePath) -> Floats:
-    """Return [N], the highest speed (m/s) at every metre of a route without traffic."""
+    """Return [N] the highest speed (m/s) at every metre of a route without traffic."""
     window = np.full(5, 0.2)
+    # curvature, averaged over 5 m
     bends = np.convolve(np.pad(np.abs(path.curvature), 2, mode="edge"), window, "valid")
     in_bend = np.sqrt(LATERAL_MPS2 / np.maximum(bends, 1e-4))
     top = np.minimum(path.speed_limits_mps, np.maximum(in_bend, SLOWEST_MPS))
+    # brake in time for lower limits ahead
     for i in range(len(top) - 2, -1, -1):
         top[i] = min(top[i], np.sqrt(top[i + 1] ** 2 + 2 * EASE_MPS2))
     return top
@@ -74,16 +76,9 @@ def obey(
     ego_s_m: float,
     served: frozenset[int],
 ) -> Stop:
-    """Return where the signals ahead on the route make the ego stop or slow down.
-
-    Args:
-        scene: What there is.
-        phases: Which signals are on the route, and where.
-        seen: The other road users.
-        ego_s_m: Arc length of the ego.
-        served: Stop signs already obeyed.
-    """
+    """Return where the signals ahead on the route make the ego stop or slow down."""
     ego, lines, slow = scene.ego, list[float](), list[float]()
+    # signals on the route whose line is still ahead
     line_of = {phase.signal_id: phase.line_s for phase in phases}
     for signal in scene.signals:
         line = line_of.get(signal.id)
@@ -92,8 +87,10 @@ def obey(
         gap = line - ego.length / 2 - ego_s_m
         if gap < 0:
             continue
+        # a stop sign is served once the ego has stopped near its line
         if signal.kind is SignalKind.STOP_SIGN and gap <= SERVED_WITHIN_M:
             served = served | {signal.id} if _stands(ego) else served
+        # a give-way line slows the ego, and stops it for traffic
         if signal.kind is SignalKind.GIVE_WAY:
             slow.append(line - ego.length / 2)
             if must_give_way(seen, line, _arrival(gap, ego.speed_mps)):
@@ -114,13 +111,7 @@ def slowed(top: Floats, stop: Stop) -> Floats:
 
 
 def must_give_way(seen: Forecast, line_m: float, crossing_s: float) -> bool:
-    """Return whether priority traffic meets the route when the ego crosses a line.
-
-    Args:
-        seen: The other road users.
-        line_m: Arc length of the line.
-        crossing_s: When the ego will cross it.
-    """
+    """Return whether priority traffic meets the route when the ego crosses a line."""
     in_reach = (seen.along_m > line_m) & (seen.along_m < line_m + CONFLICT_M)
     meets = in_reach & (np.abs(seen.lateral_m) < MEETING_M)
     meets &= (seen.speed_mps[:, :1] > 0.5) & ~seen.walks[:, None]

@@ -1,4 +1,4 @@
-"""A road of straights and arcs with lanes either way: what most layouts are."""
+"""A road of straights and arcs with lanes in both directions, used by most layouts."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -37,12 +37,12 @@ class Carriageway:
     """A finished road.
 
     Attributes:
-        network: Where it lies.
+        network: The network it belongs to.
         forward: Edges in driving direction.
         backward: Edges of the oncoming lanes, in their driving direction.
         verge: Edges of the shoulder on the right, in driving direction.
         lanes: Number of forward lanes.
-        end: Where the leftmost forward lane ends.
+        end: Pose at the end of the leftmost forward lane.
     """
 
     network: Network
@@ -57,7 +57,7 @@ class Carriageway:
         return [(a, b, lane) for a, b in self.forward]
 
     def oncoming(self, lane: int = 0) -> list[LaneIndex]:
-        """Return the chain of an oncoming lane; 0 is the one next to ours."""
+        """Return the chain of an oncoming lane; 0 is next to the forward lanes."""
         return [(a, b, lane) for a, b in self.backward]
 
     def shoulder(self) -> list[LaneIndex]:
@@ -93,7 +93,7 @@ def carriageway(
     Args:
         network: Where to build.
         name: Prefix of its node names.
-        start: Where its leftmost forward lane begins.
+        start: Pose at the beginning of its leftmost forward lane.
         pieces: Straights and arcs, joined end to end.
         section: Forward lanes; oncoming lanes get the same width and limit.
         oncoming: Number of oncoming lanes, left of the forward ones.
@@ -139,6 +139,7 @@ def _rows(
         right=LaneMarking.NONE,
         shoulder=True,
     )
+    # forward lanes, oncoming lanes, then the shoulders outside them
     ahead = replace(section, left=centre) if oncoming else section
     yield _Row(f"{name}f", ahead, 0.0, True)
     if oncoming:
@@ -160,10 +161,12 @@ def _lay(
     for k, piece in enumerate(pieces):
         after = _after(pose, piece)
         here, there = f"{row.prefix}{k}", f"{row.prefix}{k + 1}"
+        # oncoming lanes begin at the far end of the piece
         if row.forward:
             a, b, begin = here, there, pose.moved(0.0, left)
         else:
             a, b, begin = there, here, after.moved(0.0, left).turned(math.pi)
+        # arcs keep their centre: the radius changes with the offset
         if isinstance(piece, Straight):
             network.straight(a, b, begin, piece.length_m, row.section)
         else:

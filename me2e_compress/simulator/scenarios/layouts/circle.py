@@ -51,10 +51,10 @@ def ring_way(start: str, end: str) -> list[LaneIndex]:
 def roundabout(stage: Stage) -> Regulator:
     """Lay the roundabout; the ego leaves it to the right, ahead or to the left.
 
-    Returns:
-        The ego's give-way sign.
+    Returns the ego's give-way sign.
     """
     stage.layout = "roundabout"
+    # where the entry arcs touch the ring
     half_lane = LANE_WIDTH_M / 2
     sideways = half_lane + ENTRY_M
     reach = math.sqrt((RING_M + ENTRY_M) ** 2 - sideways**2)
@@ -63,6 +63,7 @@ def roundabout(stage: Stage) -> Regulator:
     centre = origin(stage).moved(approach + reach)
     for arm in ARMS:
         _arm(stage, centre, arm, reach, tangent)
+    # the ego's route around the ring
     to = stage.choice("exit", ("right", "ahead", "left"))
     command = {"right": Command.RIGHT, "ahead": Command.STRAIGHT}.get(to, Command.LEFT)
     incoming, *inside, outgoing = ring_way("back", to)
@@ -70,6 +71,7 @@ def roundabout(stage: Stage) -> Regulator:
     legs = [Leg(incoming, enter_m=begin)]
     legs += [Leg(index, command) for index in inside]
     stage.drive([*legs, Leg(outgoing)], start_speed(stage))
+    # its give-way line
     line = centre.turned(math.pi).moved(reach + 1.0, half_lane)
     return stage.regulate(SignalKind.GIVE_WAY, line.turned(math.pi))
 
@@ -82,11 +84,13 @@ def _arm(stage: Stage, centre: Pose, name: str, reach: float, tangent: float) ->
     ring = replace(inside, width=RING_WIDTH_M)
     angle = ARMS.index(name) * math.pi / 2
     out = centre.turned(angle)
+    # lanes out and in
     away, far = out.moved(reach, -half_lane), out.moved(reach + ARM_M, half_lane)
     net.straight(f"{name}.out", f"{name}.end", away, ARM_M, road)
     towards = net.straight(
         f"{name}.far", f"{name}.in", far.turned(math.pi), ARM_M, road
     )
+    # entry and exit arcs, and the ring up to the next arm
     turn = math.pi / 2 - tangent
     net.arc(f"{name}.in", f"{name}.on", towards, ENTRY_M, -turn, inside)
     leave = centre.turned(angle - tangent).moved(RING_M).turned(math.pi / 2)

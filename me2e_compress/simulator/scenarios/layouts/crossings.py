@@ -38,11 +38,11 @@ class Crossing:
     """A finished junction.
 
     Attributes:
-        network: Where it lies.
-        centre: Its middle, heading of the ego as it comes.
+        network: The network it belongs to.
+        centre: Its middle, with the ego's heading as it approaches.
         half_m: Half its side.
         lanes: Lanes of each arm in each direction.
-        move: Where the ego goes: ahead, left or right.
+        move: The ego's move: ahead, left or right.
         approach_m: Route from the ego's start to the junction's edge.
         signals: The regulator of each arm that has one.
     """
@@ -153,18 +153,21 @@ def _stop_line(crossing: Crossing, arm: str) -> Pose:
 def _crossing(
     stage: Stage, move: str, arms: Sequence[str], lanes: int, limit_mps: float
 ) -> Crossing:
+    # the junction's size and position
     approach = stage.uniform("approach_m", 55.0, 70.0)
     half = HALF_M + (lanes - 1) * LANE_WIDTH_M
     centre = origin(stage).moved(approach + half)
     crossing = Crossing(stage.network, centre, half, lanes, move, approach, {})
     section = Section(lanes=lanes, limit_mps=limit_mps)
     section = replace(section, left=LaneMarking.SOLID)
+    # arms, then a connection for each pair
     for arm in arms:
         _arm(crossing, arm, section)
     for start in arms:
         for end in arms:
             if start != end:
                 _connect(crossing, start, end, limit_mps)
+    # the ego's route
     incoming, inside, outgoing = crossing.way("back", move)
     begin = stage.network.length(incoming) - approach
     legs = [Leg(incoming, enter_m=begin), Leg(inside, _TURNS[move]), Leg(outgoing)]
@@ -184,6 +187,7 @@ def _connect(crossing: Crossing, start: str, end: str, limit_mps: float) -> None
     network, lanes = crossing.network, crossing.lanes
     first = crossing.arm(start, 0.0, LANE_WIDTH_M / 2).turned(math.pi)
     here, there = f"{start}.in", f"{end}.out"
+    # straight on, right, or left: radii that meet the lanes of the arms
     turn = (ARMS.index(end) - ARMS.index(start)) % 4
     inside = replace(PLAIN, limit_mps=limit_mps)
     if turn == 2:

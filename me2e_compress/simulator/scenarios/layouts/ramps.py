@@ -44,7 +44,8 @@ class Ramp:
     Attributes:
         main: The main road; lane 1 is next to the ramp.
         ramp: The chain of the ramp, the lane beside the main road included.
-        merge_s: On the ego's route: middle of its change between ramp and main road.
+        merge_s: Arc length on the ego's route at the middle of its change between ramp
+            and main road.
     """
 
     main: Carriageway
@@ -56,9 +57,11 @@ def on_ramp(stage: Stage, ego_on_ramp: bool) -> Ramp:
     """Lay a ramp that joins from the right and runs beside the main road."""
     stage.layout = "on_ramp" if ego_on_ramp else "main_road_past_on_ramp"
     start, section = origin(stage), straight_section(2, LIMIT_MPS)
+    # main road
     main = carriageway(stage.network, "m", start, [Straight(TOTAL_M)], section)
     single = replace(section, lanes=1)
     beside = replace(single, left=LaneMarking.DASHED)
+    # ramp: straight, an S-bend, then the acceleration lane
     angle = math.acos(1 - RAMP_APART_M / (2 * RAMP_RADIUS_M))
     apart = -2 * LANE_WIDTH_M - RAMP_APART_M
     net, length = stage.network, BEFORE_M + stage.uniform("ramp_m", 15.0, 25.0)
@@ -69,6 +72,7 @@ def on_ramp(stage: Stage, ego_on_ramp: bool) -> Ramp:
     pose = net.straight("p3", "p4", pose, lane_m, beside)
     block_end(stage, pose)
     ramp: list[LaneIndex] = [(f"p{k}", f"p{k + 1}", 0) for k in range(4)]
+    # the ego's route
     if not ego_on_ramp:
         legs = [Leg(main.ahead(1)[0], enter_m=BEFORE_M)]
         stage.drive(legs, start_speed(stage))
@@ -90,9 +94,11 @@ def off_ramp(stage: Stage) -> Ramp:
     """Lay an exit on the right; the ego starts in the left lane of the main road."""
     stage.layout = "off_ramp"
     start, section = origin(stage), straight_section(2, LIMIT_MPS)
+    # main road
     main = carriageway(stage.network, "m", start, [Straight(TOTAL_M)], section)
     single = replace(section, lanes=1)
     beside = replace(single, left=LaneMarking.DASHED)
+    # ramp: a lane beside the main road, then an S-bend away from it
     angle = math.acos(1 - RAMP_APART_M / (2 * RAMP_RADIUS_M))
     first = stage.uniform("change_m", 40.0, 55.0)
     opens = BEFORE_M + first + CHANGE_M
@@ -103,6 +109,7 @@ def off_ramp(stage: Stage) -> Ramp:
     pose = net.arc("q2", "q3", pose, RAMP_RADIUS_M, angle, single)
     net.straight("q3", "q4", pose, 150.0, single)
     ramp: list[LaneIndex] = [(f"q{k}", f"q{k + 1}", 0) for k in range(4)]
+    # the ego changes lanes twice, into the ramp
     left, right = main.ahead(0)[0], main.ahead(1)[0]
     changed = BEFORE_M + first + CHANGE_M
     legs = [
@@ -119,11 +126,13 @@ def lane_drop(stage: Stage) -> Street:
     """Lay a two-lane road whose right lane, the ego's, ends."""
     stage.layout = "lane_drop"
     start, section = origin(stage), straight_section(2, LIMIT_MPS)
+    # the road, with barriers where its right lane ends
     ends = BEFORE_M + stage.uniform("ends_m", 85.0, 95.0)
     net = stage.network
     after = net.straight("d0", "d1", start, ends, section)
     net.straight("d1", "d2", after, TOTAL_M - ends, replace(section, lanes=1))
     block_end(stage, after.moved(0.0, -LANE_WIDTH_M))
+    # the ego changes to the left before that
     change = ends - CHANGE_M - 20.0
     legs = [
         Leg(("d0", "d1", 1), enter_m=BEFORE_M, leave_m=change),

@@ -33,10 +33,7 @@ PARKING_M = 2.5
 class Street:
     """A road on which the ego follows one lane.
 
-    Attributes:
-        road: The carriageway.
-        lane: The ego's lane.
-        start_m: Arc length along the road at which the ego's route begins.
+    ``start_m`` is the arc length along the road at which the ego's route begins.
     """
 
     road: Carriageway
@@ -53,7 +50,7 @@ class Street:
 
 
 def origin(stage: Stage) -> Pose:
-    """Return where the world begins, with a random heading."""
+    """Return the pose at which the world begins, with a random heading."""
     return Pose(0.0, 0.0, stage.uniform("heading_rad", -math.pi, math.pi))
 
 

@@ -80,12 +80,10 @@ def bicycle_stream(stage: Stage, crossing: Crossing) -> Script:
 
 @dataclass(frozen=True)
 class Row:
-    """People behind each other.
+    """People behind each other, the first one first.
 
-    Attributes:
-        people: The first one first.
-        reach_m: How far each walks to the middle of the ego's lane.
-        route_s: Where that is on the route.
+    ``reach_m`` is how far each walks to the middle of the ego's lane, ``route_s`` the
+    arc length of that place on the route.
     """
 
     people: list[Walker]

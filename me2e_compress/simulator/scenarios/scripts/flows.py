@@ -62,12 +62,14 @@ def flows_from_both_sides(stage: Stage, crossing: Crossing) -> Script:
     """Drive a platoon from the left and, a little later, cars from the right."""
     late = stage.uniform("late_m", 8.0, 16.0)
     other = crossing.way("right", "left", crossing.lanes - 1)
+    # cars from the right, which come a little later
     route_s, station = meeting(stage, other)
     cars = 2 if crossing.move == "left" else 1
     begin = max(station - route_s - late, 0.0)
     for k in range(cars):
         lanes, local = on_chain(stage.network, other, max(begin - 14.0 * k, 0.0))
         stage.car(lanes, local, float(stage.ego.speed), behaviour=DENSE)
+    # a platoon from the left, timed to meet it
     chain = crossing.way("left", "right", crossing.lanes - 1)
     yield from _platoon(
         stage,
@@ -148,6 +150,7 @@ def _platoon(
     ratio = stage.uniform("flow_ratio", 0.9, 1.05)
     gap = stage.uniform("flow_gap_m", 11.0, 15.0)
     speed = float(stage.ego.speed)
+    # cars behind each other, as far as the lane reaches back
     row = list[Car]()
     for k in range(cars):
         s = station - ratio * route_s - gap * k
@@ -156,6 +159,7 @@ def _platoon(
         lanes, local = on_chain(stage.network, chain, s)
         behaviour = DENSE if k else HEEDLESS
         row.append(stage.car(lanes, local, speed, 9.0, behaviour=behaviour))
+    # a give-way sign judges by the nearest of them
     points = [meeting(stage, car.lanes) for car in row]
     if sign is not None and sign.kind is SignalKind.GIVE_WAY:
         sign.nearest_s = lambda: _nearest(row, [at for _, at in points])
@@ -174,12 +178,14 @@ def _beside(
     """Keep a car beside the ego until shortly before it changes lanes."""
     speed = float(stage.ego.speed)
     aside = stage.uniform("beside_m", -1.5, 1.5)
+    # the first car adapts to the ego, the others follow
     row = [
         stage.car(chain, start_m + aside - 13.0 * k, speed, behaviour=DENSE)
         for k in range(cars)
     ]
     lead = row[0]
     lead.behaviour = HEEDLESS
+    # level with the ego until it is close, then at a steady speed
     while stage.ahead_m(change_s) > 22.0:
         _keep_beside(stage, lead, aside)
         yield

@@ -32,11 +32,13 @@ def hard_brake(stage: Stage, street: Street) -> Script:
     lanes = street.ahead(street.lane)
     speed = float(stage.ego.speed)
     car = stage.car(lanes, street.start_m + gap + 5.0, speed)
+    # keep the distance until the place of braking
     while stage.ahead_m(where) > 0:
         error = stage.gap_m(car) - gap
         wanted = max(stage.ego.speed - 0.5 * error, 0.0)
         car.forced_mps2 = min(max((wanted - car.speed) / 0.5, -5.0), 4.0)
         yield
+    # brake, and wait until the ego stands or has passed
     stage.fire("hard_brake", car)
     car.forced_mps2 = -hardest
     waited = 0.0
@@ -66,12 +68,14 @@ def queue_cut_in(stage: Stage, street: Street) -> Script:
     lead_s = stage.uniform("lead_s", 3.0, 3.6)
     lane = street.other_lane()
     chain = street.ahead(lane)
+    # a standing queue with room ahead of the car that leaves it
     cutter: Car | None = None
     for aside in (-14.0, -7.0, 0.0, 11.0, 18.0):
         lanes, local = on_chain(stage.network, chain, street.start_m + s + aside)
         car = stage.car(lanes, local, 0.0)
         stand(car)
         cutter = car if aside == 0.0 else cutter
+    # leave when the ego is near in time
     while stage.arrival_s(s - 2.0) > lead_s:
         yield
     if cutter is not None:
@@ -106,12 +110,14 @@ def slow_queue(stage: Stage, lane: list[LaneIndex], merge_m: float) -> Script:
     speed = stage.uniform("queue_mps", 1.6, 2.2)
     spacing = stage.uniform("queue_spacing_m", 8.5, 10.0)
     first = merge_m + 30.0
+    # a crawling row
     for k in range(10):
         s = first - spacing * k
         if s > 0:
             lanes, local = on_chain(stage.network, lane, s)
             stage.car(lanes, local, speed, speed)
     queue = [body for body in stage.bodies if isinstance(body, Car)]
+    # speed up a while after the ego has come close and slowed down
     while min(abs(stage.gap_m(car)) for car in queue) > 15.0:
         yield
     stage.fire("slow_queue", queue[-1])
@@ -161,11 +167,13 @@ def _cut_in(
 ) -> Script:
     """Move into the ego's lane, crawl there, drive off."""
     stage.fire(name, car)
+    # change lanes at a crawl
     target, _ = on_chain(stage.network, lanes, _s_along(stage, lanes, car.pose))
     car.change_lane(target, side)
     release(car, crawl)
     until = stage.time_s + CRAWL_S
     waited = 0.0
+    # crawl until the ego has followed for a while, or passed
     while waited < 2.0 and stage.time_s < until:
         yield
         if car.speed > crawl + 1.0:

@@ -94,7 +94,7 @@ def spun_car(stage: Stage) -> Script:
     """Lower the grip before a car that stands across the lane.
 
     Substitutes for Bench2Drive's ControlLoss, which adds noise to the controls: that
-    would penalise what no driver did.
+    would penalise the driver for the noise.
     """
     s = stage.uniform("spun_m", 80.0, 92.0)
     grip = stage.uniform("grip_mps2", 3.0, 4.0)
@@ -124,7 +124,7 @@ def neighbours(stage: Stage, street: Street) -> Script:
 
 
 def oncoming_cars(stage: Stage, street: Street) -> Script:
-    """Drive a few cars the other way, and then none."""
+    """Drive a few cars in the other direction, and then none."""
     count = stage.integer("oncoming", 1, 3)
     chain = street.road.oncoming()
     total = sum(stage.network.length(index) for index in chain)

@@ -24,6 +24,7 @@ def red_light(stage: Stage, crossing: Crossing) -> Script:
     light = crossing.signals["back"]
     line_s = light.line_s or crossing.approach_m
     ways = (("left", "right"), ("right", "left"))
+    # cross traffic
     for k, (start, end) in enumerate(ways):
         chain = crossing.way(start, end)
         away = stage.uniform(f"cross_{k}_m", 15.0, 60.0)
@@ -31,6 +32,7 @@ def red_light(stage: Stage, crossing: Crossing) -> Script:
     while stage.ahead_m(line_s) > 35.0:
         yield
     stage.fire("red_light")
+    # the ego has waited: the cross traffic's light turns red, the ego's green
     yield from patience(stage, line_s, 12.0)
     for state, seconds in (
         (SignalState.YELLOW, YELLOW_S),
@@ -56,12 +58,14 @@ def invader(stage: Stage, street: Street) -> Script:
     where = stage.uniform("meet_m", 55.0, 75.0)
     away = stage.uniform("away_m", 50.0, 60.0)
     kind = ActorKind(stage.choice("invader", ("car", "van")))
+    # an oncoming car, offset into the ego's lane
     s = total - (street.start_m + where + away)
     lanes, local = on_chain(stage.network, chain, s)
     car = stage.car(lanes, local, 7.0, kind=kind, behaviour=Behaviour(sees_ego=False))
     _, lateral = stage.path.project(car.pose.x, car.pose.y)
     into = stage.uniform("invaded_m", 1.25, 1.45)
     car.offset_m = lateral - into
+    # adapt its speed to meet the ego at the chosen place
     begin = stage.route_pose(where)
     station = nearest_station(stage, lanes, begin.x, begin.y)
     while stage.arrival_s(where) > 4.0:
@@ -69,6 +73,7 @@ def invader(stage: Stage, street: Street) -> Script:
         wanted = min(max((station - car.station_m) / max(due, 0.2), 2.0), 13.0)
         car.forced_mps2 = min(max((wanted - car.speed) / 0.4, -5.0), 4.0)
         yield
+    # hold the offset until they have passed
     stage.fire("invader", car)
     car.forced_mps2, car.target_speed = 0.0, max(car.speed, 4.0)
     while stage.ahead_m(where) > -25.0 and not car.gone:
@@ -95,6 +100,7 @@ def emergency_behind(stage: Stage, street: Street) -> Script:
         ActorKind.EMERGENCY,
         Behaviour(3.5, headway_s=0.5, jam_gap_m=4.0, obeys_limits=False),
     )
+    # judged at the end of the route
     passed = [False]
 
     def judge() -> Event | None:
@@ -104,6 +110,7 @@ def emergency_behind(stage: Stage, street: Street) -> Script:
         return stage.event(EventKind.YIELD_EMERGENCY, words, car)
 
     stage.at_goal.append(judge)
+    # the event begins when it is close, and ends when it has passed
     while abs(stage.gap_m(car)) > 20.0:
         yield
     stage.fire("emergency_behind", car)

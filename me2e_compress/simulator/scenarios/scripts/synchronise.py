@@ -1,4 +1,4 @@
-"""When things happen: meeting points and synchronised arrivals."""
+"""Timing of scripts: meeting points and synchronised arrivals."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -44,9 +44,8 @@ def chain_points(network: Network, chain: Sequence[LaneIndex]) -> tuple[Floats, 
 def meeting(stage: Stage, chain: Sequence[LaneIndex]) -> tuple[float, float]:
     """Find where a chain of lanes meets the ego's route.
 
-    Returns:
-        Arc length on the route and on the chain of the first crossing, or of the
-        place where the one joins the other.
+    Returns the arc length on the route and on the chain of the first crossing, or of
+    the place where the one joins the other.
     """
     points, stations = chain_points(stage.network, chain)
     route = stage.path.points
@@ -115,11 +114,7 @@ def _hurry(
 def steps_out(stage: Stage, walker: Walker, route_s: float, reach_m: float) -> Script:
     """Start a walker so that it and the ego's front reach the same place together.
 
-    Args:
-        stage: The stage.
-        walker: The pedestrian or cyclist.
-        route_s: Where it crosses the ego's route.
-        reach_m: How far it walks to get there.
+    It crosses the ego's route at ``route_s``, ``reach_m`` from where it stands.
     """
     needed = reach_m / walker.top_speed_mps + 0.25
     while stage.arrival_s(route_s) > needed:
@@ -139,8 +134,8 @@ def patience(
 ) -> Script:
     """Wait until the ego has stood before a place for a while.
 
-    A driver who does not stop never ends this; one who waits too far away does, 25 s
-    after coming within 45 m.
+    It never ends for a driver who does not stop; for one who waits too far away it ends
+    25 s after coming within 45 m.
     """
     stood, near = 0.0, 0.0
     last = stage.time_s
@@ -153,7 +148,7 @@ def patience(
 
 
 def hold(stage: Stage, seconds: float) -> Script:
-    """Wait."""
+    """Wait for some seconds."""
     end = stage.time_s + seconds
     while stage.time_s < end:
         yield

@@ -41,7 +41,7 @@ def blocked_intersection(stage: Stage) -> None:
 
 
 def dynamic_object_crossing(stage: Stage) -> None:
-    """A pedestrian from behind a van."""
+    """A pedestrian steps out from behind a van."""
     two_way(stage)
     stage.play(walker_behind_van(stage))
 
@@ -52,7 +52,7 @@ def hard_break_route(stage: Stage) -> None:
 
 
 def opposite_vehicle_taking_priority(stage: Stage) -> None:
-    """A car takes the right of way that is the ego's."""
+    """A car takes the ego's right of way."""
     stage.play(crossing_car(stage, junction(stage, "ahead")))
 
 
@@ -67,13 +67,13 @@ def parking_cut_in(stage: Stage) -> None:
 
 
 def pedestrian_crossing(stage: Stage) -> None:
-    """People on a crosswalk."""
+    """People cross on a crosswalk."""
     zebra_street(stage)
     stage.play(walkers_on_zebra(stage))
 
 
 def parking_crossing_pedestrian(stage: Stage) -> None:
-    """A pedestrian from between parked cars."""
+    """A pedestrian steps out between parked cars."""
     parking_street(stage)
     stage.play(walker_between_cars(stage))
 
@@ -97,6 +97,6 @@ def vehicle_turning_route_pedestrian(stage: Stage) -> None:
 
 
 def control_loss(stage: Stage) -> None:
-    """A slick bend and a car across it."""
+    """A slick bend leads to a car across it."""
     bend(stage)
     stage.play(spun_car(stage))

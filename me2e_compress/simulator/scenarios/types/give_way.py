@@ -17,5 +17,5 @@ def invading_turn(stage: Stage) -> None:
 
 
 def yield_to_emergency_vehicle(stage: Stage) -> None:
-    """An emergency vehicle from behind."""
+    """An emergency vehicle comes from behind."""
     stage.play(emergency_behind(stage, multilane(stage)))

@@ -19,14 +19,14 @@ from me2e_compress.simulator.traffic.stage import Stage
 
 
 def accident(stage: Stage) -> None:
-    """Accident on a road of several lanes."""
+    """An accident blocks a road of several lanes."""
     street = multilane(stage)
     stage.play(crashed_cars(stage))
     stage.play(neighbours(stage, street))
 
 
 def accident_two_ways(stage: Stage) -> None:
-    """Accident that must be passed through the oncoming lane."""
+    """An accident must be passed through the oncoming lane."""
     street = two_way(stage)
     stage.play(crashed_cars(stage))
     stage.play(oncoming_cars(stage, street))
@@ -40,34 +40,34 @@ def construction_obstacle(stage: Stage) -> None:
 
 
 def construction_obstacle_two_ways(stage: Stage) -> None:
-    """Road works that must be passed through the oncoming lane."""
+    """Road works must be passed through the oncoming lane."""
     street = two_way(stage)
     stage.play(construction(stage))
     stage.play(oncoming_cars(stage, street))
 
 
 def hazard_at_side_lane(stage: Stage) -> None:
-    """Slow cyclists in one of several lanes."""
+    """Slow cyclists ride in one of several lanes."""
     street = multilane(stage)
     stage.play(slow_cyclists(stage, street))
     stage.play(neighbours(stage, street))
 
 
 def hazard_at_side_lane_two_ways(stage: Stage) -> None:
-    """Slow cyclists, passed partly through the oncoming lane."""
+    """Slow cyclists must be passed, partly through the oncoming lane."""
     street = two_way(stage)
     stage.play(slow_cyclists(stage, street))
     stage.play(oncoming_cars(stage, street))
 
 
 def parked_obstacle(stage: Stage) -> None:
-    """A stopped vehicle in a bend of a road of several lanes."""
+    """A vehicle has stopped in a bend of a road of several lanes."""
     bend(stage)
     stage.play(parked_car(stage))
 
 
 def parked_obstacle_two_ways(stage: Stage) -> None:
-    """A stopped vehicle that must be passed through the oncoming lane."""
+    """A stopped vehicle must be passed through the oncoming lane."""
     street = two_way(stage)
     stage.play(parked_car(stage))
     stage.play(oncoming_cars(stage, street))

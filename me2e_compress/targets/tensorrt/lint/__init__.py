@@ -1,4 +1,4 @@
-"""Rules of TensorRT: would its parser take a graph, and run its int8 as int8?"""
+"""Lint rules: does TensorRT's parser accept a graph, and is its int8 run as int8?"""
 
 from me2e_compress.targets.base import LintRule, of_opset, valid
 from me2e_compress.targets.tensorrt.lint import (

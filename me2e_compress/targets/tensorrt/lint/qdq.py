@@ -1,4 +1,4 @@
-"""Explicit quantization: what TensorRT wants of pairs, and where they may stand.
+"""Explicit quantization: TensorRT's requirements on pairs and their positions.
 
 Sources: NvInfer.h and the ONNX parser of TensorRT 10.7; its developer guide, "Explicit
 quantization". What TensorRT-RTX's parser accepts silently (scales by channel on
@@ -60,7 +60,7 @@ def zero_points(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def biases(model: ir.Model) -> Iterator[LintFinding]:
-    """Check that biases stay float: no pair, no int32 behind a DequantizeLinear."""
+    """Check that biases are float: no pair, no int32 before a DequantizeLinear."""
     for node in nodes_of(model):
         if node.op_type not in (*graph.CONVOLUTIONS, "Gemm"):
             continue
@@ -78,7 +78,7 @@ def scalars(model: ir.Model) -> Iterator[LintFinding]:
 def completeness(model: ir.Model) -> Iterator[LintFinding]:
     """Check that only DequantizeLinears of the same scale read a QuantizeLinear.
 
-    Or a plugin that takes int8, and its scale as another input.
+    A plugin that takes int8, and its scale as another input, may also read it.
     """
     for node in pairs_of(model):
         if node.op_type == QUANTIZE:
@@ -113,7 +113,7 @@ def _takes_integers(plugin: ir.Node) -> bool:
 
 
 def integers(model: ir.Model) -> Iterator[LintFinding]:
-    """Check that indices and shapes are not made of dequantized numbers."""
+    """Check that indices and shapes are not computed from dequantized numbers."""
     whole = {ir.DataType.INT32.value, ir.DataType.INT64.value}
     for node in nodes_of(model):
         if node.op_type != "Cast" or not is_dequantized(node.inputs[0]):
@@ -143,7 +143,7 @@ def _integer_type(node: ir.Node, zero: ir.Value | None) -> ir.DataType | None:
 
 
 def channel_scales(model: ir.Model) -> Iterator[LintFinding]:
-    """Check that activations have one scale, and weights one or one a channel."""
+    """Check that activations have one scale, and weights one or one per channel."""
     for node in pairs_of(model):
         scale = graph.static_shape(node.inputs[1])
         if not scale or scale == (1,):
@@ -187,7 +187,7 @@ def _axis(node: ir.Node) -> Iterator[LintFinding]:
 
 
 def repeated_pairs(model: ir.Model) -> Iterator[LintFinding]:
-    """Find what is quantized twice in a row."""
+    """Find tensors that are quantized twice in a row."""
     for node in pairs_of(model):
         if node.op_type == QUANTIZE and is_dequantized(node.inputs[0]):
             yield warning("repeated-pair", node, "quantizes what was just dequantized")
@@ -203,7 +203,7 @@ def outputs(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def branches(model: ir.Model) -> Iterator[LintFinding]:
-    """Find pairs between a convolution and its Add: only the residual has one."""
+    """Find pairs between a convolution and its Add: only the residual may have one."""
     for node in nodes_of(model):
         if node.op_type != "Add" or not is_standard(node):
             continue
@@ -217,13 +217,14 @@ def branches(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def half_quantized(model: ir.Model) -> Iterator[LintFinding]:
-    """Find layers that read int8 on one side only.
+    """Find layers with only one int8 operand.
 
-    A matrix-vector product may: it is as fast as its weight is small.
+    A matrix-vector product may have a float activation: its weight decides its speed.
     """
     for node in nodes_of(model):
         if node.op_type not in WEIGHTED or not is_standard(node):
             continue
+        # Tell which operand is float: the remedy differs.
         sides = [is_dequantized(value) for value in node.inputs[:2]]
         if sides == [True, False]:
             yield warning(
@@ -238,7 +239,7 @@ def half_quantized(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def float_weights(model: ir.Model) -> Iterator[LintFinding]:
-    """Find weights that are stored as float and quantized when the engine is built."""
+    """Find weights stored as float and quantized when the engine is built."""
     for node in pairs_of(model):
         value = node.inputs[0]
         if node.op_type == QUANTIZE and stored(value):
@@ -246,19 +247,19 @@ def float_weights(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def _is_vector(node: ir.Node) -> bool:
-    """Return whether a layer is a product of a matrix by a vector."""
+    """Return whether a layer is a matrix-vector product."""
     products = ("Gemm", "MatMul")
     return node.op_type in products and extent(node, weight=True).is_vector
 
 
 def _is_weight(node: ir.Node) -> bool:
-    """Return whether a pair stands on a constant."""
+    """Return whether a pair quantizes a constant."""
     value = node.inputs[0]
     return stored(value) or (is_quantized(value) and _only_stored(value))
 
 
 def _only_stored(value: ir.Value | None) -> bool:
-    """Return whether a value is a constant, a pair at most in between."""
+    """Return whether a value is a constant, possibly through pairs."""
     node = graph.producer_of(value)
     if node is not None and node.op_type in PAIR:
         return _only_stored(node.inputs[0])
@@ -266,7 +267,7 @@ def _only_stored(value: ir.Value | None) -> bool:
 
 
 def _rounds_convolution(value: ir.Value | None) -> bool:
-    """Return whether a pair reads a convolution that nothing else reads."""
+    """Return whether a value is a pair of a convolution without other readers."""
     if value is None or not is_dequantized(value) or len(value.uses()) != 1:
         return False
     node = value.producer()

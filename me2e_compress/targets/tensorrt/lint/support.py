@@ -1,4 +1,4 @@
-"""What the parser takes: operators, plugins, opsets, types, and its restrictions."""
+"""Parser support: operators, plugins, opsets, types, and restrictions."""
 
 from collections.abc import Callable, Iterator
 
@@ -75,7 +75,7 @@ def element_types(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def one_type(model: ir.Model) -> Iterator[LintFinding]:
-    """Find operators of two float types: networks are strongly typed."""
+    """Find operators with two float types: networks are strongly typed."""
     floats = (ir.DataType.FLOAT, ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
     for node in nodes_of(model):
         if not is_standard(node) or node.op_type in (*PAIR, "CastLike", "Resize"):
@@ -112,7 +112,7 @@ def plugins(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def plugin_shapes(model: ir.Model) -> Iterator[LintFinding]:
-    """Find known plugins whose outputs have no shape: nor has what is behind them."""
+    """Find known plugins whose outputs have no shape, nor what follows them."""
     known = known_plugins()
     for node in unshaped_plugins(model):
         if node.op_type not in known:
@@ -133,6 +133,7 @@ def _call(node: ir.Node, plugin: Plugin) -> Iterator[LintFinding]:
             "plugin", node, f"{name} takes {wanted} inputs, not {len(node.inputs)}"
         )
         return
+    # Check attributes, then type and rank of the first input.
     if missing := [each for each in plugin.attributes if each not in node.attributes]:
         yield error("plugin", node, f"{name} needs attributes {', '.join(missing)}")
     first = node.inputs[0]
@@ -142,6 +143,7 @@ def _call(node: ir.Node, plugin: Plugin) -> Iterator[LintFinding]:
     rank = rank_of(first)
     if None not in (rank, plugin.rank) and rank != plugin.rank:
         yield error("plugin", node, f"{name} takes rank {plugin.rank}, not {rank}")
+    # Indices must be int32.
     for index in plugin.integers:
         value = node.inputs[index]
         if value is not None and value.dtype not in (None, ir.DataType.INT32):

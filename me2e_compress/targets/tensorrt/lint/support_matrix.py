@@ -1,10 +1,10 @@
-"""Tables: the operators that TensorRT's ONNX parser takes, and known plugins.
+"""Tables of the operators that TensorRT's ONNX parser supports, and of plugins.
 
 Operators are those of the support matrix of onnx-tensorrt, ``docs/operators.md``, of
-TensorRT 10.15; what it takes that 10.1 (opset 20) did not is listed apart. An operator
-that stands in neither list is unknown, and reported.
+TensorRT 10.15; those that 10.1 (opset 20) did not support are listed apart. An operator
+in neither list is unknown, and reported.
 
-Plugins have names, inputs and attributes as the dialects of the fused operators say.
+Names, inputs and attributes of plugins come from the dialects of the fused operators.
 TensorRT finds a plugin by the node's operator name, ``plugin_version`` and
 ``plugin_namespace``.
 """
@@ -65,7 +65,8 @@ LATER: dict[str, str] = dict.fromkeys(
     ),
     "10.15",
 )  # fmt: skip
-"""Operators that TensorRT 10.1 did not take, and the version whose matrix has them."""
+"""Operators that TensorRT 10.1 did not support, and the version whose matrix has
+them."""
 
 UNSUPPORTED = frozenset(
     {
@@ -90,12 +91,12 @@ class Plugin:
     """The inputs and attributes of a plugin.
 
     Attributes:
-        source: which library has it.
+        source: the library that has it.
         inputs: least and most number of inputs.
-        attributes: those that are required.
+        attributes: required attributes.
         types: element types of its first input.
-        rank: of its first input; None where any is taken.
-        integers: inputs that must be int32.
+        rank: rank of its first input; None accepts any.
+        integers: indices of inputs that must be int32.
     """
 
     source: str
@@ -107,14 +108,14 @@ class Plugin:
 
 
 _OTHER_DOMAINS = (OWN_DOMAIN, "com.microsoft")
-"""Domains whose operators are no plugins of TensorRT."""
+"""Domains whose operators are not TensorRT plugins."""
 
 
 @functools.cache
 def known_plugins() -> Mapping[str, Plugin]:
-    """Return the plugins of every dialect that is known, by the operator's name.
+    """Return the plugins of all known dialects, by the operator's name.
 
-    Where libraries share a name, what one of them takes is let pass.
+    Where libraries share a name, anything that one of them accepts is allowed.
     """
     rows: dict[str, list[Dialect]] = {}
     for operator in operators():

@@ -1,8 +1,8 @@
-"""Parse and build a graph, and check what was built against its quantization plan.
+"""Parse and build a graph, and check the result against its quantization plan.
 
-A built plan is a binary file that carries readable text for each kernel; its form is
-not documented. It is read to confirm what the quantization plan promises, and for
-nothing else: where the form changes no kernels are found, and that is reported.
+A built plan is a binary file with readable text for each kernel, in an undocumented
+form. It is read only to confirm the quantization plan: if the form changes, no kernels
+are found, and that is reported.
 """
 
 import dataclasses
@@ -51,8 +51,8 @@ class Kernel:
 
     Attributes:
         kind: ``convolution``, ``deconvolution`` or ``product``.
-        nodes: names of the ONNX nodes that it computes; merged ones together.
-        operands: element types of its first two operands, ``?`` if not said.
+        nodes: names of the ONNX nodes that it computes, possibly several merged ones.
+        operands: element types of its first two operands, ``?`` if unknown.
     """
 
     kind: str
@@ -67,20 +67,19 @@ class Kernel:
 
 @dataclasses.dataclass(frozen=True)
 class BuildResult:
-    """The answer of TensorRT-RTX to a graph.
+    """The result of TensorRT-RTX for a graph.
 
     Attributes:
-        version: of TensorRT-RTX.
+        version: version of TensorRT-RTX.
         cut: nodes that were cut out, because it has no plugin library.
-        parsed: whether the parser took the graph.
+        parsed: whether the parser accepted the graph.
         built: whether the builder did; None if it was not run.
-        layers: of the parsed network.
-        errors: of parser and builder.
+        layers: number of layers of the parsed network.
+        errors: errors of parser and builder.
         kernels: convolutions and products of the built plan.
         missing: convolutions (Conv) that the graph's quantization plan makes int8 and
-            that no int8 kernel computes; None if the graph carries no plan, or was not
-            built. What becomes of products and deconvolutions is for the builder to
-            choose.
+            that no int8 kernel computes; None if the graph has no plan, or was not
+            built. Products and deconvolutions are left to the builder's choice.
     """
 
     version: str
@@ -99,20 +98,16 @@ class BuildResult:
 
 
 def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> BuildResult:
-    """Parse and build a graph by TensorRT-RTX, without a GPU.
+    """Parse and build a graph with TensorRT-RTX, without a GPU.
 
-    A minute and 1 GB for 1,500 nodes and 55 convolutions.
-
-    Args:
-        model: the graph; it stays as it is.
-        sm: GPU generation to build for, of :data:`SM`.
-        build: whether to build, or only parse.
+    It takes a minute and 1 GB for 1,500 nodes and 55 convolutions. ``sm`` is one of
+    :data:`SM`.
 
     Raises:
         MissingExtraError: TensorRT-RTX is not installed.
-        BrokenPackageError: it is, and cannot be imported.
-        RecipeError: no such generation.
-        GraphError: the parser took its process down; the message has its last line.
+        BrokenPackageError: it is installed, but cannot be imported.
+        RecipeError: no such GPU generation.
+        GraphError: the parser crashed; the message has its last line.
         PreconditionError: the graph cannot be cut at a plugin.
     """
     if importlib.util.find_spec("tensorrt_rtx") is None:
@@ -120,11 +115,13 @@ def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> BuildResult:
     if sm not in SM:
         listed = ", ".join(str(each) for each in SM)
         raise RecipeError(f"no GPU generation {sm}; there are {listed}")
+    # Cut out the plugins, and build the rest in another process.
     ready = model.clone()
     graph.infer_shapes(ready)
     part, gone = cut(ready)
     with tempfile.TemporaryDirectory(prefix="me2e-rtx-") as scratch:
         answer, plan = _ask(part, Path(scratch), sm, build=build)
+    # Confirm that the planned nodes are int8 kernels.
     kernels = () if plan is None else read_kernels(plan)
     errors = [*answer["errors"], *answer["log"]] if not _went_well(answer) else []
     return BuildResult(

@@ -1,4 +1,4 @@
-"""Cut out of a graph what TensorRT-RTX has no library for."""
+"""Cut nodes out of a graph that TensorRT-RTX lacks a library for."""
 
 import onnx_ir as ir
 
@@ -7,22 +7,20 @@ from me2e_compress.errors import PreconditionError
 from me2e_compress.graph.nodes import is_plugin
 
 LACKING = frozenset({"DeformConv", "NonMaxSuppression", "NonZero", "RoiAlign"})
-"""Operators that TensorRT takes, by its own plugins, and TensorRT-RTX does not."""
+"""Operators that TensorRT supports by its own plugins, and TensorRT-RTX does not."""
 
 
 def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:
     """Cut a graph at plugins: their outputs become inputs, their inputs outputs.
 
-    Nodes with a local function are not plugins: the parser reads the function.
-
-    Args:
-        model: the graph, shapes inferred; it stays as it is.
+    Nodes with a local function are not plugins: the parser reads the function. Shapes
+    must be inferred.
 
     Returns:
         The copy, and the names of the nodes that were cut out.
 
     Raises:
-        PreconditionError: type or shape of a plugin's output is not known.
+        PreconditionError: type or shape of a plugin's output is unknown.
     """
     copy = model.clone()
     copy.metadata_props.clear()  # it speaks of inputs and outputs that change
@@ -56,6 +54,7 @@ def _detach(where: ir.Graph, node: ir.Node) -> None:
         heir = ir.Value(name=name, shape=value.shape, type=value.type)
         value.replace_all_uses_with(heir)
         where.inputs.append(heir)
+    # What the node read must still be computed.
     for index, read in enumerate(node.inputs):
         computed = read is not None and read.producer() is not None
         if read is not None and computed and not read.is_graph_output():

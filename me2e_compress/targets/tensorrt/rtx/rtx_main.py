@@ -1,4 +1,4 @@
-"""The part that loads TensorRT-RTX, in a process of its own: its parser may abort.
+"""Run TensorRT-RTX in a separate process, because its parser may abort.
 
 python rtx_main.py MODEL.onnx ANSWER.json SM [PLAN]
 """
@@ -41,6 +41,7 @@ def work(model: Path, sm: int, plan: Path | None) -> dict[str, object]:
         "layers": network.num_layers,
         "built": None,
     }
+    # Build for the generation without a GPU.
     if parsed and plan is not None:
         config = builder.create_builder_config()
         config.num_compute_capabilities = 1
