@@ -98,10 +98,8 @@ def one_reader(graph: grimp.ImportGraph, root: Path) -> Iterator[str]:
         beside = module.rpartition(".")[0] == reader.rpartition(".")[0]
         if not beside or graph.find_children(reader):
             continue
-        sizes = [
-            _file(root, each).read_bytes().count(b"\n") for each in (module, reader)
-        ]
-        if sum(sizes) <= TOGETHER:
+        both = (_file(root, each).read_bytes() for each in (module, reader))
+        if sum(text.count(b"\n") for text in both) <= TOGETHER:
             yield _short(module)
 
 

@@ -39,7 +39,13 @@ def test_no_file_stands_alone_that_fits_into_its_one_reader(house: House) -> Non
     assert sorted(house.one_reader) == budget()["kept"]["one_reader"]
 
 
-@pytest.mark.parametrize("call", CALLS)
+@pytest.mark.parametrize(
+    "call",
+    [
+        each if each == "compress" else pytest.param(each, marks=pytest.mark.slow)
+        for each in CALLS
+    ],
+)
 def test_a_call_enters_no_more_files_and_functions_than_it_may(call: str) -> None:
     files, functions = budget()["entered"][call]
     found = entered(call)
