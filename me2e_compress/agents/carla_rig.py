@@ -81,6 +81,7 @@ class CarlaRig:
         ``seen`` holds the indices of the cameras that a model sees.
         """
         columns, rows = self.rendered
+        # cameras that the model sees
         mounted: SensorSpecs = [
             {
                 "type": "sensor.camera.rgb",
@@ -92,6 +93,7 @@ class CarlaRig:
             for place, camera in enumerate(self.cameras)
             if place in seen
         ]
+        # IMU, GPS and speedometer
         level = {"roll": 0.0, "pitch": 0.0, "yaw": 0.0}
         behind = {"x": BEHIND_M, "y": 0.0, "z": 0.0, **level}
         others: SensorSpecs = [

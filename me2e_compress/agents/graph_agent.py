@@ -152,6 +152,7 @@ class GraphAgent(ForwardingAgent):
     def run_step(self, input_data: SensorData, timestamp: float) -> CarlaControl:
         """Return this frame's control."""
         reading = self.tick(input_data)
+        # times count from the first tick
         if self._began_s is None:
             self._began_s = timestamp
         time_us = round((timestamp - self._began_s) * 1e6)
@@ -160,6 +161,7 @@ class GraphAgent(ForwardingAgent):
             found = checked(self._policy.plan(observation))
         except EvaluationError as error:
             raise EvaluationError(f"step {self.step}: {error}") from error
+        # a plan is followed by PID
         if not isinstance(found, PedalsAndWheel):
             speed_mps = reading.motion.speed_mps
             found = self._pid.control(found, speed_mps, reading.node)

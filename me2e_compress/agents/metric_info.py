@@ -43,6 +43,7 @@ class MetricInfo:
         """Write the file, if there is a record."""
         if not self.records:
             return
+        # beside the agent's own files, if it writes any
         own = getattr(self.agent, "save_path", None)
         path = (self.folder if own is None else Path(own)) / FILE
         records = {str(step): record for step, record in self.records.items()}

@@ -36,10 +36,12 @@ class RouteFollower:
         node is never passed. The ego is at ``x`` metres east, ``y`` north; the result
         is (float64 [2] x east, y north; command 0 to 5, as `Observation` numbers it).
         """
+        # nodes ahead, with their distance along the route
         places = self._places[self._at :]
         steps = np.hypot(*np.diff(places, axis=0).T)
         begins = np.concatenate([[0.0], np.cumsum(steps)[:-1]])
         away = np.hypot(*(places[1:] - (x, y)).T)
+        # step to the farthest node that is reached, never to the last one
         reached = (away <= PASSED_M) & (begins[: len(away)] <= AHEAD_M)
         if reached.any():
             farthest = int(np.argmax(np.where(reached, away, -1.0))) + 1

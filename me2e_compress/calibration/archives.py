@@ -30,10 +30,6 @@ def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared
     """Read the headers of an ``.npz`` by array name, without the arrays.
 
     The message calls the expected content ``what``.
-
-    Raises:
-        FramesError: the file cannot be read, is larger than `LARGEST_BYTES`, or an
-            array has another size than its header states.
     """
     try:
         check_regular(path)

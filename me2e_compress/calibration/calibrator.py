@@ -41,7 +41,6 @@ class Calibrator:
         checkpoint: file of the progress, from which a calibration resumes; it is
             removed at the end. None keeps none.
         every: frames between two checkpoints.
-        provider: the execution provider.
     """
 
     method: str = "max-min"

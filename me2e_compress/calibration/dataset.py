@@ -133,8 +133,8 @@ class CalibrationSet(Displayed):
         same.
 
         Raises:
-            FramesError: the first array that is missing, unknown, of another shape or
-                dtype, or not finite.
+            FramesError: an array is missing, unknown, of another shape or dtype, or not
+                finite.
         """
         fixed = static_inputs(model)
         for path in self.files:

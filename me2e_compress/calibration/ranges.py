@@ -51,11 +51,7 @@ class Ranges(Displayed):
 
     @classmethod
     def of(cls, seen: Statistics, method: Observer) -> Self:
-        """Compute ranges from the statistics of a calibration.
-
-        Raises:
-            FramesError: the method needs histograms, and none were collected.
-        """
+        """Compute ranges from the statistics of a calibration."""
         lows, highs = method.ranges(seen)
         bounds = zip(lows.tolist(), highs.tolist(), strict=True)
         return cls(
@@ -94,12 +90,7 @@ class Ranges(Displayed):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what :meth:`save` wrote.
-
-        Raises:
-            FramesError: no such file, or a bound is not a float32 number or the low one
-                is above the high one.
-        """
+        """Read what :meth:`save` wrote, and check the bounds."""
         if not path.is_file():
             raise FramesError(f"{path}: no such ranges file")
         try:

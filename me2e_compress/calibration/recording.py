@@ -25,12 +25,10 @@ PROGRESS = "progress.json"
 
 @dataclasses.dataclass(frozen=True)
 class Begin:
-    """Where a recording resumes.
+    """Where a recording resumes: the first missing frame, which begins a scene.
 
-    Attributes:
-        frame: the first missing frame; a scene begins there.
-        place: number of that scene among those that its source tries; some may give no
-            frame.
+    ``place`` is the number of that scene among those that its source tries; some may
+    give no frame.
     """
 
     frame: int = 0
@@ -51,17 +49,11 @@ def write_recording(
     """Write a folder that `CalibrationSet` reads, atomically.
 
     It has one ``000000.npz`` a frame, keyed by input name, ``000000.future.json`` where
-    the future is known, and ``scenes.json`` with the starts of scenes. An earlier
-    recording in the folder is replaced. The same frames give the same bytes. Complete
-    scenes of a killed run are kept in a separate folder beside it, and the same run
-    resumes from them.
-
-    Args:
-        folder: the folder to write.
-        source: yields the frames; the first starts a scene.
-        about: further entries of ``scenes.json``: the model, the seed.
-        key: what else determines the frames; only a run with the same key resumes.
-        pixels: the inputs that the source yields as bytes, by name.
+    the future is known, and ``scenes.json`` with the starts of scenes and with
+    ``about``. An earlier recording in the folder is replaced. The same frames give the
+    same bytes. Complete scenes of a killed run are kept in a separate folder beside it,
+    and a run with the same ``about`` and ``key`` resumes from them. ``pixels`` has the
+    inputs that the source yields as bytes, by name.
 
     Raises:
         FramesError: there are no frames, or a folder holds something else.

@@ -20,13 +20,7 @@ _STATE = "state/"
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationState:
-    """Progress of one pass over the frames.
-
-    Attributes:
-        done: frames seen.
-        results: results so far, by name.
-        state: values of the recurrent inputs for the next frame.
-    """
+    """Frames done in one pass, results so far, and the state for the next frame."""
 
     done: int = 0
     results: Mapping[str, Array] = dataclasses.field(default_factory=dict)
@@ -35,12 +29,9 @@ class CalibrationState:
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationCheckpoint:
-    """The file of a calibration's progress.
+    """The file of a calibration's progress; a path of None keeps nothing.
 
-    Attributes:
-        path: the file; None keeps nothing.
-        key: identifies the calibration: digest of the graph, tensors, frames, ...
-        every: frames between two writes.
+    ``key`` identifies the calibration: digest of the graph, tensors, frames, ...
     """
 
     path: Path | None
@@ -48,11 +39,7 @@ class CalibrationCheckpoint:
     every: int = 8
 
     def read(self) -> CalibrationState:
-        """Read the progress; an empty one if there is no file.
-
-        Raises:
-            FramesError: the file is of another calibration, or cannot be read.
-        """
+        """Read the progress; an empty one if there is no file."""
         if self.path is None or not self.path.is_file():
             return CalibrationState()
         try:

@@ -16,10 +16,8 @@ from me2e_compress.runtime.frames import Frame
 class FrameSubset:
     """Some of the frames of a recording, in its order; the first starts a scene.
 
-    Attributes:
-        whole: the recording.
-        places: indices of its frames.
-        share: which shard of which sample; None if it is not a shard.
+    ``places`` are indices in the whole recording; ``share`` is None if it is not a
+    shard.
     """
 
     whole: CalibrationSet
@@ -57,9 +55,6 @@ def draw(whole: CalibrationSet, count: int, seed: int) -> FrameSubset:
 
     Scenes stay complete, since recurrent state grows along them; only the last one
     drawn is cut at its end. A shorter recording is taken whole: no frame counts twice.
-
-    Raises:
-        FramesError: ``count`` is below 1.
     """
     if count < 1:
         raise FramesError(f"{count} frames were asked for; at least 1 is needed")
@@ -92,11 +87,7 @@ def hold_out(whole: CalibrationSet, most: int) -> tuple[FrameSubset, FrameSubset
 
 
 def shard(part: FrameSubset, number: int, count: int) -> FrameSubset:
-    """Return part ``number`` (from 1) of ``count``, with about as many scenes each.
-
-    Raises:
-        FramesError: no such shard, or fewer scenes than shards.
-    """
+    """Return part ``number`` (from 1) of ``count``, with about as many scenes each."""
     if not 1 <= number <= count:
         raise FramesError(f"no shard {number} of {count}: they count from 1")
     taken = set(part.places)

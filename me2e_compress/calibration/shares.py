@@ -8,13 +8,7 @@ from me2e_compress.errors import FramesError
 
 @dataclasses.dataclass(frozen=True)
 class Share:
-    """One shard of the sampled frames.
-
-    Attributes:
-        number: number of the shard, from 1.
-        count: number of shards.
-        drawn: indices in the recording of the frames of all shards.
-    """
+    """One of ``count`` shards, from 1, of the frames ``drawn`` from a recording."""
 
     number: int
     count: int
@@ -25,10 +19,6 @@ def check_whole(shares: Sequence[Share | None]) -> None:
     """Check that shards are all those of one sample.
 
     None stands for statistics that are not a shard; all None is accepted.
-
-    Raises:
-        FramesError: only some are shards, their samples or counts differ, or one is
-            missing.
     """
     known = [each for each in shares if each is not None]
     if not known:

@@ -30,13 +30,7 @@ from me2e_compress.runtime.stack.stack_session import PartRun, StackSession
 
 @dataclasses.dataclass(frozen=True)
 class StackCalibrator:
-    """Measure the ranges of every file of a stack.
-
-    Attributes:
-        method: as in :class:`~me2e_compress.calibration.calibrator.Calibrator`.
-        threads: threads within an operator; 0 takes every core.
-        provider: the execution provider.
-    """
+    """Measure the ranges of every file of a stack, with options of ``Calibrator``."""
 
     method: str = "max-min"
     threads: int = 0
@@ -52,17 +46,9 @@ class StackCalibrator:
     ) -> dict[str, Ranges]:
         """Run the stack over the frames, once; twice where histograms are needed.
 
-        Args:
-            stack: how the files are joined.
-            models: the float graph of every file, by label.
-            tensors: tensors to measure in each; empty for a file that stays float.
-            frames: the frames of the stack.
-            progress: called with frames done and all frames, of all passes.
-
-        Raises:
-            FramesError: a frame does not fit, or makes a tensor NaN or infinite; or a
-                file runs at none of the frames.
-            GraphError: onnxruntime cannot run a file.
+        ``models`` has the float graph of every file by label, ``tensors`` those to
+        measure in it, none for a file that stays float. ``progress`` is called with
+        frames done and all frames, of all passes.
         """
         counting = OBSERVERS.parse(self.method).counts
         job = _Job(self, stack, models, tensors, frames, 2 if counting else 1, progress)

@@ -35,9 +35,7 @@ class Statistics:
     """Statistics of a calibration; shards of one recording can be merged.
 
     Attributes:
-        model: digest of the graph.
         source: fingerprint of the recording.
-        tensors: names of the tensors.
         frames: indices of the frames in the recording.
         measured: float32 [frames, tensors, 3]: smallest and largest element, mean
             square; infinity, minus infinity and 0 where a tensor had no element.
@@ -122,11 +120,7 @@ class Statistics:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what :meth:`save` wrote.
-
-        Raises:
-            FramesError: no such file, or not saved statistics.
-        """
+        """Read what :meth:`save` wrote."""
         if not path.is_file():
             raise FramesError(f"{path}: no such statistics file")
         held: dict[str, npt.NDArray[Any]] = load_arrays(path, "saved statistics")

@@ -116,9 +116,6 @@ def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.M
     """Return a copy of a graph with a probe right after each tensor's producer.
 
     The last output of the copy is :data:`READINGS`.
-
-    Raises:
-        GraphError: the graph has no such tensor.
     """
     copy = model.clone()
     known = _values(copy)

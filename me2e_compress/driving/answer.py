@@ -30,6 +30,7 @@ def checked(answer: object) -> Trajectory | PedalsAndWheel:
         return _in_range(answer)
     if isinstance(answer, Trajectory):
         return Trajectory(_finite(answer.points), np.asarray(answer.times_s))
+    # an array of six waypoints
     if not isinstance(answer, np.ndarray) or answer.dtype.kind != "f":
         raise EvaluationError(f"the plan is not a float array but {_kind(answer)}")
     if answer.shape != PLAN_SHAPE:

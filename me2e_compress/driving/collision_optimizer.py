@@ -83,6 +83,7 @@ class CollisionOptimizer(HostStage):
         cells, step = self.near(plan, self._occupancy(outputs))
         if not len(cells):
             return HostWork(plan)
+        # UniAD's weight is of its own cells
         reference = np.asarray(plan, np.float64)
         weight = self.weight * (self.cell_m / UNIAD_CELL_M) ** 2
         problem = _Problem(reference, cells, step, self.sigma_m, weight)
@@ -97,8 +98,10 @@ class CollisionOptimizer(HostStage):
         The plan is [6, 2] in the ego frame, the occupancy [T, rows, columns]; a cell of
         time t is compared with waypoint t.
         """
+        # occupied cells at the time of each waypoint, the last one repeated
         times = np.minimum(np.arange(len(plan)), len(occupancy) - 1)
         step, row, column = np.nonzero(occupancy[times] > self.threshold)
+        # centres of the cells
         x = self.front_m - self.cell_m * (row + 0.5)
         y = self.left_m - self.cell_m * (column + 0.5)
         cells = np.stack([x, y], axis=-1).astype(np.float64)

@@ -80,6 +80,7 @@ class HeadFusion:
         followed = self._pid.control(plan, speed_mps, node)
         if self.options.rule == "bench2drive":
             return self._mean(followed, control, speed_mps)
+        # TCP: the control head leads while the ego turns
         lead, other = (control, followed) if self.turning else (followed, control)
         fused = self._weighted(lead, other, self.options.share)
         self._steers.append(abs(fused.steer))

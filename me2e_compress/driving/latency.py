@@ -219,11 +219,13 @@ def parse_latency(
 def _with_options(source: LatencySource, options: dict[str, object]) -> LatencySource:
     """Give options to the source, or to the one below it."""
     fields = type(source).__dataclass_fields__
+    # options belong to the innermost source
     inner = getattr(source, "source", None)
     if isinstance(inner, LatencySource):
         return LATENCY_SOURCES.with_options(
             source, {"source": _with_options(inner, options)}
         )
+    # a source that draws nothing has no seed
     kept = {
         option: value
         for option, value in options.items()

@@ -129,6 +129,7 @@ class AgentsLatency(LayeredLatency):
             raise EvaluationError(
                 "latency agents: what drives here does not tell where others are"
             )
+        # within range and field of view
         x, y = facts.agents_m.T
         near = np.hypot(x, y) <= self.range_m
         ahead = np.abs(np.arctan2(y, x)) <= np.radians(self.fov_deg) / 2

@@ -78,6 +78,7 @@ class OnnxPolicy:
             )
         first = FirstValues.of(session, adapter.recurrent, recurrent)
         policy = cls(session, adapter, inputs, outputs, recurrent, first, stage)
+        # a misfit that only a run shows
         policy._dry_run()
         return policy
 
@@ -107,12 +108,14 @@ class OnnxPolicy:
 
     def plan(self, observation: Observation) -> Answer:
         """Run the model once."""
+        # run the model, with first values where a route begins
         feeds = self.feeds(observation)
         if self._begins:
             self._state |= self.first.at(feeds)
         outputs = self.session.run({**self._state, **feeds}, first=self._begins)
         self._begins = False
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
+        # the host stage may change the plan
         plan = self.outputs.trajectory(outputs, feeds, observation)
         if plan is not None and self.stage is not None:
             plan = self._changed(plan, self.stage, outputs)

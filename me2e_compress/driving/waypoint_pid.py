@@ -106,15 +106,18 @@ class WaypointPid:
 
     def _steering(self, waypoints: npt.NDArray[np.float64], node: Place) -> float:
         asked = self.options
+        # the waypoint aimed at
         middles = (waypoints[1:] + waypoints[:-1]) / 2
         aim = int(np.argmin(np.abs(np.hypot(*middles.T) - asked.aim_m)))
         angle = _quarter_turns(*waypoints[aim])
+        # follow the route's node instead where the plan's end strays from it
         at_end = _quarter_turns(*(waypoints[-1] - waypoints[-2]))
         to_node = _quarter_turns(*node)
         outlier = abs(to_node - at_end) > asked.angle_threshold
         near = node[1] < asked.node_within_m
         follow = abs(to_node) < abs(angle) or (outlier and near)
         self._angles.append(to_node if follow else angle)
+        # PID over the window
         gains = asked.turn_kp, asked.turn_ki, asked.turn_kd
         return min(max(_pid(self._angles, *gains), -1.0), 1.0)
 

@@ -166,12 +166,14 @@ def common_adapter(a: AnySession, b: AnySession) -> tuple[PlanAdapter | None, st
     adapter = PlanAdapter.of(a.metadata, list(a.outputs))
     if adapter is None:
         return None, "the model does not say which output is its plan"
+    # an output called plan that has no plan's shape
     shape = a.outputs[adapter.output].shape
     if PLAN not in a.metadata and (len(shape) not in (3, 4) or shape[-1] != 2):
         return None, f"{adapter.output} is {list(shape)}, a plan is [1, n, 2]"
     for needed in (adapter.output, adapter.scores):
         if needed is not None and needed not in b.outputs:
             return None, f"the second model has no output {needed}"
+    # several modes need something that picks one
     sides = shape if adapter.shape is None else (1, *adapter.shape)
     if len(sides) == MODES_RANK and isinstance(modes := sides[1], int):
         adapter.check_modes(modes)
@@ -200,6 +202,7 @@ class _Tally:
         self.discrete = a.dtype.kind not in "fc"
         if not x.size:
             return
+        # sums for the SQNR, largest values for the error
         gap = np.abs(x - y)
         self.signal += float(np.vdot(x, x))
         self.noise += float(np.vdot(gap, gap))

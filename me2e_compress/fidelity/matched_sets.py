@@ -59,11 +59,13 @@ class SetOutputs(pydantic.BaseModel):
         except (documents.MalformedError, pydantic.ValidationError) as error:
             first = str(error).splitlines()[0]
             raise GraphError(f"metadata {SETS} names no outputs: {first}") from error
+        # boxes and scores must have a row per agent
         rows = {tuple(shapes.get(each, ())[:2]) for each in (found.boxes, found.scores)}
         if len(rows) != 1 or len(shapes.get(found.boxes, ())) != 3:
             return None
         if len(shapes[found.scores]) != 2:
             return None
+        # other outputs count if they have them too
         others = tuple(
             each for each in found.others if tuple(shapes.get(each, ())[:2]) in rows
         )

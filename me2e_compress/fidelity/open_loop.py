@@ -67,6 +67,7 @@ class OpenLoopTally:
         except (EvaluationError, GraphError) as error:
             self.reason = str(error)
             return
+        # distances to the recorded drive, and collisions
         driven = np.array(future.waypoints, np.float64)
         apart = np.stack([np.linalg.norm(plan - driven, axis=1) for plan in plans])
         self.judged.append(
@@ -96,6 +97,7 @@ def _hits(plans: list[Floats], driven: Floats, future: RecordedFuture) -> Floats
         ]
         for path in (driven, *plans)
     ]
+    # a step where the recorded drive touches a box counts for nobody
     recorded, *planned = np.array(found)
     return np.array([each & ~recorded for each in planned], np.float64)
 

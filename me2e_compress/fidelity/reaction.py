@@ -24,6 +24,7 @@ def plan_reaction(
     adapter = PlanAdapter.of(session.metadata, list(session.outputs))
     if adapter is None:
         raise EvaluationError("the model does not say which output is its plan")
+    # the same frame, with one image exchanged
     changed = {**frame.arrays, image: _exchanged(frame, other, image, camera)}
     needed = [adapter.output, *([adapter.scores] if adapter.scores else [])]
     plans = [
@@ -31,6 +32,7 @@ def plan_reaction(
         for arrays in (frame.arrays, changed)
         for values in replay(session, [Frame(0, True, arrays)], needed)
     ]
+    # relative to the plan's own length
     length = float(np.linalg.norm(plans[0]))
     gap = float(np.linalg.norm(plans[1] - plans[0]))
     return gap / length if length else (float("inf") if gap else 0.0)

@@ -87,6 +87,7 @@ def leaderboard_scores(
     episodes: Sequence[Episode], penalties: Version = "b2d", set_size: int = FULL_SET
 ) -> LeaderboardScores:
     """Score a set of records as the leaderboard and as Bench2Drive's tools do."""
+    # values as given, computed, and without low speed
     given = [each.given for each in episodes if each.given is not None]
     scored = [score_under(each, penalties) for each in episodes]
     unhurried = [_without_low_speed(each, penalties) for each in episodes]

@@ -129,6 +129,7 @@ def score(
     episodes: Sequence[Episode], expected: int = FULL_SET, seed: int = 0
 ) -> Scores:
     """Score a set of routes; their order affects nothing but the bootstrap."""
+    # means over routes with their intervals
     in_motion = comfort.comfort_in_motion
     mean_ability, each_ability = _abilities(episodes, seed)
     return Scores(

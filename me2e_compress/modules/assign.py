@@ -73,6 +73,7 @@ def _check(model: ir.Model, modules: ModuleMap, scopes: Mapping[ir.Node, str]) -
     wanted = modules.required()
     if not wanted:
         return
+    # each required pattern must match a parameter or a scope
     paths = dict.fromkeys(scopes.values()) | dict.fromkeys(_parameters(model))
     found = {claim for path in paths for claim in modules.claims(path)}
     for module, pattern in wanted:

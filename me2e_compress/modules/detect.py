@@ -27,9 +27,11 @@ def detect(model: ir.Model) -> ModuleMap:
 
 
 def _detect(stack: str | None, paths: list[str]) -> ModuleMap:
+    # the stack's own name decides
     for name in presets():
         if stack is not None and (stack == name or stack.startswith(f"{name}-")):
             return ModuleMap.load(name)
+    # else the best fit
     ranked = sorted(
         ((*_fit(ModuleMap.load(name), paths), name) for name in presets()),
         key=lambda entry: (-entry[0], -entry[1], entry[2]),
@@ -71,6 +73,7 @@ def map_of_files(
             return _detect(stack, paths).lenient()
         except ModuleMapError:
             return ModuleMap.whole()
+    # a named map must match in some file
     found = ModuleMap.load(name)
     claimed = {claim for path in paths for claim in found.claims(path)}
     for module, pattern in found.required():

@@ -54,6 +54,7 @@ def itemise(
     nodes: dict[str, list[ir.Node]] = {name: [] for name in modules.names()}
     for node in model.graph.all_nodes():
         nodes.setdefault(module_of(node), []).append(node)
+    # weights by the module that owns them
     elements, size = dict.fromkeys(nodes, 0), dict.fromkeys(nodes, 0)
     for owner, tensor in _owned(model, modules, module_of):
         size[owner] = size.get(owner, 0) + tensor.nbytes

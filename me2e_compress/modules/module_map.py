@@ -94,12 +94,14 @@ class ModuleMap(Displayed):
             ModuleMapError: no such preset or file, not TOML, or not a map.
         """
         path = Path(source)
+        # a user's file
         if path.suffix == ".toml":
             if not path.is_file():
                 raise ModuleMapError(f"{path}: no such file")
             with documents.reading(path, ModuleMapError, "not TOML"):
                 content = documents.content(path)
             return cls.parse(content, path.stem, str(path))
+        # presets
         if str(source) == WHOLE:
             return cls.whole()
         if str(source) not in presets():

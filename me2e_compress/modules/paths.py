@@ -92,11 +92,13 @@ def scope_of(node: ir.Node) -> str:
     """
     props = node.metadata_props
     if props:
+        # the dynamo exporter's metadata, the node itself left out
         if (scopes := props.get(_SCOPES)) is not None:
             return _last_path(_parse_list(scopes)[:-1])
         if (namespace := props.get(_NAMESPACE)) is not None:
             paths = [part.partition(": ")[0] for part in namespace.split("/")]
             return _last_path(paths[:-1])
+    # the TorchScript exporter's names
     scope = _from_name(node.name)
     if not scope and node.outputs:
         scope = _from_name(node.outputs[0].name)

@@ -82,12 +82,7 @@ class RawAttention(Dialect):
     def inputs_from_own(
         self, call: FusedCall, inputs: Values, attributes: Attributes
     ) -> Values:
-        """Write offsets from a reference point at 0, and remove the softmax.
-
-        Raises:
-            PreconditionError: the weights do not come from a softmax over all levels
-                and points.
-        """
+        """Write offsets from a reference point at 0; weights must be of a softmax."""
         value, shapes, _, locations, weights = five(inputs)
         batch, queries, heads = (call.size(locations, axis) for axis in range(3))
         # Positions 0..1 become pixels
@@ -205,7 +200,6 @@ def _columns_and_rows(call: FusedCall, shapes: ir.Value, like: ir.Value) -> ir.V
 
 
 def _starts(call: FusedCall, shapes: ir.Value) -> ir.Value:
-    """Write the first row of each level, [L] int64."""
     known = array_of(shapes)
     if known is not None:
         areas = known.astype(np.int64).prod(axis=1)

@@ -15,12 +15,7 @@ from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values
 
 @dataclasses.dataclass(frozen=True)
 class Cost:
-    """The cost of one call; None where shapes are open.
-
-    Attributes:
-        macs: multiply-accumulates.
-        bytes: bytes read and written, each operand and result once.
-    """
+    """The multiply-accumulates, and the bytes read and written, of a call if known."""
 
     macs: int | None
     bytes: int | None
@@ -46,8 +41,7 @@ class Operator(abc.ABC):
 
     @abc.abstractmethod
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
-        """Write the operator in standard operators; return the output in the own form.
-        """
+        """Write the operator in standard operators; return the own form's output."""
 
     @abc.abstractmethod
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
@@ -57,10 +51,7 @@ class Operator(abc.ABC):
     def output_shape(
         self, shapes: Sequence[Dims | None], attributes: Attributes
     ) -> Dims | None:
-        """Return the output's shape in the own form; None if even the rank is unknown.
-
-        Open dimensions are None, as is the shape of an input of unknown rank.
-        """
+        """Return the output's shape in the own form, with None for open dimensions."""
 
     @abc.abstractmethod
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
@@ -79,12 +70,7 @@ class Operator(abc.ABC):
         return dialect.result_from_own_array(result)
 
     def cost(self, node: ir.Node, dialect: Dialect) -> Cost:
-        """Return the cost of one call as far as the shapes are known.
-
-        Raises:
-            PreconditionError: the node has an attribute that this dialect does not
-                know.
-        """
+        """Return the cost of one call as far as the shapes are known."""
         shapes = dialect.shapes_to_own([open_shape(value) for value in node.inputs])
         attributes = dialect.options_to_own(dialect.attributes_of(node))
         return Cost(

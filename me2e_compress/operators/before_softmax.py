@@ -14,8 +14,7 @@ _LAYOUT = ("Expand", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze")
 def before_softmax(call: FusedCall, weights: ir.Value, axes: int) -> ir.Value | None:
     """Write the scores of a softmax in the layout of its weights, if there is one.
 
-    The last ``axes`` axes of ``weights`` are one row. Returns None if the weights do
-    not come from a softmax over whole rows, or if a shape on the way is unknown.
+    The last ``axes`` axes of ``weights`` are one row of the softmax.
     """
     shape = static_shape(weights)
     if shape is None:
@@ -44,7 +43,6 @@ def before_softmax(call: FusedCall, weights: ir.Value, axes: int) -> ir.Value | 
 
 
 def _keeps_rows(node: ir.Node, row: int) -> bool:
-    """Return whether a layout operator keeps the numbers of each row together."""
     read, made = static_shape(node.inputs[0]), static_shape(node.outputs[0])
     if read is None or made is None:
         return False

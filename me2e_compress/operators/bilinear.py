@@ -66,7 +66,6 @@ def sample_levels(
 
 
 def _by_kernel(call: FusedCall, *inputs: ir.Value) -> ir.Value:
-    """Write one node whose kernel takes the inputs of :func:`sample_levels`."""
     value, weights = inputs[0], inputs[-1]
     result = call.add("MultiScaleDeformableAttention", inputs, domain=DOMAIN)
     sizes = [call.known_size(weights, axis) for axis in range(3)]
@@ -194,7 +193,6 @@ def _neighbours(
 
 
 def _first_rows(call: FusedCall, padded: ir.Value, starts: ir.Value) -> ir.Value:
-    """Write the first row of each map and head, [N, 1, M, L, 1]."""
     batch, length, heads = (call.size(padded, axis) for axis in (0, 1, 2))
     many = call.value_of(heads)
     starts = call.cast(starts, ir.DataType.INT64)
@@ -212,10 +210,7 @@ def _first_rows(call: FusedCall, padded: ir.Value, starts: ir.Value) -> ir.Value
 def sample_levels_array(
     value: Numbers, sizes: Sizes, starts: Sizes, locations: Numbers, weights: Numbers
 ) -> Numbers:
-    """Compute :func:`sample_levels` in numpy, [N, Q, M, D] float64.
-
-    A position that is not finite counts as outside.
-    """
+    """Compute :func:`sample_levels` in numpy; infinite positions are outside."""
     batch, _, heads, _ = value.shape
     total = np.zeros((batch, locations.shape[1], heads, value.shape[3]))
     image = np.arange(batch).reshape(-1, 1, 1, 1)

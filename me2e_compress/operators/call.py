@@ -23,16 +23,9 @@ _INT64 = ir.DataType.INT64
 class FusedCall:
     """Inserts the nodes of a body or conversion before one fused node.
 
-    New nodes inherit the node's module and origins, and their shape and type are
-    inferred at once, so that the next node can depend on them.
-
-    Args:
-        node: in a graph or in a function; it is not changed.
-        opset: of the standard operators.
-        by: the name of the pass, for the provenance.
-        names: of all values of the model; new ones are added. None collects them from
-            the whole graph, which is slow for many nodes.
-        compiled: whether a body may call compiled kernels.
+    New nodes inherit its module and origins, and their shape and type are inferred at
+    once. ``names`` of all values of the model grow; None collects them from the whole
+    graph, which is slow for many nodes. ``compiled`` allows calls of compiled kernels.
     """
 
     def __init__(
@@ -238,7 +231,6 @@ def names_in(where: ir.Graph | ir.Function) -> set[str]:
 
 
 def _typed(value: ir.Value) -> bool:
-    """Set a constant's type and shape, which files omit for Constant nodes."""
     known = array_of(value)
     if known is None:
         return False

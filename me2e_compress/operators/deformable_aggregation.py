@@ -41,10 +41,7 @@ def _operands(
 
 @dataclasses.dataclass(frozen=True)
 class ScaledFeature(Dialect):
-    """SparseDriveV2, whose int8 features have a scale per channel as a sixth input.
-
-    From the own form it takes float features, without a scale.
-    """
+    """SparseDriveV2, whose int8 features have a scale per channel as a sixth input."""
 
     def inputs_to_own(
         self, call: FusedCall, inputs: Values, attributes: Attributes

@@ -99,11 +99,7 @@ class DeformableConvolution(Operator):
     )
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
-        """Write ONNX's DeformConv, or below its opset samples and a product.
-
-        Raises:
-            PreconditionError: below opset 19 a shape is not known.
-        """
+        """Write ONNX's DeformConv, or below opset 19 samples and a product."""
         image, offset, mask, weight = present(inputs[:4])
         bias = inputs[4] if len(inputs) > 4 else None
         if call.opset >= DEFORM_CONV_OPSET:
@@ -169,10 +165,7 @@ class DeformableConvolution(Operator):
 def kernel_positions(
     out: tuple[int, int], kernel: tuple[int, int], attributes: Attributes
 ) -> NdArray:
-    """Return the positions of kernel elements without offsets, y and x in pixels.
-
-    The shape is [rows * columns, elements, 1, 2], float64.
-    """
+    """Return y and x in pixels of kernel elements, [rows * columns, elements, 1, 2]."""
     options = [numbers(attributes, name) for name in _NAMES]
     axes = [
         np.arange(out[axis])[:, None] * stride - padding
@@ -230,7 +223,6 @@ def _by_samples(
     weight: ir.Value,
     attributes: Attributes,
 ) -> ir.Value:
-    """Sample every element of the kernel and multiply by the weight."""
     sizes = _Sizes.of(call, image, offset, weight)
     (deep, high, wide), part, count = sizes.image, sizes.part, sizes.count
     batch, places = sizes.batch, sizes.places
@@ -262,7 +254,7 @@ def _by_samples(
 def _locations(
     call: FusedCall, offset: ir.Value, sizes: _Sizes, attributes: Attributes
 ) -> ir.Value:
-    """Write the x and y of each kernel element, in 0..1 of the image.
+    """Write x and y of each kernel element in 0..1 of the image.
 
     The shape is [N, F * G, elements, deform_groups, 2].
     """

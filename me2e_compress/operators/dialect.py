@@ -133,10 +133,7 @@ class Dialect:
         return attributes
 
     def result_to_own(self, call: FusedCall, result: ir.Value, own: Values) -> ir.Value:
-        """Write the conversion of this dialect's output to the own form's.
-
-        ``own`` are the inputs in the own form.
-        """
+        """Write the conversion of this dialect's output to the own form's."""
         return result
 
     def result_from_own(
@@ -184,11 +181,7 @@ class Dialect:
         return tuple(cast)
 
     def attributes_of(self, node: ir.Node) -> dict[str, AttributeValue]:
-        """Return a node's attributes, with defaults filled in.
-
-        Raises:
-            PreconditionError: an attribute or a value that this dialect does not know.
-        """
+        """Return a node's attributes with defaults; unknown ones are refused."""
         known = {each.name: each for each in self.attributes}
         found: dict[str, AttributeValue] = {
             each.name: each.default for each in self.attributes
@@ -213,11 +206,7 @@ class Dialect:
         return found
 
     def check(self, node: ir.Node) -> None:
-        """Check a node's inputs as far as shapes and types are known.
-
-        Raises:
-            PreconditionError: their number, types or shapes do not fit this dialect.
-        """
+        """Refuse a node whose number, types or shapes of inputs do not fit."""
         # The number of inputs
         least = sum(not each.optional for each in self.operands)
         count = len(node.inputs)

@@ -10,7 +10,7 @@ from me2e_compress.operators.replace import set_output
 class DialectKnowledge:
     """See :class:`me2e_compress.graph.plugins.PluginKnowledge`.
 
-    A node that its dialect refuses counts as unknown; rewriting it raises the error.
+    A node that its dialect refuses counts as unknown.
     """
 
     def knows(self, node: ir.Node) -> bool:

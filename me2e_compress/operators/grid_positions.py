@@ -19,11 +19,7 @@ _CUBIC = -0.75
 def grid_by_gather(
     call: FusedCall, image: ir.Value, grid: ir.Value, attributes: Attributes
 ) -> ir.Value:
-    """Write the neighbours of each position and their weighted sum.
-
-    Raises:
-        PreconditionError: for bicubic sampling.
-    """
+    """Write the neighbours of each position and their weighted sum; not bicubic."""
     mode = number(attributes, "interpolation_mode")
     if mode == _BICUBIC:
         raise PreconditionError(
@@ -111,7 +107,6 @@ def _pixel(
     last: ir.Value,
     attributes: Attributes,
 ) -> ir.Value:
-    """Write the pixel of a position in -1..1."""
     moved = call.add("Add", [at, call.numbers(1.0, at)])
     half = call.numbers(0.5, at)
     if attributes["align_corners"]:
@@ -123,7 +118,6 @@ def _pixel(
 def _padded(
     call: FusedCall, pixel: ir.Value, last: ir.Value, attributes: Attributes
 ) -> ir.Value:
-    """Write the position that replaces one outside of the image."""
     padding = number(attributes, "padding_mode")
     if padding == _ZEROS:
         return pixel

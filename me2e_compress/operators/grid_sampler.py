@@ -144,11 +144,7 @@ class GridSampler2D(Operator):
     native_opset: ClassVar[int] = 16
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
-        """Write GridSample, or below its opset four or eight neighbours by Gather.
-
-        Raises:
-            PreconditionError: bicubic sampling below the opset of GridSample.
-        """
+        """Write GridSample, or below its opset a Gather, which cannot be bicubic."""
         image, grid = present(inputs)
         kind = image.dtype or ir.DataType.FLOAT
         if kind == ir.DataType.FLOAT16:  # onnxruntime's CPU has no kernel for it

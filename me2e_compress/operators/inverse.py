@@ -62,11 +62,7 @@ class Inverse(Operator):
     )  # fmt: skip
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
-        """Write the adjugate over the determinant.
-
-        Raises:
-            PreconditionError: the size of the matrices is unknown or too large.
-        """
+        """Write the adjugate over the determinant; the size must be known and small."""
         (matrix,) = present(inputs)
         kind = matrix.dtype or ir.DataType.FLOAT
         if kind == ir.DataType.FLOAT16:  # onnxruntime has no kernel for it

@@ -26,12 +26,7 @@ _LEAST_OPSET = 13
 
 @dataclasses.dataclass(frozen=True)
 class FusedNode:
-    """A fused node of a model, with what is needed to rewrite it.
-
-    Attributes:
-        opset: of the standard operators, where the node is.
-        names: of all values and nodes there.
-    """
+    """A fused node of a model, with the standard opset and all names around it."""
 
     node: ir.Node
     operator: Operator
@@ -61,10 +56,7 @@ def _found_in(
 
 
 def import_domains(model: ir.Model) -> None:
-    """Import all used domains, and remove imports of unused plugin domains.
-
-    Initializers of functions become Constant nodes, which a file can hold.
-    """
+    """Import the used domains only; constants of functions become Constant nodes."""
     bodies: list[ir.Graph | ir.Function] = [model.graph, *model.functions.values()]
     for body in bodies:
         used = {node.domain for node in nodes_in(body)}
@@ -206,7 +198,6 @@ def _plugin_attributes(dialect: Dialect) -> dict[str, str]:
 
 
 def _take_place(call: FusedCall, result: ir.Value) -> None:
-    """Replace the node's output by a result, which takes its name."""
     node, old = call.node, call.node.outputs[0]
     made, body = result.producer(), node.graph
     assert body is not None

@@ -91,7 +91,6 @@ class Rotate(Operator):
     def _positions(
         self, call: FusedCall, image: ir.Value, angle: ir.Value, center: ir.Value
     ) -> tuple[ir.Value, ir.Value]:
-        """Write where each pixel comes from: x and y, [H, W], in pixels."""
         turn = call.add("Mul", [angle, call.numbers(math.pi / 180, angle)])
         cosine, sine = call.add("Cos", [turn]), call.add("Sin", [turn])
         kind = angle.dtype or ir.DataType.FLOAT

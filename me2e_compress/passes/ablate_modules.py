@@ -87,12 +87,10 @@ class AblateModules(Pass):
 
         Raises:
             ModuleMapError: the map has no such module.
-            PreconditionError: a module has no nodes or makes an output that must stay,
-                the plan would be lost or no longer depend on the cameras, a shape is
-                not static, or a substitute, mean or edge does not fit.
+            PreconditionError: a module, substitute, mean or edge does not fit the
+                graph, or the plan would be lost or no longer depend on the cameras.
             RecipeError: ``means`` without ``fill="means"``, or nothing to do.
-            FramesError: means are needed but neither frames nor a file are given, or
-                they belong to another graph.
+            FramesError: means have no source, or it belongs to another graph.
         """
         # Check the options against the graph and the module map
         self._check_options()
@@ -235,10 +233,9 @@ def _require_nodes(model: ir.Model, drop: tuple[str, ...]) -> None:
 
 
 def _hand_over(model: ir.Model, goes: Callable[[ir.Node], bool]) -> int:
-    """Move layout nodes of dropped modules into the modules that read them.
+    """Move layout nodes of dropped modules into their readers' modules; count them.
 
-    Exporters write an equal cast of two modules once, with the scope of the first; the
-    second must not lose its input with that module. Returns the number of moved nodes.
+    Exporters write an equal cast of two modules once, with the scope of the first.
     """
     # Find layout nodes whose inputs all come from modules that stay
     carriers = dict[ir.Node, None]()

@@ -38,12 +38,7 @@ class AttachBodies(Pass):
     exact: ClassVar[bool] = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Add a function for each kind of fused node that has none.
-
-        Raises:
-            PreconditionError: an opset below 13, or a plugin with attributes or inputs
-                that its dialect does not know.
-        """
+        """Add a function for each kind of fused node that has none."""
         kinds: dict[ir.OperatorIdentifier, list[FusedNode]] = {}
         for fused in operators.fused_nodes(model):
             kinds.setdefault(fused.node.op_identifier(), []).append(fused)
@@ -100,7 +95,6 @@ class AttachBodies(Pass):
 
 
 def _why_not(calls: Sequence[FusedNode]) -> str:
-    """Return why nodes cannot share a body; empty if they can."""
     first = calls[0].node
     if not first.domain or ORIGINAL_DOMAIN in first.metadata_props:
         return "it has no domain of its own"
@@ -139,7 +133,6 @@ def _parameter(
 
 
 def _agreed(shapes: Sequence[Dims | None]) -> ir.Shape | None:
-    """Return the dimensions that shapes have in common; None without a common rank."""
     known = [shape for shape in shapes if shape is not None]
     if len(known) < len(shapes) or len({len(shape) for shape in known}) != 1:
         return None

@@ -21,12 +21,9 @@ from me2e_compress.runtime.providers import CPU, Provider
 class Context:
     """What a pass may use besides the graph.
 
-    Attributes:
-        frames: recorded inputs, in scenes; None where the user gave none.
-        seed: for every random choice.
-        provider: runs graphs.
-        measured: ranges measured on the frames, by pass name, so that a pass that runs
-            again on the same graph need not measure again.
+    ``frames`` are recorded inputs in scenes, None where the user gave none.
+    ``measured`` caches ranges by pass name, so that a pass that runs again need not
+    measure again.
     """
 
     modules: ModuleMap
@@ -50,7 +47,6 @@ class Context:
 
         Raises:
             FramesError: neither frames nor a file, or they are of another graph.
-            RecipeError: no such method.
         """
         # Saved ranges must belong to this graph and these frames
         if saved is not None:

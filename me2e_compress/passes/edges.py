@@ -72,14 +72,12 @@ def add_edge(
     goes: Callable[[ir.Node | None], bool],
     by: str,
 ) -> str:
-    """Add an edge to a graph and return a sentence that describes it.
+    """Add an edge to a sorted graph with scopes and shapes; return a description.
 
-    The graph must be sorted, with scopes and known shapes; it changes in place, but
-    only downstream of the reader. ``goes`` tells the nodes that are to be removed.
+    The graph changes only downstream of the reader; ``goes`` tells removed nodes.
 
     Raises:
-        PreconditionError: a part does not exist or is removed, the source depends on
-            the reader, or nothing fits.
+        PreconditionError: a part is missing, there would be a cycle, or nothing fits.
     """
     # Find both ends; a cycle is refused
     source, reader = Part.of(edge.source, modules), Part.of(edge.reader, modules)
@@ -168,7 +166,6 @@ def _fit(edge: Edge, new: ir.Value, old: ir.Value) -> int:
 
 
 def _as_queries(new: ir.Value, old: ir.Value) -> tuple[int, ...] | None:
-    """Return a shape padded in front with ones to the rank of another."""
     have, want = graph.static_shape(new), graph.static_shape(old)
     if have is None or want is None or len(have) > len(want):
         return None

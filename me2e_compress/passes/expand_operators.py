@@ -26,12 +26,7 @@ class ExpandOperators(Pass):
     exact: ClassVar[bool] = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Expand the nodes of the graph, of its bodies and of its functions.
-
-        Raises:
-            PreconditionError: an opset below 13, or a plugin with attributes or inputs
-                that its dialect does not know.
-        """
+        """Expand the nodes of the graph, of its bodies and of its functions."""
         counts: Counter[str] = Counter()
         for fused in operators.fused_nodes(model):
             counts[fused.operator.name] += 1

@@ -46,12 +46,7 @@ class FixShapes(Pass):
                 raise RecipeError(f"{self.name}: {name}={size} must be 1 or more")
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Write the sizes wherever the dimensions occur, then infer shapes.
-
-        Raises:
-            PreconditionError: no input has such a dimension, or shape inference fails
-                with that size.
-        """
+        """Write the sizes wherever the dimensions occur, then infer shapes."""
         # Sizes that an earlier run wrote need no change
         known = _fixed(model)
         wanted = {k: size for k, size in self.dims.items() if known.get(k) != size}
@@ -170,7 +165,6 @@ def _size(
 
 
 def _refusal(model: ir.Model) -> str | None:
-    """Return why ONNX cannot infer the shapes of a graph; None if it can."""
     try:
         graph.infer_shapes(model, strict=True)
     except onnx.shape_inference.InferenceError as error:

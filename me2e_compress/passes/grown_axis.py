@@ -17,12 +17,8 @@ _SHOWN_BYTES = 1024
 def carry(model: ir.Model, grown: ir.Value, old: ir.Value, what: str) -> None:
     """Infer the shapes behind a value that grew along one axis, in place.
 
-    A Reshape to a constant shape gets a new constant. ``old`` is the value that the
-    readers of ``grown`` read before; ``what`` describes the change in messages.
-
-    Raises:
-        PreconditionError: an operator does not work with the new size, a graph output
-            would change its shape, or the result of a plugin is unknown.
+    A Reshape gets a new constant shape. Raises PreconditionError where an operator or a
+    graph output does not take the new size. ``what`` describes the change in messages.
     """
     # Visit, in order, only nodes that read a grown value
     was = {grown: graph.static_shape(old) or ()}
@@ -48,10 +44,7 @@ def _reshape(
     was: dict[ir.Value, tuple[int, ...]],
     what: str,
 ) -> None:
-    """Update the constant shape of a Reshape to the new size.
-
-    The axis that grew must be an axis of the result too, neither split nor merged.
-    """
+    """Update a constant shape; the grown axis must be neither split nor merged."""
     # The shapes before and after must be known
     source, size = node.inputs[0], node.inputs[1]
     made = graph.static_shape(node.outputs[0])

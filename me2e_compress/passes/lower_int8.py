@@ -44,7 +44,6 @@ class LowerInt8(Pass):
 
         Raises:
             PreconditionError: the graph is not quantized, or not in symmetric int8.
-            FramesError: neither frames nor ranges, or they are of another graph.
         """
         # Ranges of tensors that TensorRT leaves in float
         missing = self.ranged_tensors(model, context)

@@ -32,7 +32,7 @@ class OnnxIrPass(Pass):
     inner: ir.passes.PassBase
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Run the inner pass, in place if it works in place."""
+        """Run the inner pass."""
         before = model.clone()
         after = self.inner(model).model
         provenance.sign(before, after, self.name)

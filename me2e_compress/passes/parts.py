@@ -60,9 +60,8 @@ def listed(values: tuple[ir.Value, ...] | list[ir.Value]) -> str:
 def stretched(have: tuple[int, ...], want: tuple[int, ...]) -> tuple[int, ...] | None:
     """Return the shape from which ``have`` broadcasts to ``want``; None if none does.
 
-    The last axis, the channels, must be equal: whole queries are repeated. [1, 256] of
-    one agent becomes [1, 1, 256] for the six modes of [1, 6, 256], and [1, A, 256] of
-    all agents becomes [1, A, 1, 256] for [1, A, 6, 256].
+    Whole queries are repeated: [1, 256] of an agent becomes [1, 1, 256] for six modes
+    [1, 6, 256], and [1, A, 256] of all agents [1, A, 1, 256] for [1, A, 6, 256].
     """
     if have == want or bare(have) == bare(want):
         return want
@@ -85,10 +84,7 @@ def bare(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def fit(value: ir.Value, like: ir.Value) -> int:
-    """Return how well a value can be read in place of another.
-
-    2: as it is, up to dimensions of size 1; 1: after a broadcast; 0: not at all.
-    """
+    """Return 2 if a value can replace another, 1 after a broadcast, else 0."""
     have, want = graph.static_shape(value), graph.static_shape(like)
     if have is None or want is None or value.dtype != like.dtype:
         return 0

@@ -23,10 +23,7 @@ def seeing(model: ir.Model, modules: ModuleMap) -> tuple[str, ...]:
 def check_sight(
     model: ir.Model, modules: ModuleMap, before: tuple[str, ...], drop: tuple[str, ...]
 ) -> None:
-    """Check that the plan still depends on the cameras, else raise a PreconditionError.
-
-    ``before`` is the result of :func:`seeing` for the whole graph.
-    """
+    """Raise a PreconditionError unless the plan still depends on the cameras."""
     blind = [name for name in before if name not in seeing(model, modules)]
     if blind:
         features = ", ".join(modules.names("feature"))

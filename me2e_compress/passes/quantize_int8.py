@@ -88,8 +88,6 @@ class QuantizeInt8(Pass):
             PreconditionError: the graph is quantized already, of opset below 13, or in
                 float16 that its target or opset has no int8 for.
             FramesError: neither frames nor ranges, or they are of another graph.
-            ModuleMapError: the map has no such module.
-            RecipeError: no such scheme, rules, target or method, or bad overrides.
         """
         if found := describe_quantized(model):
             raise PreconditionError(
@@ -162,7 +160,6 @@ class QuantizeInt8(Pass):
         return dataclasses.replace(plan, kept_float=kept_float)
 
     def _rules(self) -> RuleSet:
-        """Build the rule set; options of this pass take precedence."""
         rules = self.rules
         if isinstance(rules, str):
             rules = RULE_SETS.parse(rules)

@@ -59,8 +59,7 @@ class StaticGeometry(Pass):
 
         Raises:
             PreconditionError: the graph has no such input, or it is an output too.
-            FramesError: neither frames nor a file; or a value is missing, of another
-                type or shape, not finite, or not the same in all frames.
+            FramesError: a value is missing, does not fit, or differs between frames.
         """
         # Inputs that are constant already need no change
         known = static_inputs(model)

@@ -25,13 +25,10 @@ def module_of(value: ir.Value) -> str:
 
 
 def result_of(model: ir.Model, part: Part, like: ir.Value | None = None) -> ir.Value:
-    """Return the result of a part of a graph: the last value that leaves it.
+    """Return the last value that leaves a part, with ``like`` the last that fits it.
 
-    A decoder returns its queries and, last, the reference points it refined; so with
-    ``like`` the last value of fitting type and shape (up to a broadcast) is taken.
-
-    Raises:
-        PreconditionError: nothing leaves the part, or nothing that fits.
+    A decoder returns its queries and, last, the reference points it refined. Raises
+    PreconditionError if there is none.
     """
     found = part.exits(model)
     if like is None and found:
@@ -89,11 +86,7 @@ def replace_readers(old: ir.Value, new: ir.Value) -> None:
 
 
 def constant_like(where: ir.Graph, value: ir.Value, array: Array) -> ir.Value:
-    """Add a constant in place of a value.
-
-    Raises:
-        PreconditionError: type or shape differ, or the value is itself a shape.
-    """
+    """Add a constant in place of a value of the same type and shape."""
     shape, dtype = layout_of(value)
     if array.dtype != dtype or array.shape != shape:
         raise PreconditionError(
@@ -104,11 +97,7 @@ def constant_like(where: ir.Graph, value: ir.Value, array: Array) -> ir.Value:
 
 
 def layout_of(value: ir.Value) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
-    """Return the shape and type that a substitute must have.
-
-    Raises:
-        PreconditionError: the shape is not static, or the value is itself a shape.
-    """
+    """Return the shape and type of a substitute; shape arithmetic has none."""
     if is_shape_arithmetic(value):
         raise PreconditionError(
             f"{value.name} is arithmetic on shapes, which no module owns: run"
@@ -126,10 +115,7 @@ def layout_of(value: ir.Value) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
 def zeros_like(
     where: ir.Graph, value: ir.Value, readers: Sequence[ir.Node], by: str
 ) -> ir.Value:
-    """Add zeros of a value's shape and type, in a few bytes of any size.
-
-    New nodes inherit from the ``readers``. Raises as :func:`layout_of`.
-    """
+    """Add zeros of a value's shape and type, in a few bytes of any size."""
     shape, dtype = layout_of(value)
     zero = ir.tensor(np.zeros(1, dtype), name="zero")
     node = ir.node("ConstantOfShape", [_size(where, shape, value)], {"value": zero})
@@ -201,13 +187,10 @@ def means_of(
     context: Context,
     file: Path | None,
 ) -> tuple[dict[str, Array], str]:
-    """Read means by value name from a file, or measure them on the context's frames.
-
-    Returns the means, and a phrase that tells their source.
+    """Read means by value name from a file, or measure them; also name their source.
 
     Raises:
         FramesError: neither frames nor a file, or they are of another graph.
-        PreconditionError: a value has no static shape, or is itself a shape.
     """
     for value in values:
         layout_of(value)

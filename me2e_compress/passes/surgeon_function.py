@@ -43,12 +43,7 @@ class SurgeonFunction(Pass):
     changes_interface: bool = False  # type: ignore[misc]
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Run the function on a copy.
-
-        Raises:
-            PassError: the function returned something that is not a graph.
-            GraphError: the result is not a valid model.
-        """
+        """Run the function on a copy; a result that is not a graph is a PassError."""
         # Run the function on graphsurgeon's form of the graph
         handed = to_graphsurgeon(model)
         given = self.function(handed)

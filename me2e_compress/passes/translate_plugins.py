@@ -49,8 +49,7 @@ class TranslatePlugins(Pass):
         """Translate the nodes of the graph, of its bodies and of its functions.
 
         Raises:
-            PreconditionError: the library has no such operator or cannot express it, or
-                a plugin has attributes or inputs that its dialect does not know.
+            PreconditionError: the library lacks an operator or cannot express a call.
         """
         counts: Counter[str] = Counter()
         for fused in operators.fused_nodes(model):

@@ -86,6 +86,7 @@ def position_arithmetic(
     on through other products, which are projections: of two computed operands, or of a
     camera's matrix and a table of points.
     """
+    # back from the readers of positions, through products without weights
     found: set[ir.Node] = set()
     queue = deque(value for value, _ in _positions(model.graph))
     while queue:
@@ -131,6 +132,7 @@ def _companions(
             and node.inputs[1] in constants
         )
 
+    # layers behind every tensor of sampling weights
     nearest = behind(model.graph, _LAYOUT, is_beside)
     reason = "sampling weights: they read the tensor that the offsets read"
     return {

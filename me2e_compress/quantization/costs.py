@@ -146,6 +146,7 @@ class Costs:
             island = _connected(first, kept, touching, seen)
             if not island or any(each not in self.saved_s for each in island):
                 continue
+            # what the whole region pays at its borders, and saves
             borders = dict.fromkeys(b for each in island for b in touching[each])
             paid = sum(border.paid_s(kept) for border in borders)
             saved = sum(self.saved_s[each] for each in island)

@@ -39,6 +39,7 @@ def find_ego_layers(
         changing = [each for each in reads if each not in constants]
         if not changing or any(each not in sources for each in changing):
             continue
+        # its results are a status too, while they are small
         name = sources[changing[0]]
         if node.op_type in WEIGHTED:
             found[node] = name
@@ -53,10 +54,12 @@ def _statuses(model: ir.Model) -> Iterator[tuple[ir.Value, str]]:
         for value in model.graph.inputs
         if str(value.name) not in model.graph.initializers
     ]
+    # a graph without any sensor has no status beside it
     sizes = {value: _elements(value) for value in inputs}
     known = [size for size in sizes.values() if size is not None]
     if None not in sizes.values() and max(known, default=0) < LEAST_SENSED:
         return
+    # small inputs that are neither states nor matrices
     recurrent = recurrent_inputs(model)
     for value, size in sizes.items():
         shape = static_shape(value) or ()

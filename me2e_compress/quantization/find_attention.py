@@ -55,6 +55,7 @@ def ahead(graph: ir.Graph, through: Collection[str], is_product: Test) -> Neares
             found[value] = _merged(
                 beyond.get(reader, ()) for reader in value.consumers()
             )
+        # what reads a node's inputs: the product itself, or what lies ahead of it
         if is_product(node):
             beyond[node] = ((0, node),)
         elif node.op_type in through:

@@ -230,12 +230,14 @@ def _contracted(einsum: ir.Node) -> int | None:
     equation = einsum.attributes.get_string("equation", "").replace(" ", "")
     terms, _, result = equation.partition("->")
     sizes: dict[str, int | None] = {}
+    # the size of every label, on either side of an ellipsis
     for term, value in zip(terms.split(","), einsum.inputs, strict=False):
         shape = open_shape(value) or ()
         front, _, back = term.partition("...")
         sizes.update(zip(front, shape, strict=False))
         if back:
             sizes.update(zip(reversed(back), reversed(shape), strict=False))
+    # labels that the result lacks
     summed = [size for label, size in sizes.items() if label not in result]
     known = [size for size in summed if size is not None]
     return math.prod(known) if known and len(known) == len(summed) else None

@@ -40,6 +40,7 @@ class QuantScheme:
                 f"no scheme {name}; there are {', '.join(SCHEMES)}, all of them int8"
             )
         wanted = SCHEMES[name]
+        # a scheme of a part needs a map that knows parts
         lacking = [role for role in SCHEMES["full"] if not modules.names(role)]
         if lacking and name != "full":
             raise ModuleMapError(

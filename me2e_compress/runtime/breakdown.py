@@ -74,8 +74,6 @@ def break_down(
 
     Raises:
         ProviderError: the provider runs nodes elsewhere than on the CPU.
-        GraphError: the model cannot be run.
-        FramesError: a frame does not fit.
     """
     if provider.native != CPU.native:
         raise ProviderError(

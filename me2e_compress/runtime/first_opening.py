@@ -47,18 +47,11 @@ def try_apart(
     """Open a graph, and run it once, in a separate process, unless it is known.
 
     Opening takes 0.3 s more than a session takes; running adds one inference. A graph
-    that onnxruntime refuses passes here: whoever opens it next reports why.
-
-    Args:
-        model: the graph; it is not changed.
-        name: name of the graph in messages.
-        file: a file that holds this very graph; None writes it to a temporary one.
-        feeds: inputs for one run; recurrent ones may be missing. None only opens.
-        memory: folder of verdicts; None takes the user's cache folder.
-        on_begin: called if the graph is new.
-
-    Returns:
-        The seconds taken; 0 where the graph is known.
+    that onnxruntime refuses passes here: whoever opens it next reports why. ``file``
+    may hold this very graph already. ``feeds`` are inputs for one run, without which
+    the graph is only opened; recurrent ones may be missing. ``memory`` is the folder of
+    verdicts, by default in the user's cache. Returns the seconds taken, 0 for a known
+    graph.
 
     Raises:
         GraphError: the process died; the message has the graph, the step and the

@@ -58,13 +58,8 @@ def runnable(
     """Return a graph whose fused nodes onnxruntime can run with these options.
 
     The kernels that it needs are registered in ``options``. Kernels are for the CPU;
-    operators that a library of the user implements are left to that library.
-
-    Returns:
-        The graph itself, where it has no fused nodes, or a copy.
-
-    Raises:
-        GraphError: a fused node is not used as its operator requires.
+    operators that a library of the user implements are left to that library. A graph
+    without fused nodes is returned itself, others are copied.
     """
     compiled = provider.native == CPU.native and kernels.why_not() is None
     theirs = provider.claims
@@ -86,18 +81,10 @@ def compiled_or_expanded(
     compiled: bool,
     theirs: Callable[[str], bool] = lambda op_type: False,
 ) -> tuple[ir.Model, tuple[kernels.CompiledKernel, ...]]:
-    """Replace the fused nodes by kernels or by bodies.
+    """Replace the fused nodes by kernels, if ``compiled``, or by bodies.
 
-    Args:
-        model: the graph; it is not changed.
-        compiled: whether kernels may be used.
-        theirs: returns whether an operator is to be left as it is.
-
-    Returns:
-        A copy, or the graph itself if it has no fused nodes; and the kernels in it.
-
-    Raises:
-        GraphError: a fused node is not used as its operator requires.
+    Operators for which ``theirs`` is true are left as they are. Returns a copy, or the
+    graph itself if it has no fused nodes, and the kernels in it.
     """
     names = {node.op_type for node in unknown_nodes(model) if is_fused(node)}
     ours = {name for name in sorted(names) if not theirs(name)}

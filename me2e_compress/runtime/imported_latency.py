@@ -34,12 +34,9 @@ _LONGEST_MS = 1e9
 class Imported:
     """What was read from files of other tools.
 
-    Attributes:
-        samples_us: one latency for each inference; empty if unknown.
-        layers_us: average time of each layer.
-        rails_w: watts of each rail, one for each line of the log.
-        machine: the machine, if a file names it.
-        sources: description of each file.
+    ``samples_us`` has one latency for each inference, ``layers_us`` the average of each
+    layer, ``rails_w`` the watts of each rail for each line of the log; all may be
+    empty.
     """
 
     samples_us: tuple[int, ...] = ()
@@ -77,11 +74,7 @@ def read_imports(paths: Sequence[Path]) -> Imported:
 
 
 def read_import(path: Path) -> Imported:
-    """Read one file.
-
-    Raises:
-        EvaluationError: the file is missing, malformed or of another kind.
-    """
+    """Read one file."""
     try:
         content = documents.content(path)
         text = content.decode("utf-8-sig", errors="replace")

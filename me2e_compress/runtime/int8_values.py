@@ -35,10 +35,7 @@ def read_int8(node: ir.Node, opset: int, names: set[str] | None) -> None:
     Result: the same Reshape of the integers, read by the int8 kernel; nodes that nobody
         else reads are removed.
 
-    Args:
-        node: a call of ``MultiScaleDeformableAttention`` in the kernels' domain.
-        opset: version of ONNX's own operators.
-        names: names of all values; None looks at the node's graph.
+    ``node`` is a call of ``MultiScaleDeformableAttention`` in the kernels' domain.
     """
     value = node.inputs[0]
     assert value is not None

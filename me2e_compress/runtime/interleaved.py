@@ -88,15 +88,9 @@ def record_traces(
     """Record the latency of models, each warm, in alternating blocks.
 
     Recurrent state is fed forward and reset where scenes begin; the recording is
-    repeated as often as needed. ``models`` holds ONNX files or TOML files of stacks;
+    repeated as often as needed. ``models`` has ONNX files or TOML files of stacks;
     ``samples`` and ``warm_up`` count for each model; ``on_sample`` is called with
     samples done, all samples and the model's name.
-
-    Raises:
-        EvaluationError: there is nothing to measure.
-        GraphError: a model cannot be run.
-        ProviderError: the provider is not available.
-        FramesError: a frame does not fit.
     """
     check_work(samples, warm_up, frames)
     sessions = {

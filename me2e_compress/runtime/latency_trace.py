@@ -22,16 +22,7 @@ Microseconds: TypeAlias = Mapping[str, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class TimeShare:
-    """The share of one part in a model's time.
-
-    Attributes:
-        name: name of a module or an operator.
-        share: share of the whole, 0 to 1.
-        p50_us: microseconds; None where there are too few samples, as for the others.
-        p90_us: 90th percentile.
-        p99_us: 99th percentile.
-        max_us: time in the slowest inference.
-    """
+    """The share of one part in a model's time; percentiles need enough samples."""
 
     name: str
     share: float
@@ -156,11 +147,7 @@ class LatencyTrace(Displayed):
         }
 
     def save(self, path: Path) -> None:
-        """Write the trace atomically.
-
-        Raises:
-            EvaluationError: the file cannot be written.
-        """
+        """Write the trace atomically."""
         try:
             write_json(path, self.to_json())
         except OSError as error:
@@ -170,11 +157,7 @@ class LatencyTrace(Displayed):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a trace; its percentiles are recomputed from the samples.
-
-        Raises:
-            EvaluationError: no such file, or not a trace with at least one sample.
-        """
+        """Read a trace; its percentiles are recomputed from the samples."""
         with documents.reading(path, EvaluationError, "not a latency trace"):
             record = _Record.model_validate_json(documents.content(path))
         return cls(

@@ -96,14 +96,7 @@ def open_file(
     """Open an ONNX file directly or, if onnxruntime refuses it, after loading it here.
 
     This opens graphs that are newer than onnxruntime, that store shapes in a file of
-    weights, or that hold fused operators. The arguments are those of
-    :func:`open_graph`.
-
-    Returns:
-        The session, and the weights that must live as long.
-
-    Raises:
-        GraphError: no such file, or onnxruntime cannot run it.
+    weights, or that hold fused operators. See :func:`open_graph`.
     """
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
@@ -139,20 +132,11 @@ def open_graph(
     provider: Provider = CPU,
     without: Sequence[str] | None = None,
 ) -> tuple[ort.InferenceSession, Weights]:
-    """Open a graph in memory.
+    """Open a graph in memory, and return its session and its lent weights.
 
-    Args:
-        model: the graph; it is not changed, and its weights must not change while the
-            session lives.
-        options: session options, to which the provider is attached.
-        provider: the execution provider.
-        without: optimizations to disable; None takes those of the provider.
-
-    Returns:
-        The session, and the weights that must live as long.
-
-    Raises:
-        GraphError: onnxruntime cannot run this graph; the message names the operator.
+    The weights must live as long as the session, and must not change. The provider is
+    attached to ``options``; ``without`` lists optimizations to disable, by default
+    those of the provider. The GraphError of a refused graph names the operator.
     """
     if reason := unsupported(model, provider):
         raise GraphError(reason)

@@ -20,9 +20,6 @@ def optimized(model: ir.Model, provider: Provider = CPU) -> ir.Model:
     """Return a graph as onnxruntime's optimizations leave it on this machine.
 
     Its operators are those that run: ``QLinearConv``, ``FusedConv``, ``ReorderInput``.
-
-    Raises:
-        GraphError: onnxruntime cannot run this graph.
     """
     with tempfile.TemporaryDirectory(prefix="me2e-optimized-") as folder:
         path = Path(folder) / "model.onnx"

@@ -18,12 +18,7 @@ SHORTEST_S = 0.5
 
 @dataclass(frozen=True)
 class Load:
-    """Load by other processes during a measurement.
-
-    Attributes:
-        others: mean number of cores that they took.
-        cores: cores of the machine.
-    """
+    """Mean number of cores that other processes took during a measurement."""
 
     others: float
     cores: int
@@ -50,13 +45,9 @@ class Load:
 class OthersLoad:
     """Measure the cores that other processes keep busy while a block runs.
 
-    Args:
-        machine: returns CPU seconds of all processes since boot.
-        ours: returns CPU seconds of this process and its ended children.
-        clock: returns wall seconds.
-
-    Attributes:
-        load: load over the block; None before it ends, or if it was too short.
+    ``machine`` and ``ours`` return CPU seconds of all processes since boot, and of this
+    process with its ended children. ``load`` is None before the end, or if the block
+    was too short.
     """
 
     def __init__(

@@ -75,11 +75,7 @@ class PlanAdapter(pydantic.BaseModel):
     def of(cls, metadata: Mapping[str, str], outputs: Sequence[str]) -> Self | None:
         """Read the adapter from a model's metadata, or use an output named ``plan``.
 
-        Returns:
-            The adapter; None if the model does not name its plan.
-
-        Raises:
-            GraphError: the metadata is malformed or names an unknown output.
+        Returns None if the model names no plan; malformed metadata is a GraphError.
         """
         text = metadata.get(PLAN)
         if text is None:
@@ -114,12 +110,7 @@ class PlanAdapter(pydantic.BaseModel):
         return np.cumsum(points, axis=0) if self.deltas else points
 
     def trajectory(self, points: npt.NDArray[np.float64]) -> Trajectory:
-        """Return waypoints, in any frame, with their times.
-
-        Raises:
-            GraphError: the time between them is unknown.
-            EvaluationError: there are none, or none after the observation.
-        """
+        """Return waypoints, in any frame, with their times, if the step is known."""
         if self.step_s is None and len(points) != CONTRACT_WAYPOINTS:
             raise GraphError(
                 f"output {self.output}: the plan has shape {list(points.shape)}, it"
@@ -143,11 +134,7 @@ class PlanAdapter(pydantic.BaseModel):
             )
 
     def choice(self, outputs: Arrays) -> int:
-        """Return the mode with the largest score, the first of equals.
-
-        Raises:
-            GraphError: no output of scores is named.
-        """
+        """Return the mode with the largest score, the first of equals."""
         if self.scores is None:
             raise GraphError(f"nothing names the scores of {self.output}")
         return int(np.argmax(np.asarray(outputs[self.scores], np.float64).reshape(-1)))

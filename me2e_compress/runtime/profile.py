@@ -31,24 +31,10 @@ def profile(
 ) -> LatencyTrace:
     """Measure the latency of a model on every frame, one at a time.
 
-    Recurrent state is fed forward and reset where scenes begin; reading a frame is
-    not counted. The recording is repeated as often as needed.
-
-    Args:
-        model: ONNX file, or the TOML file of a stack.
-        frames: the inputs.
-        samples: number of latencies; None takes one a frame.
-        warm_up: inferences before the first that counts.
-        threads: onnxruntime's number of threads; the closed loop uses one.
-        provider: the execution provider.
-        said: metadata that overrides the model's own.
-        on_sample: called with samples done and to do.
-
-    Raises:
-        EvaluationError: there is nothing to measure.
-        GraphError: the model cannot be run.
-        ProviderError: the provider is not available.
-        FramesError: a frame does not fit.
+    Recurrent state is fed forward and reset where scenes begin; reading a frame is not
+    counted. The recording is repeated as often as needed; by default there is one
+    sample a frame. The closed loop uses one thread. ``said`` is metadata that overrides
+    the model's own; ``on_sample`` is called with samples done and all samples.
     """
     wanted = len(frames) if samples is None else samples
     check_work(wanted, warm_up, frames)

@@ -226,11 +226,7 @@ class TensorRtRtxProvider(Provider):
         return super().is_installed() or bool(importlib.util.find_spec(self.package))
 
     def attach(self, options: ort.SessionOptions) -> None:
-        """Register the provider's own library, then those of operators.
-
-        Raises:
-            ProviderError: not installed, no RTX GPU, or a library without operators.
-        """
+        """Register the provider's own library, then those of operators."""
         super().attach(options)
         if not super().is_installed():
             module = importlib.import_module(self.package)

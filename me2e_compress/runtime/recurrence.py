@@ -59,11 +59,7 @@ def recurrence(
 
 
 def declared_pairs(metadata: Mapping[str, str]) -> dict[str, str | None] | None:
-    """Return the pairs that the metadata declares; None where it declares nothing.
-
-    Raises:
-        GraphError: the metadata is not a mapping of names.
-    """
+    """Return the pairs that the metadata declares; None where it declares nothing."""
     text = metadata.get(RECURRENT)
     return None if text is None else _parse(text)
 

@@ -79,8 +79,7 @@ class Session:
         rewritten: a file for the graph as onnxruntime optimizes it, with a file of
             weights beside it; it fits this machine's kernels only.
         provider: execution provider, and the libraries of operators it knows.
-        profiled: a folder for the output of onnxruntime's profiler, written when
-            :meth:`end_profile` is called.
+        profiled: a folder for the profile that :meth:`end_profile` writes.
         said: metadata that overrides the model's own.
 
     Attributes:
@@ -88,7 +87,6 @@ class Session:
         outputs: the outputs by name, in order.
         metadata: the model's own metadata, with ``said``.
         recurrent: ``{input: output}`` of the state that is fed forward.
-        provider: the execution provider.
 
     Raises:
         GraphError: onnxruntime cannot run this graph; the message names the operator.
@@ -201,21 +199,13 @@ def replay(
     outputs: Sequence[str] | None = None,
     state: Mapping[str, Array] | None = None,
 ) -> Iterator[dict[str, Array]]:
-    """Run a model over a recording, its recurrent state fed forward.
+    """Run a model over a recording, its recurrent state fed forward; yield its outputs.
 
     At the start of a scene a recurrent input comes from the frame or, if the frame has
     none, is its first value: zeros, unless a stack defines another one. Afterwards it
     is the model's output of the previous frame, even if the frame has an array for it.
-
-    Args:
-        session: the model.
-        frames: the recording.
-        outputs: the outputs to yield; None yields all.
-        state: recurrent inputs before a first frame that continues a scene, to resume
-            an interrupted replay.
-
-    Yields:
-        The outputs of every frame, in order.
+    ``state`` holds the recurrent inputs before a first frame that continues a scene, to
+    resume an interrupted replay; ``outputs`` None yields all.
 
     Raises:
         FramesError: a frame does not fit; the message names it.

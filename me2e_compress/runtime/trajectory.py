@@ -43,11 +43,7 @@ class Trajectory:
     def ahead(
         cls, points: npt.NDArray[np.floating], times_s: npt.NDArray[np.floating]
     ) -> Self:
-        """Build a trajectory of the waypoints after the observation; drop the others.
-
-        Raises:
-            EvaluationError: there is none.
-        """
+        """Build a trajectory of the waypoints after the observation."""
         if not (times_s > 0).any():
             raise EvaluationError("no waypoint lies after the observation")
         return cls(points[times_s > 0], times_s[times_s > 0])

@@ -114,12 +114,14 @@ class _Bisection:
             if len(group) == 1 or self._left < 2:
                 blamed.append((group, cost))
                 continue
+            # keep the halves that alone make much of the loss
             middle = len(group) // 2
             halves = [
                 (half, self._loss(half)) for half in (group[:middle], group[middle:])
             ]
             costly = [each for each in halves if each[1] >= BLAME * loss]
             open_groups += costly
+        # the whole module is no finding
         found = [each for each in blamed if len(each[0]) < len(self._names)]
         return tuple(sorted(found, key=lambda each: -each[1]))
 

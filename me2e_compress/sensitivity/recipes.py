@@ -113,6 +113,7 @@ def write_recipe(
     ``passes`` run before int8, by name, with sizes for open dimensions. Returns the
     file of overrides, None if none is needed.
     """
+    # the exact passes, then int8
     lines = [_entry(name, dims) for name, dims in passes.items()]
     overrides = path.with_name(path.stem + ".overrides.toml")
     if choice.modules:
@@ -126,6 +127,7 @@ def write_recipe(
         if choice.floats:
             options.append(f"overrides = {_string(overrides.name)}")
         lines.append("\n".join(options) + "\n")
+    # recipe and overrides together, or neither
     with drafts.all_or_none():
         write_bytes(path, "\n".join(lines).encode())
         if not choice.floats or not choice.modules:

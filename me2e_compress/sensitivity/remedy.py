@@ -145,10 +145,12 @@ class _Search:
     def _keep(self, worst: Shortfall) -> bool:
         """Keep more nodes float; False if nothing is left that would help."""
         left = [each for each in self._nodes if each not in self._floats()]
+        # one node that is to blame
         group = self._bisect(left, worst)
         if len(group) == 1:
             self._alone += group
             return True
+        # else the module with most of the costly nodes
         modules = Counter(each.module for each in group if each.module)
         inside = {each.module for each in left}
         if not modules or len(inside) == 1:

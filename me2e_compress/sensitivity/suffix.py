@@ -32,6 +32,7 @@ class Suffix:
         """Find what the named nodes reach; None in a graph with subgraphs."""
         if any(True for _ in model.graph.subgraphs()):
             return None  # their bodies read values by name
+        # what the nodes reach, and what that reads from before
         count, total, inside = graph.macs_counter(model), 0, 0
         reached, read = set[ir.Value](), dict[str, None]()
         for node in model.graph:
@@ -52,6 +53,7 @@ class Suffix:
 
         Returns the reference's answers, with frames that hold the boundary too.
         """
+        # a copy of the graph that outputs the boundary too
         probe = model.clone()
         values = _values(probe)
         known = {str(each.name) for each in probe.graph.outputs}
@@ -59,6 +61,7 @@ class Suffix:
         probe.graph.outputs.extend(added)
         session = Session(probe, release=True, provider=reference.session.provider)
         found = replay(session, reference.frames, self.boundary)
+        # frames with these values
         frames = [
             dataclasses.replace(
                 frame, arrays={**_states(session), **frame.arrays, **entering}

@@ -106,6 +106,7 @@ class Trials:
         self._session = partial(
             Session, threads=threads, release=True, provider=provider
         )
+        # every choice is judged once
         self._known: dict[Int8Choice, Score] = {}
         self._driven: dict[Int8Choice, float] = {}
         self.reference = Reference.of(self._session(model), frames)

@@ -42,6 +42,7 @@ def route_table(outcome: "StudyResult") -> Table | None:
     driven = [each for each in outcome.drives if each.routes]
     if not driven or len(driven[0].routes) > MOST_ROUTES:
         return None
+    # one column per drive, one row per route
     several = len(outcome.study.conditions) > 1
     names = [f"{e.variant}, {e.condition}" if several else e.variant for e in driven]
     return Table(

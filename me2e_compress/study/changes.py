@@ -58,6 +58,7 @@ def changes(
     found = list[Change]()
     for condition in (each for each in conditions if each.against):
         for drive in (each for each in drives if each.condition == condition.name):
+            # the drive and its counterpart, of the variant and the baseline
             cells = [
                 (variant, name)
                 for variant in (drive.variant, baseline)
@@ -66,6 +67,7 @@ def changes(
             if not all(cell in there for cell in cells):
                 continue
             ours, before, theirs, theirs_before = (there[cell] for cell in cells)
+            # the plain difference, and how far it exceeds the baseline's
             change = _change(cells[0], cells[1], ours, before, seed)
             if drive.variant != baseline:
                 score, rate = _beyond(ours, before, theirs, theirs_before, seed)

@@ -142,6 +142,7 @@ class Study:
     evaluator: str = HIGHWAY
 
     def __post_init__(self) -> None:
+        # names must be unique, and refer to something
         check_unique("variant", (variant.name for variant in self.variants))
         check_unique("condition", (condition.name for condition in self.conditions))
         names = [variant.name for variant in self.variants]
@@ -152,12 +153,14 @@ class Study:
             )
         check_conditions(self.conditions, names)
         check_pairs(self.pairs, names, [each.name for each in self.conditions])
+        # routes belong to highway only
         if self.elsewhere:
             self._check_elsewhere()
         elif not self.routes:
             raise StudyError(f"{self.title}: there is no route to drive")
         if self.seed < 0:
             raise StudyError(f"seed {self.seed}: must be 0 or more")
+        # blocks name variants and conditions
         for block in self.blocks:
             block.check(names, [each.name for each in self.conditions])
         if self.to_record is None:
@@ -193,6 +196,7 @@ class Study:
         check_conditions_elsewhere(self.evaluator, self.conditions)
 
     def _check_frames(self) -> None:
+        # passes that calibrate need frames
         needy = [
             (variant.name, each.name)
             for variant in self.variants
@@ -204,6 +208,7 @@ class Study:
                 f"variant {needy[0][0]}: {needy[0][1]} measures on recorded frames,"
                 " and there are none (frames = FRAMES)"
             )
+        # models without a trace are timed on held-out frames
         untimed = [each for each in self.variants if each.is_model and not each.trace]
         traced = [each.name for each in self.conditions if each.traced]
         if traced and untimed and self.held_out is None:

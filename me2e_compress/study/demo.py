@@ -178,6 +178,7 @@ class DriverDemo:
 
     def drive(self, listener: Listener) -> DriveResult:
         """Drive the routes with both, and write the report."""
+        # a study of two variants under ideal conditions
         everything = load_routes()
         study = Study(
             f"{self.name} before and after {self.recipe_name}",
@@ -193,6 +194,7 @@ class DriverDemo:
             timing=Timing(LATENCY_SAMPLES),
             provider=self.provider,
         )
+        # run it, and write its report with the demo's own sections
         engine = LocalEngine(self.workers)
         found = run_study(study, self.out, engine, listener, force=self.force)
         told = (*self._told, self._files())

@@ -83,6 +83,7 @@ class RouteSummary:
     @classmethod
     def of(cls, episode: Episode) -> Self:
         """Summarize an episode."""
+        # percentiles of the latency that the drive was charged
         charged = [each.latency_us for each in episode.decisions]
         latency_us = np.percentile(charged or [0], PERCENTS, method="higher")
         return cls(

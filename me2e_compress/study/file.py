@@ -64,6 +64,7 @@ def load_study(
         ProviderError: A provider or library is missing.
     """
     path = study_path(path)
+    # read the file, which may be any TOML
     try:
         content = documents.from_toml(documents.content(path))
     except FileNotFoundError as error:
@@ -77,12 +78,14 @@ def load_study(
         table = _Study.model_validate(content)
     except ValidationError as error:
         raise StudyError(f"{path}: {_complaint(error)}") from error
+    # options of the caller take precedence
     if provider is not None:
         table.provider = provider
     if not trust_code and (named := _code(table)):
         raise StudyError(
             f"{path} runs code: {named[0]}; look at it first, then say --trust-code"
         )
+    # resolve its names, and check what it refers to
     study = _Reader(path).study(table, routes, plugins)
     study.check_recordings()
     return study
@@ -198,6 +201,7 @@ class _Reader:
     def study(
         self, table: _Study, routes: str | None, plugins: Sequence[Path]
     ) -> Study:
+        # the caller's routes take precedence over the file's
         timing = table.latency
         libraries = (*map(self._beside, table.plugins), *plugins)
         which = routes if table.routes is None or routes else str(table.routes)
@@ -238,6 +242,7 @@ class _Reader:
         policy, adapter, stage = table.policy, table.adapter, table.host_stage
         if policy in SHIPPED:  # a file of that name beside the study wins
             policy = str(model_path(policy, self.path.parent))
+        # a named policy may bring its own adapter and host stage
         driver = driver_named(policy)
         if isinstance(driver, OnnxDriver):
             policy = str(model_path(driver.path, self.path.parent))

@@ -155,6 +155,7 @@ class StudyResult(Result):
         return [self._record(each) for each in self.drives]
 
     def _record(self, drive: Drive) -> dict[str, object]:
+        # a drive that failed has no scores
         scores, of = drive.scores, self.variant(drive.variant)
         found = (
             {}

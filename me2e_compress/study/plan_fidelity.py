@@ -62,6 +62,7 @@ def judge(
     A model with other inputs or outputs is not an error: it is not measured, and the
     reason says why.
     """
+    # reasons why there is nothing to compare
     if study.held_out is None:
         return PlanFidelity.unknown("no held-out frames were given")
     if prepared.model is None or baseline.model is None:
@@ -71,6 +72,7 @@ def judge(
         return PlanFidelity.unknown(f"{lacks.variant.name} is not a model")
     if prepared is baseline:
         return PlanFidelity.unknown("the baseline itself")
+    # both models over all held-out frames
     recording = CalibrationSet(study.held_out)
     stage = f"fidelity of {prepared.variant.name}"
     left, right = (
@@ -83,6 +85,7 @@ def judge(
             listener.on_progress(stage, frame.index, len(recording), "frames")
             yield frame
 
+    # models with different interfaces cannot be compared
     try:
         found = compare(left, right, reported())
     except (EvaluationError, FramesError) as error:
@@ -102,6 +105,7 @@ def measure_json(measure: Measure) -> dict[str, float | str | None]:
 def _of(found: Fidelity, session: Session) -> PlanFidelity:
     if found.plan is None:
         return PlanFidelity.unknown(found.plan_reason)
+    # the output that holds the plan
     adapter = PlanAdapter.of(session.metadata, list(session.outputs))
     sqnr_db = next(
         (
@@ -111,6 +115,7 @@ def _of(found: Fidelity, session: Session) -> PlanFidelity:
         ),
         math.nan,
     )
+    # an identical plan has an infinite ratio
     exact = sqnr_db == math.inf
     return PlanFidelity(
         Measure(found.plan.mean_m, "m"),

@@ -86,11 +86,13 @@ def prepare_variant(
         EvaluationError: It cannot drive.
         Me2eError: A pass refused the graph or failed.
     """
+    # drivers without a file need no preparation
     driver = driver_named(variant.policy, variant.adapter)
     if not isinstance(driver, OnnxDriver):
         if not study.elsewhere:
             driver.open()
         return PreparedVariant(variant, driver)
+    # apply the passes, if there are any
     model = source = driver.path
     if not source.is_file():
         raise StudyError(f"variant {variant.name}: {source}: no such model")
@@ -102,9 +104,11 @@ def prepare_variant(
         provider=PROVIDERS.text(study.provider),
         host_stage=variant.host_stage,
     )
+    # fail early on a model that cannot run or drive
     try_file(model, listener, study.provider)
     if not study.elsewhere:  # another evaluator may ask for another interface
         driver.open()
+    # origin of the file
     sha256 = graph.sha256_of(model)
     origin = source.name, to_text(variant.passes)
     if not variant.passes:

@@ -22,6 +22,7 @@ def recorded(study: Study, workspace: Workspace, listener: Listener) -> Study:
     if asked is None:
         return study
     model = Path(study.reference.policy)
+    # calibration frames, and held-out frames of the next seed
     folders = list[Path]()
     for name, count, seed in (
         ("frames", asked.frames, asked.seed),

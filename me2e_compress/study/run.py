@@ -62,17 +62,20 @@ def run_study(
 def _run(
     study: Study, folder: Path, engine: Engine, listener: Listener, pictures: int
 ) -> StudyResult:
+    # frames, models and their latencies
     workspace = Workspace(folder)
     study = recorded(study, workspace, listener)
     prepared = prepare_all(study, workspace, listener)
     clock = time_all(study, prepared, workspace, listener)
     variants = _variants(study, prepared, clock, listener)
+    # drive every variant under every condition
     setup = DriveSetup(study, clock, workspace, engine, listener)
     drives = [
         drive
         for condition in study.conditions
         for drive in setup.under(condition, prepared)
     ]
+    # only highway can show two drives side by side
     contrasts = (
         () if study.elsewhere else take_pictures(setup, prepared, drives, pictures)
     )

@@ -92,10 +92,12 @@ def take_pictures(
     Raises:
         EvaluationError: A picture cannot be written.
     """
+    # look-ups by the names in the drives
     found = list[Contrast]()
     by_name = {each.variant.name: each for each in prepared}
     conditions = {each.name: each for each in setup.study.conditions}
     routes = {each.id: each for each in setup.study.routes}
+    # one picture per chosen pair
     pairs = _chosen(setup.study.baseline, drives, limit)
     for done, pair in enumerate(pairs):
         setup.listener.on_progress("pictures", done, len(pairs), pair.route.route)

@@ -57,6 +57,7 @@ def _scoreboard(outcome: "StudyResult", condition: Condition) -> Table:
 
 def differences(outcome: "StudyResult") -> Table:
     """Show every variant minus the baseline, paired by route."""
+    # drives with a difference to the baseline
     baseline = outcome.study.baseline
     several = len(outcome.study.conditions) > 1
     names, found = list[str](), list[PairedDifference]()
@@ -65,6 +66,7 @@ def differences(outcome: "StudyResult") -> Table:
             found.append(drive.difference)
             name = f"{drive.variant}, {drive.condition}"
             names.append(name if several else drive.variant)
+    # p-values are corrected for all comparisons shown
     corrected = holm([each.p_value for each in found])
     return Table(
         f"Difference to {baseline} on the same routes",
@@ -87,12 +89,14 @@ def _differences_note(found: Sequence[PairedDifference]) -> str:
         "types\" for types drawn anew. SR p: McNemar's exact test",
         ".",
     ]
+    # several comparisons: the correction, and its limits
     if len(found) > 1:
         notes[1] = (
             f", corrected for {len(found)} comparisons (Holm). Each interval is a 95 % "
             "interval by itself: one in twenty misses zero by chance where nothing "
             "differs."
         )
+    # what so few routes cannot show
     if found:
         n, least = found[0].driving_score.n, found[0].smallest_shown
         on = counted(n, "route")
@@ -147,6 +151,7 @@ def _abilities(
 
 def change_tables(outcome: "StudyResult") -> tuple[Table, ...]:
     """Show costs of changed conditions, and pairs of drives, if there are any."""
+    # changes of a condition, and pairs of drives
     baseline = outcome.study.baseline
     found = outcome.changes, outcome.pairs
     titles = (
@@ -161,6 +166,7 @@ def change_tables(outcome: "StudyResult") -> tuple[Table, ...]:
         f" Beyond: minus {baseline}'s own difference, route by route; below zero where"
         " the change costs more than it."
     )
+    # only changes have the columns beyond the baseline
     columns = ("drive", "against", "DS, points", "DS, other types", "SR, points")
     return tuple(
         Table(

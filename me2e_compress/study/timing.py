@@ -144,6 +144,7 @@ def _measured(
     """
     if not missing:
         return {}
+    # the baseline is always measured with the others
     name = baseline.variant.name
     timed = missing if kept is None else (baseline, *missing)
     found = record_traces(
@@ -156,6 +157,7 @@ def _measured(
             "latency", done, total, words
         ),
     )
+    # put them on the scale of the kept baseline
     if kept is None:
         return found
     pace = kept.percentile_us(50) / max(1, found.pop(name).percentile_us(50))

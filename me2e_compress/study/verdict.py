@@ -10,6 +10,7 @@ from me2e_compress.workflows.result import Cell, Table
 
 def before_and_after(outcome: StudyResult, name: str) -> Table:
     """Compare the baseline and a variant of a study with one condition."""
+    # size, latency, plan and driving, one row each
     before, after = outcome.variant(outcome.study.baseline), outcome.variant(name)
     moved, most = after.fidelity.mean_m, after.fidelity.max_m
     far = "" if most.value is None else f"{most.value:.2f} m at most"

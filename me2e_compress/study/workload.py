@@ -114,6 +114,7 @@ def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
     A route costs world frames and decisions; the condition decides the number of frames
     per decision.
     """
+    # speed of this machine, from earlier logs if possible
     place = Workspace(Path(folder))
     known = _logged(place.folder)
     frame_s, decision_s = known or (FRAME_S, DECISION_S)
@@ -121,6 +122,7 @@ def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
     for condition in study.conditions:
         period = held_frames(study, condition)
         for variant in study.driven_under(condition):
+            # frames and decisions of the missing routes
             left = _left(study, place, variant, condition)
             driven_s = sum(EXPERT_S[route.scenario] for route in left)
             frames = 1e6 * driven_s / step_us(condition.dt_ms)

@@ -45,11 +45,13 @@ def write_study(
         StudyError: The folder cannot be written.
         GraphError: A file was changed since we wrote it.
     """
+    # the Markdown tables
     folder = Path(folder)
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
     title = f"{outcome.study.title}{outcome.study.preview}"
     heading = f"# {in_markdown(title)}\n\n"
     text = heading + "\n".join(table.markdown() for table in all_tables(outcome))
+    # all files are written, or none
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with (

@@ -19,9 +19,6 @@ def store_weights(model: ir.Model, plan: QuantPlan) -> None:
     the integers directly, in one kernel (MatMulNBits); it would dequantize a transposed
     weight again for every frame. The graph, in which the plan's other nodes are placed,
     is changed in place.
-
-    Raises:
-        PreconditionError: the graph is older than opset 13.
     """
     chosen = plan.weight_only
     if not chosen:

@@ -42,10 +42,7 @@ def weights_of(
     """Quantize the weights of int8 layers, by the name of the layer's first output.
 
     Layers that share a weight share the result; decisions without a weight are ignored.
-
-    Raises:
-        PreconditionError: the graph is older than opset 13, or a planned weight is not
-            a constant.
+    The graph needs opset 13 or later.
     """
     if (opset := opset_of(model)) < MIN_OPSET:
         raise PreconditionError(

@@ -65,6 +65,7 @@ def _check_kept(name: str, episode: Episode) -> None:
             f"{name} yields route {route!r}: a name is made of letters, digits, '_' "
             "and '-'"
         )
+    # the episode survives its JSON
     try:
         again = Episode.from_json(json.loads(json.dumps(episode.to_json())))
     except (TypeError, ValueError) as error:
@@ -72,6 +73,7 @@ def _check_kept(name: str, episode: Episode) -> None:
         raise VerificationError(f"{name}: {route} cannot be kept: {line}") from error
     if again != episode:
         raise VerificationError(f"{name}: {route} is read back as another episode")
+    # frames are in order
     times = [frame.time_us for frame in episode.frames]
     if any(later <= earlier for earlier, later in itertools.pairwise(times)):
         raise VerificationError(f"{name}: the frames of {route} are not in their order")

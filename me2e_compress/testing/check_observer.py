@@ -29,11 +29,13 @@ def check_observer(observer: Observer, seed: int = 0) -> tuple[Bounds, Bounds]:
     check_form(observer, OBSERVERS)
     tensors = _tensors(seed)
     _check_counts(observer, tensors)
+    # the same statistics give the same ranges
     seen = _statistics(tensors, observer.counts)
     lows, highs = observer.ranges(seen)
     if not _equal((lows, highs), observer.ranges(seen)):
         raise VerificationError(f"{observer.name} gives two ranges for one tensor")
     _check_bounds(observer.name, seen, lows, highs)
+    # the order of the tensors does not matter
     turned = observer.ranges(_statistics(tensors[::-1], observer.counts))
     if not _equal((lows[::-1], highs[::-1]), turned):
         raise VerificationError(
@@ -67,6 +69,7 @@ def _check_bounds(name: str, seen: Statistics, lows: Bounds, highs: Bounds) -> N
             )
         if not np.isfinite(bounds).all():
             raise VerificationError(f"{name}: a bound is not finite")
+    # low bounds below high ones, and within what was seen
     for tensor, low, high in zip(seen.tensors, lows, highs, strict=True):
         if low > high:
             raise VerificationError(
@@ -108,6 +111,7 @@ def _statistics(tensors: list[npt.NDArray[np.float32]], histograms: bool) -> Sta
     names = tuple(f"t{at}" for at in range(len(tensors)))
     places = tuple(range(FRAMES))
     seen = Statistics("model", "source", names, places, measured)
+    # histograms, if the observer reads them
     if not histograms:
         return seen
     counts = [

@@ -57,6 +57,7 @@ def check_operator(
             f"{operator.name}: the own form is {operator.own.name!r} in the domain"
             f" {operator.own.domain!r}, both must be {OWN_DOMAIN!r}"
         )
+    # every dialect at every opset, on random calls
     make = drawn if draw is None else draw
     for dialect in operator.all_dialects():
         random = np.random.default_rng(seed)
@@ -104,6 +105,7 @@ class _Case:
         own = self.operator.own
         if self.dialect == own:
             return
+        # a call in the own form, translated and expanded
         model = graph_of(call, own, self.opset)
         by = "check-operator"
         try:

@@ -103,6 +103,7 @@ def _check_exact(
             f"{current.name} is not idempotent: {second.changes} changes on a second"
             " run"
         )
+    # the outputs are the same
     inputs = VerificationInputs.of(before, context.frames, context.seed, 2)
     found = equivalence.verify((current.name,), before, after, inputs)
     if not equivalence.passed(found):

@@ -47,6 +47,7 @@ def check_policy(driver: Driver) -> Answers:
     check_form(driver, POLICIES)
     if not driver.fingerprint() or driver.fingerprint() != driver.fingerprint():
         raise VerificationError(f"{driver.name} has no fingerprint, or more than one")
+    # the same answers after a reset, and from a new policy
     policy = driver.open()
     answers, again = _answers(driver, policy), _answers(driver, policy)
     if not _same(answers, again):

@@ -77,6 +77,7 @@ def _array(
     operand: Operand, sizes: dict[str, int], random: np.random.Generator
 ) -> NdArray:
     dims = operand.dims
+    # a digit is a size, a letter one size in all operands, * any size
     letters = ["*"] * random.integers(1, _LARGEST_RANK + 1)
     shape = []
     for letter in letters if dims is None else dims.split():
@@ -86,6 +87,7 @@ def _array(
         elif letter != "*":
             size = sizes.setdefault(letter, size)
         shape.append(size)
+    # values of the first type that the operand allows
     kind = operand.types[0]
     if kind in INTEGERS:
         return random.integers(0, 5, shape).astype(kind.numpy())

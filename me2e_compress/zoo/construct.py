@@ -13,10 +13,7 @@ if TYPE_CHECKING:
 
 
 def construct(spec: Stack, sampling: "Sampling" = "operator") -> "nn.Module":
-    """Build the module that the original's weights fit; its own weights are meaningless.
-
-    ``spec`` comes from `Stack.with_heads`.
-    """
+    """Build a module that the original's weights fit; its own are meaningless."""
     model: nn.Module
     if spec.name == TCP.name:
         from me2e_compress.zoo.tcp.stack import Tcp

@@ -17,7 +17,7 @@ BIAS_STD = 0.1
 EMBEDDING_STD = 0.3
 DEFAULT_GAIN = math.sqrt(2)
 RESIDUAL_SCALE = 0.35
-"""Scale of the last normalisation of a residual block, so that 16 blocks stay stable."""
+"""Scale of the last normalisation of a residual block, so 16 blocks stay stable."""
 
 ATTENTION_HEADS = 8
 
@@ -79,11 +79,7 @@ def _drawn(
 
 
 def _smooth(kernels: Tensor) -> Tensor:
-    """Blur kernels [out, in, k, k] at the same standard deviation.
-
-    White-noise kernels respond more to pixel noise than to shapes; trained ones are
-    smooth.
-    """
+    """Blur kernels [out, in, k, k] at the same deviation: trained ones are smooth."""
     blurred = kernels
     for _ in range(kernels.shape[-1] // 3):
         blurred = functional.avg_pool2d(blurred, 3, 1, 1, count_include_pad=False)
@@ -91,8 +87,7 @@ def _smooth(kernels: Tensor) -> Tensor:
 
 
 def _spread(bias: Tensor) -> Tensor:
-    """Return deformable DETR's offsets: one direction per head, one more step per point.
-    """
+    """Return deformable DETR's offsets: a direction per head, a step per point."""
     angles = torch.arange(ATTENTION_HEADS) * (2 * math.pi / ATTENTION_HEADS)
     directions = torch.stack([angles.cos(), angles.sin()], -1)
     directions = directions / directions.abs().amax(-1, keepdim=True)
@@ -102,10 +97,7 @@ def _spread(bias: Tensor) -> Tensor:
 
 
 def take_statistics(backbone: nn.Module, images: Tensor) -> Tensor:
-    """Set a backbone's batch normalisations to the statistics of images, in place.
-
-    The images are [N, 3, H, W], normalised. Returns the features.
-    """
+    """Set batch normalisations to statistics of images; return the features."""
     norms = [each for each in backbone.modules() if isinstance(each, nn.BatchNorm2d)]
     for norm in norms:
         norm.train()

@@ -152,11 +152,7 @@ def _filled(
 
 
 def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
-    """Trace a module with example inputs and return the graph.
-
-    Raises:
-        GraphError: the exporter wrote another opset than requested.
-    """
+    """Trace a module with example inputs and return the graph."""
     import torch
 
     with _quiet_exporter(), torch.no_grad():
@@ -218,7 +214,6 @@ def example(spec: Stack) -> "tuple[Tensor, ...]":
 
 @contextmanager
 def _quiet_exporter() -> Iterator[None]:
-    """Silence only torch's warnings about its exporter and traced shapes."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "You are using the legacy TorchScript")
         warnings.filterwarnings("ignore", category=DeprecationWarning, module="torch")

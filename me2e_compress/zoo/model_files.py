@@ -8,11 +8,7 @@ from me2e_compress.errors import GraphError
 
 
 def write(path: Path, content: bytes) -> Path:
-    """Write a file atomically, with its folder if needed, and return the path.
-
-    Raises:
-        GraphError: the path is a folder, or it or its folder cannot be written.
-    """
+    """Write a file atomically, with its folder if needed; errors are GraphErrors."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -24,13 +24,9 @@ _NAMED = 3
 class Mismatch:
     """The differences between a checkpoint and a stack; false if there are none.
 
-    Attributes:
-        wanted: number of tensors that the stack has.
-        missing: names of the original.
-        unexpected: names in the file.
-        other_shapes: name, shape in the file, shape in the stack.
-        other_types: name and element type, where it is not a floating-point one.
-        not_finite: names of tensors with NaN, infinities, or overflows of float32.
+    ``missing`` are names of the original, the others names of the file.
+    ``other_shapes`` are name, shape in the file and shape in the stack. ``not_finite``
+    includes overflows of float32.
     """
 
     wanted: int
@@ -69,11 +65,8 @@ def _first(names: Sequence[str]) -> str:
 class NameMatch:
     """Pairs each tensor of a module with the one of its published name.
 
-    Attributes:
-        module: on any device, including meta.
-        names: the original's names.
-        state: the checkpoint's tensors.
-        ema: take moving averages; buffers without one are taken as they are.
+    The module may be on meta. With ``ema`` moving averages are taken; buffers without
+    one are taken as they are.
     """
 
     module: "nn.Module"

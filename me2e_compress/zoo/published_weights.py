@@ -20,17 +20,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PublishedWeights:
-    """All tensors of a stack from a checkpoint, by our names; float32 except counters.
-    """
+    """All tensors of a stack, by our names; float32 except counters."""
 
     tensors: "Mapping[str, Tensor]"
     record: WeightsRecord
 
     def fill(self, model: "nn.Module") -> None:
-        """Set all parameters and buffers of a stack's module, in place.
-
-        Tables that the module computed stay (`PublishedNames.computed`).
-        """
+        """Set a module's tensors except those in `PublishedNames.computed`."""
         model.load_state_dict({**model.state_dict(), **self.tensors})
 
 
@@ -39,15 +35,11 @@ def published_weights(
 ) -> PublishedWeights:
     """Read the weights of a stack from a checkpoint of its original.
 
-    Args:
-        stack: a name in `STACKS`.
-        path: a file for `read_state_dict`.
-        heads: which last layers; None is the default of the stack.
-        ema: take the moving averages that mmcv's EMAHook stores with the parameters.
+    ``ema`` takes the moving averages that mmcv's EMAHook stores with the parameters.
 
     Raises:
         MissingExtraError: torch is not installed, or safetensors for such a file.
-        GraphError: unknown stack or heads, an unreadable file, or one that does not
+        GraphError: unknown stack or heads, or a file that is unreadable or does not
             hold exactly the stack's tensors.
     """
     spec = _with_original(stack, heads)
@@ -63,10 +55,7 @@ def published_weights(
 def mismatch(
     stack: str, path: Path, *, heads: str | None = None, ema: bool = False
 ) -> Mismatch:
-    """Return every name of a checkpoint that does not fit a stack.
-
-    For arguments and errors see `published_weights`.
-    """
+    """Return every name of a checkpoint that does not fit; see `published_weights`."""
     spec = _with_original(stack, heads)
     return _match(spec, read_state_dict(path), ema).mismatch()
 
@@ -106,7 +95,6 @@ def _with_original(stack: str, heads: str | None) -> Stack:
 
 
 def _other_heads(stack: Stack, state: StateDict, ema: bool) -> str:
-    """Return a hint which heads the tensors would fit, if any."""
     each = ((name, stack.with_heads(name)) for name in stack.heads)
     fits = [name for name, spec in each if not _match(spec, state, ema).mismatch()]
     return "".join(f"; it fits --heads {name}" for name in fits)

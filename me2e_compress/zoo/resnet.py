@@ -69,11 +69,7 @@ def _shortcut(channels: int, out: int, stride: int) -> nn.Module | None:
 
 
 class ResNet(nn.Module):
-    """Maps images to the feature maps of all stages.
-
-    ``blocks`` are counted per stage; ``width`` channels leave the stem, and every stage
-    doubles them.
-    """
+    """Maps images to the feature maps of all stages; each stage doubles ``width``."""
 
     def __init__(
         self,

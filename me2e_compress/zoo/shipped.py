@@ -19,12 +19,7 @@ SHIPPED = tuple(stack.name for stack in STACKS.values() if stack.trained)
 
 
 class TrainingData(pydantic.BaseModel):
-    """The training data of a model.
-
-    Attributes:
-        seeds: of the generated routes; none of them is an evaluation route.
-        frames: total number of camera frames.
-    """
+    """Seeds of the training routes, none used for evaluation, and frames."""
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
@@ -124,10 +119,9 @@ def checkpoint(name: str, folder: Path | None = None) -> Path:
 
 
 def sample_frames(model: Path, folder: Path | None = None) -> Path | None:
-    """Return the folder of recorded frames of a shipped model, if a file is a copy of one.
+    """Return the recorded frames of a shipped model, if a file is a copy of one.
 
-    There are two frames of a drive: enough to verify exact passes on realistic input,
-    but not to calibrate. ``folder`` is as in `shipped`.
+    Two frames of a drive suffice to verify exact passes, but not to calibrate.
     """
     folder = folder or WEIGHTS
     for name in SHIPPED:
@@ -159,10 +153,10 @@ def _same(path: Path, expected: str) -> Path:
 
 
 def copy(name: str, target: Path, folder: Path | None = None) -> Path:
-    """Write a copy of a shipped model atomically, and return its path.
+    """Write a copy of a shipped model atomically and return its path.
 
     Raises:
-        GraphError: as `shipped`, or ``target`` is the shipped file itself or cannot be
+        GraphError: as `shipped`, or ``target`` is the shipped file or cannot be
             written.
     """
     source = shipped(name, folder)

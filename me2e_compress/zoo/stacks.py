@@ -14,10 +14,7 @@ Shape = tuple[int, ...]
 class ImageNorm:
     """How pixels become the image input: (pixel - mean) / std, per channel.
 
-    Attributes:
-        mean: in grey levels 0 to 255, in the order of `order`.
-        std: like the mean.
-        order: channels of the model: red first or blue first.
+    Both are in grey levels 0 to 255, in the ``order`` of the model's channels.
     """
 
     mean: tuple[float, float, float]

@@ -1,5 +1,4 @@
-"""Read state dicts in files of other programs as tensors by name, without running code.
-"""
+"""Read state dicts of other programs as tensors by name, without running code."""
 
 import hashlib
 import importlib
@@ -52,14 +51,9 @@ _NAMED = 5
 
 @dataclass(frozen=True, eq=False)
 class StateDict:
-    """Tensors of a checkpoint.
+    """Tensors of a checkpoint by name, without the prefixes of wrappers.
 
-    Attributes:
-        path: the file.
-        sha256: of the file, lower-case hex.
-        tensors: by name, without the prefixes of wrappers.
-        epoch: as stated in the file.
-        iteration: as stated in the file.
+    ``epoch`` and ``iteration`` are as stated in the file; ``sha256`` is lower-case hex.
     """
 
     path: Path
@@ -114,8 +108,6 @@ def _from_torch(path: Path) -> object:
 
 
 def _refusal(said: str) -> str:
-    """Return which function or class a file requests, from the message of torch's reader.
-    """
     asked = re.search(r"GLOBAL ([\w.]+)", said)
     if asked is None:
         return "neither a file of torch.save nor .safetensors"
@@ -140,11 +132,7 @@ def _from_safetensors(path: Path) -> object:
 
 
 def _tensors(whole: object) -> Mapping[Any, Any]:
-    """Return the content under the wrapper's key, or everything.
-
-    Raises:
-        MalformedError: It holds no tensors by name, or under several keys.
-    """
+    """Return the content under the wrapper's key, or everything."""
     if not isinstance(whole, Mapping):
         raise MalformedError(f"it holds a {type(whole).__name__}, not tensors by name")
     held = [key for key in WRAPPERS if isinstance(whole.get(key), Mapping)]
@@ -171,11 +159,7 @@ def _is_tensor(name: object, value: object) -> bool:
 
 
 def _without_prefixes(tensors: "Mapping[str, Tensor]") -> "dict[str, Tensor]":
-    """Return the tensors by bare names, which must be unique.
-
-    Raises:
-        MalformedError: Two become one.
-    """
+    """Return the tensors by bare names, which must be unique."""
     found: dict[str, Tensor] = {}
     for name, tensor in tensors.items():
         bare = name

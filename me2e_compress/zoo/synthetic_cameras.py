@@ -1,5 +1,4 @@
-"""Six pinhole cameras around a vehicle, and how they render boxes on a painted ground.
-"""
+"""Six pinhole cameras around a vehicle, and how they render painted boxes."""
 
 import math
 from collections.abc import Sequence
@@ -119,8 +118,7 @@ def render(
 ) -> NDArray[np.uint8]:
     """Draw the images of the six cameras, [6, h, w, 3] RGB, 360 x 640 by default.
 
-    ``boxes`` are everything on the ground, in world coordinates; ``scale`` is relative
-    to 1600 x 900 images.
+    Boxes are in world coordinates; ``scale`` is relative to 1600 x 900 images.
     """
     cameras = rig(scale)
     images = np.empty((len(cameras), *cameras[0].hw, 3), np.uint8)
@@ -137,7 +135,6 @@ def render(
 def _background(
     world: SyntheticWorld, ego: EgoPose, camera: Pinhole, rays: Array
 ) -> tuple[Array, Array]:
-    """Draw sky and ground: colour [h, w, 3] and depth [h, w]."""
     rise = np.clip(rays[..., 2:] / 0.5, 0, 1)
     colour = SKY_LOW * (1 - rise) + SKY_HIGH * rise
     depth = np.full(rays.shape[:2], np.float32(0))

@@ -29,13 +29,9 @@ SENSOR_NOISE = 2.0
 def frames(
     spec: Stack, n: int, seed: int, scene_length: int = 8, first: int = 0
 ) -> Iterator[Frame]:
-    """Yield frames one by one, keyed by input name, without the recurrent inputs.
+    """Yield ``n`` frames by input name, without the recurrent inputs.
 
-    There are ``n`` frames in scenes of ``scene_length``; ``first`` is the frame to
-    begin with, the first of a scene.
-
-    Raises:
-        FramesError: a count is below 1.
+    Frame ``first`` must begin a scene; counts below 1 are a FramesError.
     """
     if n < 1 or scene_length < 1:
         raise FramesError(
@@ -150,7 +146,6 @@ def _place(bend: float, along: float, aside: float) -> tuple[float, float, float
 
 
 def _colour(rng: np.random.Generator, bounds: Range) -> tuple[float, float, float]:
-    """Draw a colour, mostly grey."""
     red, green, blue = np.clip(rng.uniform(*bounds) + rng.normal(0, TINT, 3), 0, 255)
     return float(red), float(green), float(blue)
 
@@ -195,7 +190,6 @@ def _building(rng: np.random.Generator, bend: float) -> Cuboid:
 
 
 def _small(rng: np.random.Generator, bend: float) -> Cuboid:
-    """Draw a pedestrian walking along the pavement, or a cone."""
     side = 1 if rng.random() < 0.5 else -1
     x, y, yaw = _place(bend, float(rng.uniform(-20, 40)), side * rng.uniform(6, 8.5))
     if rng.random() < 0.4:

@@ -51,10 +51,7 @@ class EgoPose:
 
 @dataclass(frozen=True)
 class Cuboid:
-    """A cuboid on the ground, in metres, radians, metres per second and RGB.
-
-    ``window_m`` is the vertical period of a dark band; None paints none.
-    """
+    """A box in metres, radians and RGB; ``window_m`` is a dark band's period."""
 
     x: float
     y: float
@@ -112,15 +109,9 @@ class Cuboid:
 class SyntheticWorld:
     """The ground, and the objects on it when the scene began.
 
-    Attributes:
-        bend: curvature of the road at the start, 1 / m; its middle is y = bend * x ** 2
-            / 2.
-        crossing_m: where a zebra crossing begins.
-        tile: [256, 256] brightness of the ground, repeated.
-        boxes: at time 0.
-        speed_mps: of the ego vehicle at time 0.
-        accel_mps2: of the ego vehicle.
-        lane_m: offset of the ego vehicle from the middle of the road, left positive.
+    The middle of the road is y = bend * x ** 2 / 2, a zebra crossing begins at
+    ``crossing_m``, and ``tile`` [256, 256] is the repeated brightness of the ground.
+    ``lane_m`` is the ego vehicle's offset from the middle, left positive.
     """
 
     bend: float

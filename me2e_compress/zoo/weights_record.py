@@ -18,10 +18,6 @@ class WeightsRecord:
     """The checkpoint of a graph's weights, and what was not used of it.
 
     Attributes:
-        file: name of the checkpoint.
-        sha256: of the file, lower-case hex.
-        epoch: as stated in the file.
-        iteration: as stated in the file.
         averaged: whether its moving averages were taken.
         converted: number of tensors converted to float32, by their old type.
         unread: names of omitted tensors, which driving does not use.
@@ -61,10 +57,7 @@ class WeightsRecord:
 
 
 def named_weights(metadata: Mapping[str, str]) -> str:
-    """Return the line that names the checkpoint of a graph; empty if unknown.
-
-    A stack exported without a checkpoint has random weights.
-    """
+    """Return the line that names a graph's checkpoint or random weights, if known."""
     text = metadata.get(RECORD)
     if text is None:
         stack = STACKS.get(metadata.get("me2e.stack", ""))

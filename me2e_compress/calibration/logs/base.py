@@ -163,11 +163,7 @@ class DriveLog(ABC):
 
 
 def pose(rotation: Sequence[float], translation: Sequence[float], what: str) -> Floats:
-    """Return the [4, 4] of a quaternion w, x, y, z and a translation.
-
-    Raises:
-        FramesError: a number is not finite, or the quaternion is zero.
-    """
+    """Return the [4, 4] of a quaternion w, x, y, z and a translation."""
     w, x, y, z = found = np.array(rotation, np.float64)
     size = float(found @ found)
     if not (np.isfinite(size) and np.isfinite(translation).all() and size > 0):

@@ -39,8 +39,6 @@ class LoggedInputs:
     """How the inputs of a model are made from a log.
 
     Attributes:
-        forms: shape and type of the inputs to make, by name; recurrent ones are left
-            out.
         image: normalisation and size of the input img; None without one.
         forward_left: whether the model's ground frame is the ego's (x forward, y left)
             instead of the lidar's (x right, y forward).
@@ -53,11 +51,7 @@ class LoggedInputs:
     width: int | None = None
 
     def check(self, log: DriveLog) -> None:
-        """Check that a log can feed the model.
-
-        Raises:
-            FramesError: an input cannot be made, or the number of cameras differs.
-        """
+        """Check that a log can feed the model."""
         for name in self.forms:
             if name not in MADE:
                 raise FramesError(
@@ -128,16 +122,9 @@ def log_frames(
 ) -> Iterator[Frame]:
     """Yield frames of a model from a log in order, with images as bytes.
 
-    Args:
-        log: the data set.
-        model: builds the inputs.
-        count: most frames in all.
-        scene_length: most frames of a scene; None takes all.
-        done: frames that exist already, in whole scenes.
-        first: number of the scene to begin with.
-
-    Raises:
-        FramesError: something is missing or malformed, or a count is below 1.
+    At most ``count`` frames in all and ``scene_length`` a scene are read. To resume,
+    ``done`` frames in whole scenes exist already, and ``first`` is the number of the
+    scene to begin with.
     """
     if count < 1 or (scene_length is not None and scene_length < 1):
         raise FramesError(

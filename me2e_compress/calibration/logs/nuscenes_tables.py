@@ -28,12 +28,7 @@ _SPACE = " \t\r\n,"
 
 
 def rows(path: Path, *fields: str) -> Iterator[Row]:
-    """Read the rows of a table one by one.
-
-    Raises:
-        FramesError: the table is missing or malformed, or a row lacks one of
-            ``fields``.
-    """
+    """Yield the rows of a table one by one; each must have ``fields``."""
     with documents.reading(path, FramesError, "not a table of nuScenes"):
         for index, row in enumerate(_objects(path)):
             for name in fields:

@@ -25,12 +25,10 @@ _JPEG, _PNG = b"\xff\xd8", b"\x89PNG"
 
 @dataclass(frozen=True)
 class Picture:
-    """A decoded picture.
+    """A decoded picture, uint8 [3, h, w], at most as large as the input.
 
-    Attributes:
-        planes: uint8 [3, h, w], at most as large as the input.
-        place: [4, 4] from pixels of the whole picture to those of the input, both times
-            depth.
+    ``place`` [4, 4] leads from pixels of the whole picture to those of the input, both
+    times depth.
     """
 
     planes: Bytes
@@ -38,11 +36,7 @@ class Picture:
 
 
 def read_picture(path: Path, pixels: PixelInput, columns: int) -> Picture:
-    """Read a JPEG or PNG and lay it out for an input of which it takes ``columns``.
-
-    Raises:
-        FramesError: it is missing, truncated, or no picture.
-    """
+    """Read a JPEG or PNG and lay it out for an input of which it takes ``columns``."""
     import cv2  # takes a tenth of a second to import
 
     found = _decoded(path)
@@ -62,12 +56,8 @@ def read_picture(path: Path, pixels: PixelInput, columns: int) -> Picture:
 def read_pixels(path: Path, size: tuple[int, int]) -> tuple[Bytes, Floats]:
     """Read a JPEG or PNG and scale it to ``size`` (rows, columns) without cropping.
 
-    Returns:
-        RGB [rows, columns, 3], and [4, 4] from pixels of the picture to those, both
-        times depth.
-
-    Raises:
-        FramesError: it is missing, truncated, or no picture.
+    Returns RGB [rows, columns, 3], and [4, 4] from pixels of the picture to those, both
+    times depth.
     """
     import cv2
 

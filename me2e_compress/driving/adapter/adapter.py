@@ -101,6 +101,7 @@ class Adapter(BaseModel):
             **dict.fromkeys((*self.feeds, *self.images)),
             **{name: each.answer for name, each in named if each.answer is not None},
         }
+        # the plan's mode may be picked by an input of another name
         said = {RECURRENT: json.dumps(pairs)} if pairs else {}
         if self.plan is not None:
             picks = self.plan.command_input

@@ -55,6 +55,7 @@ class BetaActions(_Table):
                 f"{self.alpha} and {self.beta} are {alpha.tolist()} and"
                 f" {beta.tolist()}: no parameters of a Beta distribution"
             )
+        # from 0 to 1 to -1 to 1
         pairs = zip(alpha.tolist(), beta.tolist(), strict=True)
         chosen = (self._chosen(a, b) for a, b in pairs)
         acceleration, steer = (2.0 * each - 1.0 for each in chosen)
@@ -123,6 +124,7 @@ class ControlAdapter(_Table):
 
     @model_validator(mode="after")
     def _one_form(self) -> Self:
+        # exactly one way to read the controls
         named = {name for name in _NUMBERS if getattr(self, name) is not None}
         tables = sum(table is not None for table in (self.beta, self.scored))
         if tables + (named in _FORMS) != 1 or (tables and named):
@@ -130,6 +132,7 @@ class ControlAdapter(_Table):
                 "either throttle, steer and brake, or acceleration and steer, or beta,"
                 " or scored"
             )
+        # ranges that can be divided by
         for name in _NUMBERS:
             nothing, full = getattr(self, f"{name}_range")
             if nothing == full:

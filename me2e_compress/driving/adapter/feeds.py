@@ -36,6 +36,7 @@ class FeedPart:
         if not isinstance(name, str):
             names = ", ".join(INPUT_SOURCES.names())
             raise ValueError(f"no source is named; there are {names}")
+        # what is left of the table are the source's options
         mean = _levels("mean", options.pop("mean", 0.0))
         std = _levels("std", options.pop("std", 1.0))
         if not np.all(std):
@@ -56,6 +57,7 @@ class FeedPart:
             raise EvaluationError(
                 f"{self.source.name}: mean or std: {error}"
             ) from error
+        # numpy may have broadcast to a larger shape
         if scaled.shape != array.shape:
             raise EvaluationError(
                 f"{self.source.name}: mean and std make {list(scaled.shape)} of its "
@@ -83,6 +85,7 @@ class Feed(BaseModel):
             raise ValueError("it must be a table with a source, or with parts")
         if "parts" not in table:
             return {"parts": (FeedPart.read(table),)}
+        # parts, each a table of its own
         listed = table["parts"]
         if not (isinstance(listed, list) and listed) or len(table) > 1:
             raise ValueError("parts must be a list of tables, and stand alone")

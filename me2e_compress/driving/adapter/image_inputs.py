@@ -70,6 +70,7 @@ class ImageInput(BaseModel):
             raise ValueError("mean and std belong together")
         if self.std is not None and not all(self.std):
             raise ValueError("std is zero")
+        # c, h and w, each letter once
         letters = self.layout
         if letters is not None and (
             set(letters) - set("bnchw")
@@ -176,9 +177,11 @@ def rendered_size(name: str, table: ImageInput, port: ImagePort) -> tuple[int, i
             f"input {name} has {port.size[0]} rows and {port.size[1]} columns: a size "
             f"of {rows} x {columns} does not fit"
         )
+    # without stitching, the cameras are rendered as the input is
     asked = table.rendered or table.camera_size
     if asked is not None or not table.stitch:
         return asked or (rows, columns)
+    # stitched cameras share the columns
     if columns % len(table.cameras):
         raise EvaluationError(
             f"input {name}: {columns} columns of {len(table.cameras)} cameras: "

@@ -44,6 +44,7 @@ class InputImages:
         rows, columns = self.rendered
         if (crops := self.table.crops) is None:
             return ((0, 0, columns, rows),) * len(self.indices)
+        # crops count pixels of the camera's own size
         full_rows, full_columns = self.table.camera_size or self.rendered
         across, down = columns / full_columns, rows / full_rows
         return tuple(
@@ -109,6 +110,7 @@ class InputImages:
     def _taken(self, images: Bytes) -> Bytes:
         """Return uint8 RGB [pictures, h, w, 3]."""
         rows, columns = self.rendered
+        # pictures taken as they are need no copy
         whole = all(each == (0, 0, columns, rows) for each in self.windows)
         if whole and self.size == self.rendered and not self.table.stitch:
             every = self.indices == tuple(range(len(images)))

@@ -60,10 +60,12 @@ class ModelInputs:
         """
         ports = {k: v for k, v in session.inputs.items() if k not in recurrent}
         _check_names(session, adapter, recurrent)
+        # every input is fed by something
         tables, given = image_tables(adapter, ports), feeds_by_input(adapter, ports)
         for name in ports:
             if name not in tables and name not in given:
                 raise EvaluationError(unfed(name))
+        # and by something that fits
         images, size = images_by_input(session, adapter, tables)
         found = cls(session.inputs, adapter, images, given, size)
         for fault in found.faults().values():
@@ -95,6 +97,7 @@ class ModelInputs:
                 raise EvaluationError("the model needs images, and none were rendered")
             for name, each in self.images.items():
                 arrays[name] = each.apply(observation.images)
+        # inputs that are no images may need the ego's track
         self._track.note(observation.time_us, observation.motion)
         seen = self._seen(observation)
         arrays |= {name: feed.value(seen) for name, feed in self.given.items()}
@@ -130,6 +133,7 @@ class ModelInputs:
         """Return the reason for each input that cannot be fed, in feed order."""
         nothing = self.nothing(0)
         self._track.note(0, nothing.motion)
+        # what feeds an input must be there, and fit
         seen, found = self._seen(nothing), dict[str, str]()
         for name, feed in self.given.items():
             try:
@@ -242,6 +246,7 @@ def _fault(name: str, port: SessionPort, array: Array, sizes: str) -> str:
     ):
         said = f"input {name} has shape {list(found)}, it must be {[1, *array.shape]}"
         return f"{said}: it is {sizes}" if sizes else said
+    # the types must agree
     if not np.can_cast(array.dtype, DTYPES[port.type], "same_kind"):
         return f"input {name} is {port.type}, and what feeds it {array.dtype}"
     return ""

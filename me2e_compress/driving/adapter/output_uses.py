@@ -65,6 +65,7 @@ def plan_words(plan: PlanAdapter, shape: Shape) -> str:
     words = f"plan: {many} {step_s:g} s apart"
     if plan.deltas:
         words += ", as steps"
+    # how the mode is picked, if there are several
     if plan.command_input is not None:
         words += f", mode by {plan.command_input}"
     elif plan.default_mode is not None and len(sides) > (

@@ -76,6 +76,7 @@ class ModelOutputs:
         control = self.control.read(outputs)
         if self.fusion is None or plan is None:
             return control
+        # both heads, fused
         speed_mps, points = observation.speed_mps, observation.target_points
         if points is None:
             raise EvaluationError("fusion aims at a target point, and there is none")

@@ -113,6 +113,7 @@ class FirstValues:
                 held[name] = _from_file(entry.file, name, ports[name], where)
             elif entry.first != ZEROS:
                 given[name] = _input(entry.first, ports[name], ports, recurrent, where)
+        # all others start from zeros
         known = {*held, *given, *session.recurrent}
         others = [name for name in recurrent if name not in known]
         return cls(held, given, {name: zeros(name, ports[name]) for name in others})

@@ -44,9 +44,11 @@ class Past(InputSource):
 
     def value(self, seen: Observed) -> Array:
         """Return float64 [steps, quantities]."""
+        # the ego's states, the present one last
         now = seen.motion
         back = 1e6 * self.spacing_s * np.arange(self.steps, -1, -1)
         states = seen.track.at(seen.observation.time_us - back)
+        # relative to the present pose, in the model's axes
         states[:, :3] -= (now.x, now.y, states[-1, 2])
         cos, sin = np.cos(now.heading), np.sin(now.heading)
         in_ego = states[:, :2] @ np.array([[cos, -sin], [sin, cos]])

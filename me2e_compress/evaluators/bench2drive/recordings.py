@@ -71,6 +71,7 @@ class RecordedRoute:
         The speed is the derivative of the position. Route progress is not recorded:
         ``route_m`` is the distance driven.
         """
+        # one column per field of a frame
         moved = _lengths(np.diff(self.position_m, axis=0))
         columns = {
             "x": self.position_m[:, 0],
@@ -183,11 +184,13 @@ def read_recording(raw: object) -> RecordedRoute:
     Raises:
         BrokenRecordingError: There is no step, or one is incomplete or not finite.
     """
+    # steps are keyed by their number
     if not isinstance(raw, dict) or not raw:
         raise BrokenRecordingError("no step is recorded")
     steps = [key for key in raw if not _STEP.fullmatch(key)]
     if steps:
         raise BrokenRecordingError(f"{steps[0][:60]!r} is not the number of a step")
+    # CARLA's left-handed world becomes right-handed
     acceleration, turning, forward, right = (_column(raw, part, 3) for part in _PARTS)
     location = _column(raw, _LOCATION, 3)
     ahead, aside, push = forward[:, :2], right[:, :2], acceleration[:, :2]

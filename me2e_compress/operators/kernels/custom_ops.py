@@ -74,7 +74,6 @@ _register = ctypes.CFUNCTYPE(_POINTER, _POINTER, _POINTER)(_add)
 
 
 def _api(base: int) -> Any:
-    """Return the functions of onnxruntime's C interface, by offset."""
     get = ctypes.cast(base, ctypes.POINTER(_POINTER))[0]
     found = ctypes.CFUNCTYPE(_POINTER, ctypes.c_uint32)(get)(abi.API_VERSION)
     return ctypes.cast(found, ctypes.POINTER(_POINTER))

@@ -125,7 +125,6 @@ def _corners(w: Any, o: Any, places: Any, shares: Any, count: int, row: int) -> 
 
 @compiled
 def _to_real(a: Any, w: Any, out: int, head: int, first: int, last: int) -> None:
-    """Convert sums of quantized numbers to real ones."""
     numbers, scales = floats(out), floats(a[SCALE])
     shares = F(0)
     for j in range(first, last):
@@ -142,7 +141,6 @@ def _to_real(a: Any, w: Any, out: int, head: int, first: int, last: int) -> None
 
 
 def _block(kind: Any) -> Callable[[int, int], Word]:
-    """Make the function that computes a block of queries, for an element type."""
     sum_rows = weighted_rows(kind)
     bytes_each = kind.bitwidth // 8
     quantized = bytes_each == 1
@@ -189,10 +187,7 @@ def _refused(t: Any, message: int) -> Word:
 
 @compiled
 def _read(t: Any, context: int, index: int, to: int) -> Word:
-    """Read an input into ten words (dimensions, address, type) and return its rank.
-
-    The dimensions are not read if there are more than eight.
-    """
+    """Read an input into ten words and return its rank, of which 8 are stored."""
     slot = _slot()
     at = address_of(slot)
     call(t[abi.GET_INPUT], context, index, at, 0, 0)
@@ -241,7 +236,6 @@ def _misfit(a: Any, x: Any) -> Word:
 
 
 def _compute(inputs: int) -> Callable[[int, int], Word]:
-    """Make the function that onnxruntime calls, for a number of inputs."""
 
     def compute(state: int, context: int) -> Word:
         t, x, a = words(state), _inputs(), _words()

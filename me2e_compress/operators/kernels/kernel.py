@@ -7,13 +7,9 @@ from me2e_compress.operators.kernels.abi import ANY, FLOAT, INT8, UINT8
 
 @dataclasses.dataclass(frozen=True)
 class CompiledKernel:
-    """A compiled operator of the domain :data:`DOMAIN`.
+    """A compiled operator of :data:`DOMAIN`: its code's module, and its element types.
 
-    Attributes:
-        module: the module of this package that has its code.
-        inputs: their element types.
-        messages: errors for inputs that do not fit.
-        output: its element type.
+    ``messages`` are the errors for inputs that do not fit.
     """
 
     op_type: str

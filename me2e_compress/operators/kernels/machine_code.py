@@ -49,11 +49,8 @@ def load_or_compile(
 ) -> Mapping[str, int]:
     """Return the addresses of a kernel's functions by name, cached in ``folder``.
 
-    The module's ``functions(op_type)`` are Python functions of two words that return a
-    word; ``begins`` is called before a kernel is compiled.
-
-    Raises:
-        GraphError: the functions call something that only Python or Numba has.
+    The module's ``functions(op_type)`` take two words and return one; ``begins`` is
+    called before a compilation. Code that calls into Python or Numba is a GraphError.
     """
     with _LOCK:
         place = private(folder)
@@ -81,7 +78,6 @@ def _fingerprint() -> str:
 
 
 def _read(path: Path | None) -> bytes | None:
-    """Return stored code; None if there is none or the file is corrupt."""
     try:
         content = b"" if path is None else path.read_bytes()
     except OSError:
@@ -91,7 +87,6 @@ def _read(path: Path | None) -> bytes | None:
 
 
 def _machine() -> Any:
-    """Return LLVM's compiler for this processor."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     target = llvm.Target.from_default_triple()

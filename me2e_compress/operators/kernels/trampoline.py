@@ -31,10 +31,7 @@ _STEP = 16  # bytes a function takes
 
 @dataclasses.dataclass(frozen=True)
 class _Machine:
-    """Constants of a processor: ELF ``e_machine``, largest memory page, and code.
-
-    ``add`` returns the first argument plus :data:`STATE_OFFSET`; ``nothing`` returns.
-    """
+    """ELF ``e_machine``, largest memory page, and code of a processor."""
 
     number: int
     page: int
@@ -42,7 +39,6 @@ class _Machine:
     nothing: bytes
 
     def jump(self, distance: int) -> bytes:
-        """Return code that jumps to the address in the slot at this distance."""
         if self.number == 62:  # jmp *slot(%rip)
             return b"\xff\x25" + struct.pack("<i", distance - 6)
         # ldr x16, slot; br x16
@@ -109,7 +105,6 @@ def shared_object(machine: str) -> bytes:
 
 
 def _header(kind: _Machine, dynamic: int, tags: int) -> bytes:
-    """Return the ELF header and the program headers."""
     ident = b"\x7fELF\2\1\1".ljust(16, b"\0")
     sizes = (64, 56, 4, 0, 0, 0)
     head = struct.pack(
@@ -147,10 +142,8 @@ class Trampoline:
 def load(folder: Path) -> Trampoline:
     """Open the shared object from a private folder or, where that fails, from memory.
 
-    A folder that is not writable, or mounted ``noexec``, is skipped.
-
-    Raises:
-        OSError: it cannot be executed from memory either.
+    A folder that is not writable, or mounted ``noexec``, is skipped. If memory cannot
+    be executed either, it raises an OSError.
     """
     content = shared_object(platform.machine())
     if place := private(folder):

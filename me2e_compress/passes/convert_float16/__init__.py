@@ -66,13 +66,7 @@ class ConvertFloat16(Pass):
         return not self.keep_io
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Choose the nodes, then change their type.
-
-        Raises:
-            ModuleMapError: the map has no such module.
-            PreconditionError: the graph is int8, of an opset without float16 scales.
-            FramesError: the frames do not fit the graph.
-        """
+        """Choose the nodes, then change their type."""
         for name in self.keep_modules:
             context.modules.module(name)
         if describe_quantized(model) and opset_of(model) < SCALES_SINCE:

@@ -33,9 +33,10 @@ class ElementTypes:
         self._opset = opset_of(model)
 
     def inputs(self, node: ir.Node) -> tuple[int, ...]:
-        """Return the inputs of the source type that can have the wanted one.
+        """Return the inputs to change.
 
-        The input of a Cast changes only to the wider type: else it would round first.
+        That of a Cast changes only to a wider type: else it would round before it
+        casts.
         """
         if node.op_type == "Cast":
             read = None if node.inputs[0] is None else node.inputs[0].dtype
@@ -49,10 +50,7 @@ class ElementTypes:
         )
 
     def outputs(self, node: ir.Node) -> tuple[int, ...]:
-        """Return the outputs that change type when those inputs do.
-
-        A Cast to the source type then casts to the wanted one.
-        """
+        """Return the outputs that change type when those inputs do."""
         if node.op_type == "Cast" and node.outputs[0].dtype == self.source:
             return (0,)
         schema = self._schema(node)
@@ -155,10 +153,7 @@ class Retyping:
         results: set[ir.Value],
         wanted: set[tuple[ir.Node, int]],
     ) -> None:
-        """Skip Casts whose retyping would only require another Cast next to them.
-
-        Nobody wants their result in the other type, or their input keeps its type.
-        """
+        """Skip Casts whose retyping would only require another Cast next to them."""
         casts = [node for node in nodes if node.op_type == "Cast"]
         for node in casts:
             uses = ((use.node, use.idx) for use in node.outputs[0].uses())
@@ -192,7 +187,6 @@ class Retyping:
                 node.replace_input_with(index, self._as(value, kind, node))
 
     def _as(self, value: ir.Value, kind: ir.DataType, reader: ir.Node) -> ir.Value:
-        """Return a value in another type; equal requests share one Cast."""
         if (value, kind) not in self._casts:
             if self._is_constant(value):
                 array = _converted(value, kind)

@@ -69,8 +69,7 @@ def wide_nodes(
 ) -> dict[ir.Node, str]:
     """Map the nodes of the main graph that must stay in float32 to the reason.
 
-    Shapes and types must be inferred. Without ``frames`` no ranges are measured;
-    ``keep_io`` keeps inputs and outputs of the graph in float32.
+    Shapes and types must be inferred; without ``frames`` no ranges are measured.
     """
     # Operators, constants and positions decide without running the graph
     places = position_arithmetic(model, constant_values(model))
@@ -137,8 +136,7 @@ def _by_constants(node: ir.Node, types: ElementTypes) -> str | None:
 def _fits(numbers: Numbers) -> bool:
     """Return whether constants are the same in float16.
 
-    Of up to 16 numbers (epsilons, factors, bounds) each must be; of a weight only the
-    large elements, next to which an element that becomes 0 does not matter.
+    Of more than 16 numbers only the large ones count: the rest may become 0.
     """
     size = np.abs(numbers)
     if numbers.size == 0 or not np.isfinite(size).all():

@@ -49,8 +49,7 @@ EDGE_BYTES = 64
 def share_nodes(graph: ir.Graph, by: str, *, across_modules: bool) -> int:
     """Merge equal nodes into the first of them and count the removed ones.
 
-    Nodes are equal if operator, attributes and inputs are. Nodes of different modules
-    stay apart unless ``across_modules``, so that a module can still be removed later.
+    Nodes of different modules stay apart unless ``across_modules``.
     """
     # Find equal nodes and bypass all but the first
     first: dict[object, ir.Node] = {}
@@ -186,7 +185,6 @@ class EliminateRedundant(Pass):
     def _visit(
         self, node: ir.Node, site: MergeSite, tally: Counter[str]
     ) -> list[ir.Node]:
-        """Try the rules on one node and return the nodes to look at again."""
         # Unread nodes go first
         if not any(is_read(value) for value in node.outputs):
             makers = list(node.predecessors())
@@ -233,7 +231,7 @@ def _inline_branch(
 ) -> list[ir.Node] | None:
     """Replace an If whose condition is known by the nodes of its branch.
 
-    The If stays (None) where its branch passes an outer value on as a graph output, or
+    It stays (None) where its branch passes an outer value on as a graph output, or
     where a reader would refuse the branch's shape, which the If had hidden from it.
     """
     graph = node.graph

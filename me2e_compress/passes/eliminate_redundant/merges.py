@@ -73,11 +73,7 @@ class MergeSite:
         return self.opsets.get("", self.opsets.get("ai.onnx", 0))
 
     def shape(self, sizes: tuple[int, ...], reader: ir.Node) -> ir.Value:
-        """Return the initializer that holds a shape, one per distinct shape.
-
-        It is named after its first reader, since value names are unique in the whole
-        model, subgraphs included.
-        """
+        """Return the initializer of a shape, named uniquely after its first reader."""
         value = self.shapes.get(sizes)
         if value is None or value.graph is not self.graph:
             name, array = f"{reader.outputs[0].name}_shape", np.array(sizes, np.int64)

@@ -126,7 +126,6 @@ class FoldConstants(Pass):
 
 
 def _learn(asked: list[ir.Value], found: dict[ir.Value, Array]) -> bool:
-    """Record shapes known only from evaluation; return whether there were any."""
     learnt = False
     for value in asked:
         if graphs.static_shape(value) is None and not value.is_graph_output():
@@ -155,10 +154,9 @@ def _notes(tally: _Tally) -> tuple[str, ...]:
 def _commit(
     graph: ir.Graph, choice: FoldChoice, arrays: dict[ir.Value, Array], name: str
 ) -> list[ir.Value]:
-    """Replace the chosen values by initializers and return these.
+    """Replace the chosen values by initializers of the same names, and return these.
 
-    An initializer takes the name of the value it replaces. Not every runtime allows an
-    initializer as a graph output: an Identity passes it on.
+    Not every runtime allows an initializer as a graph output: an Identity passes it on.
     """
     # Names of the removed nodes are free again
     leave = {
@@ -189,7 +187,6 @@ def _commit(
 
 
 class _Store:
-
     def __init__(self, graph: ir.Graph, names: set[str]) -> None:
         self.graph = graph
         self.names = names

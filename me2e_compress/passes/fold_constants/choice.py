@@ -25,13 +25,9 @@ ENTRY_BYTES = 64
 
 @dataclasses.dataclass
 class FoldChoice:
-    """Which values to fold.
+    """Which values become initializers, and which expressions are no longer needed.
 
-    Attributes:
-        values: the values that become initializers, in graph order.
-        gone: the expressions whose nodes are no longer needed.
-        kept: number of nodes that go on computing constants because that is cheaper.
-        growth_bytes: growth of the weights; negative if they shrink.
+    ``kept`` counts the nodes that go on computing constants because that is cheaper.
     """
 
     values: list[ir.Value]
@@ -114,7 +110,6 @@ class _Market:
         return math.prod(shape) * value.dtype.itemsize + ENTRY_BYTES
 
     def cheapest(self, lot: list[Expression]) -> list[Expression]:
-        """Return the part of a group whose folding costs least, by a minimum cut."""
         network = FlowNetwork()
         source, sink = network.vertex(), network.vertex()
         # Edges for nodes that stay and for values that are stored
@@ -174,7 +169,6 @@ class _Market:
         return self.known.maker.get(node.outputs[0]) if node.outputs else None
 
     def _dies(self, value: ir.Value) -> bool:
-        """Return whether only constant nodes read a weight."""
         return (
             value.is_initializer()
             and not value.is_graph_output()

@@ -22,8 +22,7 @@ def evaluate(
 ) -> tuple[dict[ir.Value, Array], list[ir.Node]]:
     """Return the computed values, and the nodes that the runtime refused.
 
-    One session runs everything that the values need; if that fails, one session per
-    node, so that one unsupported operator does not spoil the rest.
+    Nodes run in one session, or each in its own if that fails.
     """
     needed = _needed(values, known)
     if not needed:

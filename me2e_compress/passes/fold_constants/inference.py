@@ -17,10 +17,9 @@ def infer_node(
     *,
     trust_shapes: bool = True,
 ) -> bool:
-    """Infer the shapes of a node's outputs; return whether more is known than before.
+    """Infer missing shapes of a node's outputs; return whether any is new.
 
-    Only outputs without a static shape are written. Pass ``trust_shapes=False`` inside
-    bodies: the outputs of a loop may change shape from round to round.
+    Use ``trust_shapes=False`` in loops, whose outputs may change shape between rounds.
     """
     try:
         found = _ask(node, known, {}, opsets)
@@ -32,9 +31,8 @@ def infer_node(
 def branch_fits(node: ir.Node, branch: ir.Graph, opsets: Mapping[str, int]) -> bool:
     """Return whether an If's readers would be valid if they read a branch directly.
 
-    They may not: an If hides the shapes of its branches from its readers, and a reader
-    that works only by luck (a Range up to a vector of one element) is refused without
-    it.
+    An If hides the shapes of its branches: a reader may work only because of that (a
+    Range up to a vector of one element).
     """
     instead = dict(zip(node.outputs, branch.outputs, strict=True))
     readers = dict.fromkeys(use.node for value in instead for use in value.uses())

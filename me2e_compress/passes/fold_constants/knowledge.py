@@ -43,10 +43,7 @@ COMPUTE = frozenset(
 
 @dataclasses.dataclass(eq=False)
 class Expression:
-    """Equal nodes that read only constants; the first represents all.
-
-    ``inputs`` are those of the first, each value replaced by its first equal.
-    """
+    """Equal nodes of constants; each input is replaced by its first equal."""
 
     nodes: list[ir.Node]
     inputs: tuple[ir.Value | None, ...]
@@ -56,11 +53,7 @@ class Expression:
 class Knowledge:
     """What is known about the values of one graph.
 
-    Attributes:
-        arrays: values known as arrays, initializers included.
-        expressions: the constant nodes, in graph order, equal ones together.
-        maker: the expression that makes a value.
-        first: for a value computed twice, the first value that equals it.
+    ``first`` maps a value that is computed twice to the first value that equals it.
     """
 
     arrays: dict[ir.Value, Array]
@@ -74,7 +67,11 @@ class Knowledge:
 
 
 class Sweep:
-    """Walks one graph in order and collects its constant expressions."""
+    """Walks one graph in order and collects its constant expressions.
+
+    ``refused`` nodes failed in onnxruntime; ``fresh`` initializers are new to ONNX's
+    shape inference; ``trust_shapes`` is False inside loops, where shapes may change.
+    """
 
     def __init__(
         self,
@@ -85,15 +82,6 @@ class Sweep:
         through_compute: bool,
         trust_shapes: bool,
     ) -> None:
-        """Set up a sweep.
-
-        Args:
-            opsets: of the model.
-            refused: nodes that onnxruntime could not evaluate.
-            fresh: initializers that ONNX's shape inference has not seen yet.
-            through_compute: whether convolutions, products, ... may be constant.
-            trust_shapes: False inside loops, where a shape may change every round.
-        """
         self.opsets = opsets
         self.opset = opsets.get("", opsets.get("ai.onnx", 0))
         self.refused = refused
@@ -230,7 +218,6 @@ def _shape(node: ir.Node, shape: tuple[int, ...]) -> Array:
 
 
 def _is_answer(node: ir.Node) -> bool:
-    """Return whether a node only passes an initializer on to a graph output."""
     if node.op_type != "Identity" or not node.outputs[0].is_graph_output():
         return False
     return node.inputs[0] is not None and node.inputs[0].is_initializer()

@@ -25,7 +25,7 @@ class FlowNetwork:
             self.left.append(amount)
 
     def cut(self, source: int, sink: int) -> set[int]:
-        """Return the source's side of the cheapest cut; of equal ones the largest side.
+        """Return the source's side of the cheapest cut; of equal ones the largest.
 
         No path of infinite capacity may lead from source to sink.
         """

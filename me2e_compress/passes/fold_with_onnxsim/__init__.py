@@ -57,11 +57,7 @@ class FoldWithOnnxsim(Pass):
             )
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Fold a copy of the model.
-
-        Raises:
-            PassError: onnxsim crashed, refused the model, or took too long.
-        """
+        """Fold a copy; a crash, refusal or timeout of onnxsim is a PassError."""
         # Exchange the model through files
         with tempfile.TemporaryDirectory(prefix="me2e-onnxsim-") as folder:
             given, folded = Path(folder, "given.onnx"), Path(folder, "folded.onnx")
@@ -100,7 +96,6 @@ def _end_of(error: subprocess.CalledProcessError) -> str:
 
 
 def _own_weights(result: ir.Model, model: ir.Model) -> None:
-    """Share unchanged weights with the model, and load the others from the files."""
     ours = model.graph.initializers
     for graph in (result.graph, *result.graph.subgraphs()):
         for name, value in graph.initializers.items():

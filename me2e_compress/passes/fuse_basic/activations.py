@@ -122,8 +122,8 @@ def _sigmoid() -> Fusion:
 def _stays_a_part(match: Match, facts: Facts) -> str | None:
     """Refuse a sigmoid whose Log follows before any layer: an inverse sigmoid.
 
-    onnxruntime's Sigmoid has an absolute error of 8e-8. Near 1e-5, where detectors clip
-    inverse sigmoids, that moves the logit by 8e-3.
+    onnxruntime's Sigmoid is exact to 8e-8; near 1e-5, where detectors clip inverse
+    sigmoids, that moves the logit by 8e-3.
     """
     ahead, seen = deque(match.root.outputs), set(match.root.outputs)
     while ahead:
@@ -167,7 +167,6 @@ def _swish(*, allowed: bool) -> Fusion:
 
 
 def _is_sixth(node: ir.Node) -> bool:
-    """Return whether a HardSigmoid is that of HardSwish: x / 6 + 0.5."""
     alpha = node.attributes.get_float("alpha", 0.2)
     beta = node.attributes.get_float("beta", 0.5)
     return is_close(alpha, 1 / 6) and is_close(beta, 0.5)

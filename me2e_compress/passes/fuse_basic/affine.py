@@ -101,7 +101,6 @@ def _arithmetic(match: Match) -> _Affine | None:
 
 
 def _is_per_channel(match: Match) -> bool:
-    """Return whether a constant varies along axis 1 at most."""
     source, given = match[LAYER], match.array(NUMBERS).shape
     shape = static_shape(source)
     rank = len(source.shape) if source.shape is not None else 0
@@ -144,7 +143,6 @@ def _rewrite(found: Match, kit: Kit) -> str | None:
 def _give(
     layer: ir.Node, shared: ir.Value, weight: Array, scale: Numbers, kit: Kit
 ) -> bool:
-    """Give a layer its scaled weight; False if the copy would cost too much."""
     if (scale == 1).all():
         return True
     # Reuse the copy of a layer with the same scale
@@ -178,10 +176,7 @@ def _copy_name(layer: ir.Node, shared: ir.Value, scale: Numbers) -> str:
 
 
 def _is_worth_copies(shared: ir.Value) -> bool:
-    """Return whether the removed nodes are worth the copies of a shared weight.
-
-    Copies made for other layers before cost nothing.
-    """
+    """Return whether the removed nodes are worth the copies of a shared weight."""
     copies, stays, worth = set[str](), shared.is_graph_output(), 0.0
     for use in shared.uses():
         found = _behind(use.node) if use.idx == 1 else None

@@ -40,11 +40,8 @@ SAMPLING = {
 class Level:
     """One feature map and where it is sampled.
 
-    Attributes:
-        node: the GridSample.
-        image: [batch * heads, channels, height, width].
-        grid: [batch * heads, rows, columns, 2], where -1 and 1 are the edges.
-        size: height and width.
+    ``image`` is [batch * heads, channels, height, width], ``grid`` [batch * heads,
+    rows, columns, 2], where -1 and 1 are the edges; ``size`` is height and width.
     """
 
     node: ir.Node
@@ -64,15 +61,12 @@ class Decomposed:
 
     Attributes:
         levels: its feature maps, in the order in which they are joined.
-        weights: the attention weights.
-        results: the sum, and the results of layout operators after it; each of them may
-            be replaced.
+        results: the sum, and results of layout operators after it; each may be
+            replaced.
         queries: the digits of rows and columns that remain after the sum.
         points: the digits of rows and columns that are summed over, without the level.
         batch: images times heads.
-        channels: of one head.
-        mask: factor of the results of each image before they are added; None: no
-            factor.
+        mask: factor of the results of each image before they are added, or None.
         images: the digits of the batch that are then added up: cameras or frames.
         scale: factor of that sum, 1 / count for a mean.
     """
@@ -90,11 +84,7 @@ class Decomposed:
 
 
 def find(node: ir.Node) -> Decomposed:
-    """Find the deformable attention that a GridSample is part of.
-
-    Raises:
-        PreconditionError: there is none; the message says what differs.
-    """
+    """Find the deformable attention of a GridSample, or raise a PreconditionError."""
     # Follow samples, weights and sum
     levels, samples = _levels(node)
     product, weights = _weighted(samples)
@@ -120,9 +110,8 @@ def find(node: ir.Node) -> Decomposed:
 def with_images(found: Decomposed) -> Decomposed:
     """Include a sum or mean over images that follows, masked or not, if there is one.
 
-    A sum over images of sums over points is a sum over both: each image is one more
-    level. BEVFormer (Li et al., 2022) adds up the cameras that see a pillar and takes
-    the mean over this frame and the last.
+    Each image becomes one more level. BEVFormer (Li et al., 2022) adds up the cameras
+    that see a pillar and takes the mean over this frame and the last.
     """
     # An optional mask, then the sum or mean
     end, mask = found.results[-1], None
@@ -192,7 +181,6 @@ def _level(node: ir.Node) -> tuple[Level, View]:
 
 
 def _levels(node: ir.Node) -> tuple[tuple[Level, ...], View]:
-    """Return all levels that are sampled and joined alike, and their result."""
     level, sampled = _level(node)
     end = list(results(sampled))[-1]
     concat = sole_reader(end.value)
@@ -219,7 +207,6 @@ def _levels(node: ir.Node) -> tuple[tuple[Level, ...], View]:
 
 
 def _sampler(value: ir.Value | None) -> ir.Node | None:
-    """Return the GridSample that a value comes from through layout operators."""
     node = producer_of(value)
     while node is not None and is_standard(node) and node.op_type in LAYOUT_OPERATORS:
         node = producer_of(node.inputs[0])

@@ -108,10 +108,9 @@ def split_like(digits: Digits, others: Iterable[Digit]) -> Digits:
 
 
 def runs(source: Digits, wanted: Digits) -> tuple[list[Digits], list[int]]:
-    """Split digits into runs that stay together when reordered.
+    """Split digits into runs that stay together in the wanted order.
 
-    ``wanted`` holds some or all of the digits, none split, in the new order. Returns
-    the runs in the order of the source, and the wanted order as positions in these.
+    Returns the runs in the order of the source, and the wanted order as positions.
     """
     places = [source.index(digit) for digit in wanted]
     starts = [

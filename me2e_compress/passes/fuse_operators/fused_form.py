@@ -43,11 +43,7 @@ OP_TYPE = "MultiScaleDeformableAttention"
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """How a deformable attention becomes one node.
-
-    ``mask`` is a factor of the weights; ``cost`` counts the bytes written to lay
-    operands out.
-    """
+    """How a deformable attention becomes one node; ``cost`` is in bytes of layouts."""
 
     found: Decomposed
     heads: int
@@ -69,8 +65,7 @@ class Plan:
 def plan(found: Decomposed) -> Plan:
     """Choose where to read and what to replace, so that the least data is moved.
 
-    Raises:
-        PreconditionError: images are added up but levels are not contiguous in memory.
+    Images can be added up only if levels are contiguous, else PreconditionError.
     """
     # List where each operand can be read
     value = options_of([level.image for level in found.levels], join_pixels)
@@ -111,10 +106,7 @@ def plan(found: Decomposed) -> Plan:
 
 
 def write(chosen: Plan, call: FusedCall) -> ir.Value:
-    """Write the fused node and the layout of its operands; return its result.
-
-    The nodes go in front of the node whose result is replaced.
-    """
+    """Write the fused node and its layouts before the old node; return its result."""
     found = chosen.found
     form = _Form(found, chosen.heads)
     images = math.prod(digit.size for digit in found.images)

@@ -18,10 +18,7 @@ from me2e_compress.passes.fuse_operators.views import View
 
 
 def laid_out(call: FusedCall, view: View, form: Layout) -> ir.Value:
-    """Write the operators that bring a view to a layout; none where it has it.
-
-    Where the view lacks digits it is repeated.
-    """
+    """Write the operators from a view to a layout, repeating over missing digits."""
     value, (scale, shift) = view.value, scaling(view)
     if scale != 1.0:
         value = call.add("Mul", [value, call.numbers(scale, value)])
@@ -48,10 +45,7 @@ def laid_out(call: FusedCall, view: View, form: Layout) -> ir.Value:
 def combined(
     call: FusedCall, op_type: str, views: Sequence[View], form: Layout
 ) -> ir.Value:
-    """Write a sum or product of views in a layout, each repeated by broadcasting alone.
-
-    ``op_type`` is Add or Mul; each view has some of the layout's digits.
-    """
+    """Write an Add or Mul of views in a layout, each repeated by broadcasting."""
     if len(views) == 1:
         return laid_out(call, views[0], form)
     # Group the digits so that a view has or lacks each group as a whole

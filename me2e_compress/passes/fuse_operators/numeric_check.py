@@ -108,12 +108,12 @@ class Proofs:
     def error(self, before: ir.Value, after: ir.Value, views: Sequence[View]) -> float:
         """Return max|a-b|/max|a| of two values that are computed from the same views.
 
-        Views are fed with normal numbers; a third of the positions lie outside the
-        feature maps.
+        Views hold normal numbers; a third of the positions lie outside the feature
+        maps.
 
         Raises:
-            PreconditionError: one of them reads another value too, or the first returns
-                only zeros.
+            PreconditionError: one of them reads another value too, or returns only
+                zeros.
             GraphError: onnxruntime cannot run it.
         """
         inputs = list(dict.fromkeys(view.value for view in views))

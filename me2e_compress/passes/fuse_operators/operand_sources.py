@@ -25,12 +25,7 @@ from me2e_compress.passes.fuse_operators.views import (
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """Where an operand comes from.
-
-    Attributes:
-        views: one for the whole operand, or one per level, or two that are added.
-        total: whether they are added.
-    """
+    """The views of an operand: one, or one per level, or the two terms of a sum."""
 
     views: tuple[View, ...]
     total: bool = False
@@ -88,10 +83,9 @@ def whole_views(view: View) -> list[View]:
 
 
 def sums_of(option: Source) -> list[Source]:
-    """Return where the two terms can be read that an operand is the sum of.
+    """Return where the two terms of an operand can be read, if it is an unscaled sum.
 
-    Positions are often the sum of few reference points and offsets: moving data before
-    the sum is cheaper. Only where the sum itself needs no scale.
+    Positions are often the sum of few reference points and offsets, cheaper to move.
     """
     if len(option.views) != 1 or scaling(option.views[0]) != (1.0, 0.0):
         return []
@@ -114,9 +108,8 @@ def cheapest(
     form: Callable[[int | None], Layout],
     covered: tuple[Digit, ...] = (),
 ) -> tuple[float, Source]:
-    """Return the lowest cost of laying out a source, and that source.
+    """Return the lowest cost of laying out a source, and the last such source.
 
-    Of equal sources the last is taken. ``form`` gives the layout by level (None: all);
     ``covered`` are digits that another operator repeats the operand over anyway.
     """
 
@@ -145,9 +138,8 @@ def cost_of(
 ) -> float:
     """Return the bytes written to bring a view to a layout.
 
-    The view need not be repeated over the ``covered`` digits. ``part`` says that it is
-    one of several that are added or multiplied: that repeats it, and it is scaled
-    wherever it is read.
+    The view need not be repeated over ``covered`` digits, nor at all as a ``part`` of a
+    sum or product, which repeats it and is scaled elsewhere.
     """
     have, wanted = flat(view.layout), flat(form)
     have, wanted = split_like(have, wanted), split_like(wanted, have)

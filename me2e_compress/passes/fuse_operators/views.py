@@ -19,13 +19,9 @@ LAYOUT_OPERATORS = REGROUPING | {"Transpose"}
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """A value that holds the elements of another, moved and perhaps scaled.
+    """A value with the moved elements of another: other = scale * this + shift.
 
-    Attributes:
-        value: the value.
-        layout: the digits of the other's indices that its dimensions are made of.
-        scale: the other's elements are ``scale`` times this one's ...
-        shift: ... plus ``shift``.
+    ``layout`` are the digits of the other's indices that its dimensions are made of.
     """
 
     value: ir.Value
@@ -36,13 +32,9 @@ class View:
 
 @dataclasses.dataclass(frozen=True)
 class Selection:
-    """A view of a contiguous part of one dimension.
+    """A view of ``size`` indices from ``start`` on of one dimension.
 
-    Attributes:
-        view: the value before the selection; its layout is that of the part.
-        axis: the dimension.
-        start: the first index.
-        size: number of indices.
+    The layout of ``view``, the value before the selection, is that of the part.
     """
 
     view: View
@@ -60,8 +52,7 @@ class Selection:
 def sources(view: View) -> Iterator[View | Selection]:
     """Walk from a value, itself first, back to where its elements come from.
 
-    The walk ends before the first operator that does more than move elements; a
-    selection, if it meets one, is the last.
+    A selection, if it meets one, is the last.
     """
     while True:
         yield view
@@ -74,11 +65,7 @@ def sources(view: View) -> Iterator[View | Selection]:
 
 
 def results(view: View) -> Iterator[View]:
-    """Walk from a value, itself first, forward through layout operators.
-
-    The walk ends where several nodes read a value, or where one does more than move
-    elements.
-    """
+    """Walk from a value, itself first, through sole readers that only move it."""
     while True:
         yield view
         reader = sole_reader(view.value)
@@ -89,10 +76,7 @@ def results(view: View) -> Iterator[View]:
 
 
 def joined(selections: Sequence[Selection], digits: Digits) -> View | None:
-    """Return the view that consecutive parts make up together; None if they do not.
-
-    ``digits`` are those of the whole dimension.
-    """
+    """Return the view that consecutive parts make up together; None if they do not."""
     first = selections[0]
     start = 0
     # The parts must be adjacent and equal in all other respects
@@ -195,7 +179,6 @@ def _order(node: ir.Node, rank: int) -> list[int]:
 
 
 def _unscaled(node: ir.Node, view: View) -> View | None:
-    """Undo a sum or product with one constant for all elements."""
     left, right = node.inputs[0], node.inputs[1]
     constant, source = _number(right), left
     if constant is None and node.op_type in ("Add", "Mul"):
@@ -222,7 +205,6 @@ def _number(value: ir.Value | None) -> float | None:
 
 
 def _selected(node: ir.Node, view: View) -> Selection | None:
-    """Return the part of one dimension that a node selects; None if it does not."""
     source = node.inputs[0]
     shape = static_shape(source)
     if source is None or shape is None:

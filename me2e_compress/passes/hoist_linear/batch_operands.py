@@ -25,11 +25,7 @@ from me2e_compress.rewrite import Array, maker, sole_reader
 
 @dataclasses.dataclass(frozen=True)
 class BatchOperand:
-    """The right operand of a batched product, split into terms.
-
-    ``shared`` terms are the same for every batch, ``narrow`` ones are layers of few
-    columns; nothing else reads the ``nodes`` that make it.
-    """
+    """The right operand of a batched product: shared terms and narrow layers."""
 
     layout: HeadLayout
     shared: tuple[ir.Value, ...]
@@ -38,10 +34,7 @@ class BatchOperand:
 
 
 def split_operand(product: ir.Node, rewriter: Rewriter) -> int | None:
-    """Multiply by the terms of a batched product's operand separately.
-
-    Returns the saved MACs; None if it does not pay, or if there is no such product.
-    """
+    """Multiply by the terms of an operand apart; return saved MACs, None if none."""
     found = _operand(product)
     if found is None or product.inputs[0] is None:
         return None
@@ -93,7 +86,6 @@ def _operand(product: ir.Node) -> BatchOperand | None:
 
 
 def _terms(value: ir.Value) -> tuple[list[ir.Value], list[ir.Node]] | None:
-    """Return the terms of a sum or repetition, and the nodes in between."""
     if sole_reader(value) is None:
         return None
     node, source = value.producer(), without_repeats(value)
@@ -115,8 +107,6 @@ def _terms(value: ir.Value) -> tuple[list[ir.Value], list[ir.Node]] | None:
 
 
 class _Writer:
-    """Writes the products of the terms and their sum."""
-
     def __init__(
         self, product: ir.Node, found: BatchOperand, rewriter: Rewriter
     ) -> None:

@@ -19,18 +19,11 @@ Atom = tuple[int, int, int]
 
 @dataclasses.dataclass(frozen=True)
 class HeadLayout:
-    """How an operand is cut out of rows.
+    """How an operand is cut out of rows ``value``: [B, J, H D], or [J, B, H D].
 
-    Attributes:
-        value: the rows: [B, J, H D], or [J, B, H D].
-        nodes: the views and scalings in between, the last one first.
-        scale: product of the scalings.
-        batch_axis: 0 or 1, of the rows.
-        batch: B.
-        heads: H.
-        tokens: J.
-        channels: D, of one head.
-        turned: whether the operand is [.., D, J] (keys), not [.., J, D] (values).
+    ``nodes`` are the views and scalings in between, the last one first; ``scale`` is
+    the product of the scalings. A ``turned`` operand is [.., D, J] (keys), not [.., J,
+    D] (values); D are the channels of one head, J the tokens.
     """
 
     value: ir.Value
@@ -85,7 +78,6 @@ def layout_of(operand: ir.Value) -> HeadLayout | None:
 
 
 def _factor(node: ir.Node) -> float | None:
-    """Return the factor of a scaling, 1 for a view; None for other nodes."""
     if node.op_type not in ("Mul", "Div"):
         return 1.0
     left, right = map(scalar_of, node.inputs)

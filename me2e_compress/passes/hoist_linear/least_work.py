@@ -50,14 +50,10 @@ class Price:
 
 @dataclasses.dataclass(frozen=True)
 class Question:
-    """A product whose price is wanted.
+    """A product of a value [..., K] with N ``columns`` whose price is wanted.
 
-    Attributes:
-        value: what is multiplied, [..., K].
-        columns: N, of the product.
-        owned: whether only this product reads the value, so that its nodes go too.
-        fresh: whether the matrix is a new one, which takes bytes in the file.
-        depth: how many earlier nodes may still be examined.
+    ``owned``: only this product reads the value. ``fresh``: the matrix is new and takes
+    bytes in the file. ``depth``: how many earlier nodes may still be examined.
     """
 
     value: ir.Value
@@ -101,10 +97,7 @@ class Prices:
         self.owned.known.clear()
 
     def saving(self, layer: LinearLayer) -> Price | None:
-        """Return the cheapest other way of a layer, with the work and MACs it saves.
-
-        None if no other way has fewer MACs and costs less.
-        """
+        """Return a cheaper way of fewer MACs with the savings; None if there is none."""
         # Compare the direct product with the best other way
         columns = (static_shape(layer.product.outputs[0]) or (0,))[-1]
         source = layer.source
@@ -206,8 +199,7 @@ def terms_of(
 ) -> Iterator[tuple[ir.Value, bool, tuple[int, int] | None]]:
     """Yield the terms of a sum: value, whether only the sum reads it, its matrix rows.
 
-    A term behind an Expand or Tile is yielded without it where adding repeats it
-    anyway.
+    Repetitions are skipped where adding repeats the term anyway.
     """
     values = [value for value in node.inputs if value is not None]
     shapes = [static_shape(value) for value in values]

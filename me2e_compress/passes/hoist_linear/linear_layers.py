@@ -104,7 +104,6 @@ def layer_behind(value: ir.Value) -> LinearLayer | None:
 
 
 def _is_product(node: ir.Node) -> bool:
-    """Return whether a node multiplies rows of known sizes by one constant matrix."""
     if node.op_type not in ("MatMul", "Gemm") or node.domain not in ("", "ai.onnx"):
         return False
     if node.attributes.get_int("transA", 0):
@@ -130,7 +129,6 @@ def _adds_bias(node: ir.Node, product: ir.Node) -> bool:
 
 
 def _is_vector(value: ir.Value | None, result: tuple[int, ...]) -> bool:
-    """Return whether a value adds the same constant to every row of a result."""
     shape = static_shape(value)
     if shape is None or not holds_numbers(value) or len(shape) > len(result):
         return False

@@ -16,10 +16,7 @@ from me2e_compress.rewrite import Numbers, numbers_of
 
 
 class Matrix:
-    """A matrix [K, N] that becomes an initializer when it is first needed.
-
-    ``value`` is the initializer that holds it, if there is one.
-    """
+    """A matrix [K, N] that becomes an initializer when it is first needed."""
 
     def __init__(self, numbers: Numbers, value: ir.Value | None, name: str) -> None:
         self.numbers, self.value, self.name = numbers, value, name

@@ -25,20 +25,14 @@ class Amount:
 
 
 class OwnedWork:
-    """Adds up and caches the work that goes with a value.
-
-    ``rate`` is the number of file bytes that a removed node may cost.
-    """
+    """Adds up and caches the work that goes with a value."""
 
     def __init__(self, rate: float) -> None:
         self.rate = rate
         self.known: dict[int, Amount] = {}
 
     def of(self, value: ir.Value) -> Amount:
-        """Return the work and MACs of the nodes that only this value needs.
-
-        It does not recurse: a sum may have thousands of terms.
-        """
+        """Return the work that only this value needs, without recursion (long sums)."""
         waiting = [value]
         while waiting:
             last = waiting[-1]
@@ -55,7 +49,6 @@ class OwnedWork:
         return self.known[id(value)]
 
     def _last_step(self, value: ir.Value) -> tuple[Amount, list[ir.Value]]:
-        """Return the work of the last step to a value, and the values only it reads."""
         node = value.producer()
         if id(value) in self.known:
             return self.known[id(value)], []

@@ -115,10 +115,7 @@ class Rewriter:
         sources: Sequence[ir.Node],
         like: ir.Value,
     ) -> ir.Value:
-        """Write a node before the maker of ``like`` and with its type.
-
-        ``sources`` are the nodes that it stands for, the leading one first.
-        """
+        """Write a node that replaces ``sources``, before the maker of ``like``."""
         place = like.producer()
         assert place is not None
         name = fresh_name(f"{sources[0].name}_{op_type}", self.names)
@@ -131,7 +128,6 @@ class Rewriter:
 
 
 class _Writer:
-
     def __init__(self, rewriter: Rewriter, layer: LinearLayer) -> None:
         self.rewriter, self.layer = rewriter, layer
         self.made: list[ir.Value] = []
@@ -140,7 +136,6 @@ class _Writer:
         return self._write_way(way, matrix, plus(bias, vector_of(way, matrix)))
 
     def _write_way(self, way: Way, matrix: Matrix, vector: Numbers | None) -> ir.Value:
-        """Write a way, with one vector for all that it adds to every row."""
         # Products and constants end the recursion
         if isinstance(way, Direct):
             return self._multiply(way.value, matrix, vector)

@@ -124,7 +124,6 @@ def _axes(node: ir.Node) -> list[int]:
 
 
 def _repetition(value: ir.Value) -> Repetition | None:
-    """Find the source with the fewest rows that a value is repeated from."""
     best, least = None, math.prod(static_shape(value) or ())
     nodes: list[ir.Node] = []
     while len(nodes) < LONGEST:
@@ -143,11 +142,7 @@ def _repetition(value: ir.Value) -> Repetition | None:
 
 
 def _move(node: ir.Node, index: int, found: Repetition) -> Move | None:
-    """Return a node's inputs and shape in front of a repetition; None if impossible.
-
-    Its other operand must be one row, be repeated along the same axes, or have none of
-    the repeated axes.
-    """
+    """Return a node's inputs and shape in front of a repetition; None if impossible."""
     small = static_shape(found.source)
     if not small:
         return None
@@ -177,7 +172,6 @@ def _move(node: ir.Node, index: int, found: Repetition) -> Move | None:
 
 
 def _pays(node: ir.Node, move: Move) -> bool:
-    """Return whether the smaller work of a node is worth repeating its result."""
     whole = static_shape(node.outputs[0]) or ()
     # Bytes that the node no longer reads and writes
     saved = _traffic(node.inputs) - _traffic(move.inputs)

@@ -18,10 +18,7 @@ REPEATS = frozenset({"Concat", "Expand", "Tile"})
 
 
 def moved_rows(node: ir.Node) -> tuple[ir.Value, ...] | None:
-    """Return the inputs whose rows a node rearranges or repeats; None if it does not.
-
-    Sizes must be known, and the last axis of each input must be that of the output.
-    """
+    """Return the inputs whose rows a node rearranges or repeats; None if none."""
     rule = _RULES.get(node.op_type)
     if rule is None or not is_standard(node) or not node.inputs:
         return None
@@ -64,7 +61,6 @@ def _always(node: ir.Node, rank: int) -> bool:
 
 
 def _axis(default: int) -> Callable[[ir.Node, int], bool]:
-    """Build the check that an operator works along another axis than the last."""
 
     def check(node: ir.Node, rank: int) -> bool:
         axis = node.attributes.get_int("axis", default)

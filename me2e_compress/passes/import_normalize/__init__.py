@@ -52,11 +52,7 @@ class ImportNormalize(Pass):
     exact: ClassVar[bool] = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Rewrite the model in place.
-
-        Raises:
-            ModuleMapError: the module map does not fit the graph.
-        """
+        """Rewrite the model in place."""
         changes = _name_nodes(model, self.name) + _stamp(model, context)
         changes += _isolate_plugins(model, self.name)
         demoted, note = doubles.demote(model, self.name)
@@ -72,10 +68,7 @@ def needs_import(model: ir.Model) -> bool:
 
 
 def with_own_domains(model: ir.Model) -> ir.Model:
-    """Return a graph whose plugins have their original domains.
-
-    It is the graph itself if no plugin was moved, else a copy.
-    """
+    """Return the graph, or a copy whose plugins have their old domains again."""
     if not any(ORIGINAL_DOMAIN in node.metadata_props for node in nodes_of(model)):
         return model
     copy = model.clone()

@@ -16,12 +16,11 @@ _BY_WIDTH = ("BitCast",)
 
 
 def demote(model: ir.Model, by: str) -> tuple[int, str]:
-    """Turn float64 into float32 everywhere: weights, attributes, value types.
+    """Turn float64 into float32 everywhere; return the changes, and why doubles stayed.
 
-    Nothing changes where an input or output of the graph is double, or a value of an
-    unknown operator. Finite numbers beyond float32's range become its largest ones, so
-    that a mask of ``-1.8e308`` stays finite. Returns the number of changes, and a
-    sentence for the report if doubles had to stay.
+    Nothing changes where an input, output or unknown operator has doubles. Finite
+    numbers beyond float32's range are clipped, so that a mask of ``-1.8e308`` stays
+    finite.
     """
     if not any(True for _ in _doubles(model)):
         return 0, ""

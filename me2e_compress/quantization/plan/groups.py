@@ -29,6 +29,7 @@ def find_groups(
     is read as int8 is put on one scale with those of its inputs that are read as int8
     elsewhere: it then moves int8 as it is. Concats of Concats are one group.
     """
+    # int8 readers of every tensor
     readers: dict[ir.Value, list[str]] = {}
     for node, decision in decided.items():
         for index in decision.activations if decision.dtype == INT8 else ():
@@ -40,6 +41,7 @@ def find_groups(
         for value, nodes in readers.items()
         if len(nodes) > 1
     ]
+    # scales that a Concat joins
     if concat:
         found += _concats(graph, readers, pins)
     return tuple(found)

@@ -63,14 +63,17 @@ def make_plan(
     Raises:
         RecipeError: an override matches no node, or wants int8 where it cannot be.
     """
+    # what the rules may know, and what the user has decided
     asked = RULE_SETS.parse(DEFAULT_RULES) if rules is None else rules
     in_order = asked.rules()
     facts = RuleFacts(model, scheme.modules, costs, fused)
     pins = overrides.bind(model)
     main = model.graph
+    # every node by itself
     decided = {
         node: _decide(node, facts, in_order, pins, main) for node in main.all_nodes()
     }
+    # what depends on other decisions
     for rule in in_order:
         decided.update(_second_thoughts(rule, decided, facts, pins))
     decided.update(_residuals(main, decided, facts, pins))
@@ -202,11 +205,13 @@ def _residuals(
     for node in graph:
         if node.op_type != "Add" or not is_standard(node):
             continue
+        # branches that end in an int8 convolution
         fused = [i for i in (0, 1) if _ends_convolution(node.inputs[i], decided)]
         if not fused or any(each in facts.constants for each in node.inputs):
             continue
         if static_shape(node.inputs[0]) != static_shape(node.inputs[1]):
             continue
+        # the longer path is fused, the other is the residual
         main = max(fused, key=lambda at: depth.get(node.inputs[at], 0))
         found[node] = _residual(decided[node], node, 1 - main, pins)
     return found

@@ -135,9 +135,11 @@ class Overrides(_Strict):
             RecipeError: an override matches nothing.
         """
         main = {node: _names(node) for node in model.graph}
+        # the last override that matches a node wins
         pinned: dict[ir.Node, Override] = {}
         for each in self.override:
             pinned.update(dict.fromkeys(_some(main, each.matches, str(each)), each))
+        # Concats whose scales stay apart
         apart: dict[ir.Node, None] = {}
         for rule in self.concat:
 
@@ -177,6 +179,7 @@ class Pins:
 
         The RecipeError names the override and why its first node cannot be int8.
         """
+        # overrides to int8 that some node follows, and those that one refuses
         refused: dict[Override, Decision] = {}
         followed: dict[Override, None] = {}
         for node, override in self._pinned.items():
@@ -186,6 +189,7 @@ class Pins:
                 followed[override] = None
             else:
                 refused.setdefault(override, decided[node])
+        # an override that nobody follows is a fault
         for override, decision in refused.items():
             if override not in followed:
                 raise RecipeError(

@@ -174,6 +174,7 @@ class RuleSet(abc.ABC):
         """
         more = (RULES.parse(e) if isinstance(e, str) else e for e in self.extra)
         rules = (*self.own_rules(), *more)
+        # firm rules cannot be switched off
         loose = [rule.name for rule in rules if not rule.firm]
         for name in self.without:
             if name not in loose:

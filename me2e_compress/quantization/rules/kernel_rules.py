@@ -67,6 +67,7 @@ class NarrowConvolution(Rule):
             inputs, outputs = shape[0] // group, shape[1] * group
         if min(inputs, outputs) >= self.minimum:
             return None
+        # narrow layers that some kernel takes
         kernel = shape[2:]
         if group > 1:
             fits = outputs % self.packing == 0 and min(kernel, default=1) >= 3

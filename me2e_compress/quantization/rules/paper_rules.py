@@ -75,6 +75,7 @@ class WeightOperand(Rule):
         left, right = node.inputs[0], node.inputs[1]
         if int8_inputs(node):
             return _no_features(left, facts)
+        # operands of floats, and not all constant
         types = {each.dtype for each in (left, right) if each is not None}
         if not types <= {ir.DataType.FLOAT, ir.DataType.FLOAT16, None}:
             return "neither float32 nor float16"
@@ -84,6 +85,7 @@ class WeightOperand(Rule):
             return "the queries are constant"
         if left in facts.constants:
             return "the left operand is constant: coordinate arithmetic, not a layer"
+        # a weight, or the product of an attention
         if right in facts.constants:
             return None
         if node.op_type != "MatMul":

@@ -35,11 +35,7 @@ class EnergyRecording:
         return summarise(self.windows(schedule), by, self.idle_w(schedule))
 
     def windows(self, schedule: EnergySchedule) -> list[Window]:
-        """Cut consecutive windows from the work after the warm-up.
-
-        Raises:
-            EnergyError: the recording is too short, or its counter does not move.
-        """
+        """Cut consecutive windows from the work after the warm-up."""
         # Find the stretch in which frames are done, and skip the warm-up.
         working = np.flatnonzero(np.diff(self.frames) > 0)
         if not len(working):

@@ -154,11 +154,7 @@ class EnergyResult(Displayed):
         return asdict(self)
 
     def save(self, path: Path) -> None:
-        """Write the result atomically.
-
-        Raises:
-            EnergyError: the file cannot be written.
-        """
+        """Write the result atomically."""
         try:
             write_json(path, self.to_json(), indent=2)
         except OSError as error:
@@ -166,11 +162,7 @@ class EnergyResult(Displayed):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what :meth:`save` wrote; unknown keys are ignored.
-
-        Raises:
-            EnergyError: no such file, or not of this form.
-        """
+        """Read what :meth:`save` wrote; unknown keys are ignored."""
         with documents.reading(path, EnergyError, "not an energy file"):
             record = documents.from_json(documents.content(path))
             return TypeAdapter(cls).validate_python(record)

@@ -33,9 +33,6 @@ def summarise(
 
     ``idle_w`` is None where the idle device was not measured; ``states`` are those
     before and after each window.
-
-    Raises:
-        EnergyError: there are too few windows.
     """
     found = estimate(windows, by.step_s, idle_w)
     frames = sum(each.frames for each in windows)

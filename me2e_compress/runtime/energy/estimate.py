@@ -72,20 +72,11 @@ def estimate(
     fitted to the windows, because warm-up and drift are no noise; Student's t applies
     to the residuals. Windows begin at a random phase of the counter, so that its step,
     its part-time sensing and its noise show in their spread. If the windows lie closer
-    together than the step alone allows, the error of the step replaces the spread: a
+    together than the step (``step_s``) alone allows, its error replaces the spread: a
     window of whole steps and ``r`` more seconds holds one step more or less by chance,
     a standard deviation of power x sqrt(r (step - r)). Energy in pauses lies between
-    idle and mean power: the middle is subtracted, and half the distance is added to the
-    interval in quadrature.
-
-    Args:
-        windows: at least :data:`FEWEST_WINDOWS`, at random phases of the counter, each
-            after frames of the same model.
-        step_s: seconds between updates of the counter.
-        idle_w: watts of the idle device; None if unknown (0 or more).
-
-    Raises:
-        EnergyError: there are too few windows.
+    idle (0 if unknown) and mean power: the middle is subtracted, and half the distance
+    is added to the interval in quadrature.
     """
     if len(windows) < FEWEST_WINDOWS:
         raise EnergyError(

@@ -76,11 +76,7 @@ class EnergyMeter:
         self._power = PowerSamples(reader, clock)
 
     def measure(self, work: Mapping[str, Work]) -> dict[str, EnergyResult]:
-        """Measure models in turn; ``work`` maps each name to what runs one frame.
-
-        Raises:
-            EnergyError: the counter goes back, does not move, or cannot be read.
-        """
+        """Measure models in turn; ``work`` maps each name to what runs one frame."""
         spans: dict[str, list[_Span]] = {name: [] for name in work}
         turns = self._schedule.turns(list(work))
         with (

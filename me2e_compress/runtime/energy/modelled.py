@@ -22,13 +22,10 @@ Number = Literal["int8", "float16", "float32"]
 
 @dataclass(frozen=True)
 class EnergyCosts:
-    """Published energies of one silicon process.
+    """Published energies of one silicon process, in picojoules.
 
-    Attributes:
-        mac_pj: picojoules of a multiply-accumulate by type of the factors; sums are
-            int32 or float32.
-        byte_pj: picojoules of a byte from or to external memory.
-        source: where the figures are published.
+    ``mac_pj`` is that of a multiply-accumulate by type of the factors, with sums in
+    int32 or float32; ``byte_pj`` that of a byte from or to external memory.
     """
 
     mac_pj: Mapping[Number, float]
@@ -138,15 +135,7 @@ def modelled_energy(
 
     A product counts as int8 where both factors are: in integer operators, and between
     QuantizeLinear and DequantizeLinear. Int8 weights of a float product count as int8
-    for memory only.
-
-    Args:
-        model: the graph, with shapes inferred; it is not changed.
-        process: one of :data:`PROCESSES`.
-        module_of: returns the module of a node.
-
-    Raises:
-        EnergyError: no such process.
+    for memory only. Shapes of the graph must be inferred.
     """
     costs = costs_of(process)
     found, unknown = _multiplying(model, module_of)
@@ -173,11 +162,7 @@ def modelled_energy(
 
 
 def costs_of(process: str) -> EnergyCosts:
-    """Return the figures of a process.
-
-    Raises:
-        EnergyError: no such process.
-    """
+    """Return the figures of a process; EnergyError if there is none of that name."""
     if process not in PROCESSES:
         there = ", ".join(PROCESSES)
         raise EnergyError(f"no process {process!r}; there are {there}")

@@ -37,17 +37,10 @@ def measure_energy(
 
     Recurrent state is fed forward and reset where scenes begin. The first frames, as
     many as fit into 500 MB, are repeated as often as needed. Nothing else may run on
-    the device.
-
-    Args:
-        models: ONNX files, or TOML files of stacks, by name.
-        frames: the inputs of the models.
-        counter: ``auto``, or a name and options; see ``open_counter``.
-        schedule: durations and counts; None takes the defaults.
-        threads: onnxruntime's number of threads.
-        provider: the execution provider.
-        said: metadata that overrides the models' own.
-        on_window: called with windows done, windows in all, and the model's name.
+    the device. ``models`` has ONNX files, or TOML files of stacks, by name; ``counter``
+    is described at ``open_counter``; ``said`` is metadata that overrides the models'
+    own; ``on_window`` is called with windows done, windows in all, and the model's
+    name.
 
     Returns:
         Joules per frame by model; without a counter, the reason why not, at once.

@@ -70,13 +70,7 @@ class Nvml(EnergyCounter):
 
 
 class NvmlReader(Reader):
-    """An open GPU.
-
-    Args:
-        handle: NVML's device handle.
-        counts: whether it counts energy.
-        power: the power in mW, or the error where it cannot be read.
-    """
+    """An open GPU; ``power`` is in mW, or the error where it cannot be read."""
 
     scope = "the whole board"
 

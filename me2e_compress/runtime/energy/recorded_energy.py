@@ -35,11 +35,7 @@ class Recorded(EnergyCounter):
     file: Path
 
     def open(self) -> EnergyRecording:
-        """Read the file and check it.
-
-        Raises:
-            EnergyError: the file is missing or its columns or numbers are not valid.
-        """
+        """Read the file and check it."""
         try:
             columns, words = _read(self.file)
             return _recording(columns, words, self.file.name)

@@ -21,9 +21,6 @@ class EnergySchedule:
         lead_in_s: seconds of frames of the same model just before a window: the counter
             lags by a step, and clocks and caches settle.
         seed: of the random phases at which windows begin.
-
-    Raises:
-        EnergyError: too few windows, or a time that is not positive.
     """
 
     warm_up_s: float = 30.0

@@ -31,11 +31,7 @@ def read_value(path: Path, name: str, where: str) -> Array:
 
 
 def fitted(value: Array, port: SessionPort, where: str) -> Array:
-    """Prepend dimensions of 1 to an array, and check it against its input.
-
-    Raises:
-        GraphError: the type or shape differs.
-    """
+    """Prepend dimensions of 1 to an array, and check it against its input."""
     missing = max(0, len(port.shape) - value.ndim)
     value = value.reshape((1,) * missing + value.shape)
     element = {"float32": "float", "float64": "double"}.get(

@@ -30,11 +30,7 @@ class Joined:
 
 
 def join(content: StackFile, files: Sequence[PartGraph], folder: Path) -> Joined:
-    """Join the files of a stack; paths of first values are relative to ``folder``.
-
-    Raises:
-        GraphError: the files do not fit each other.
-    """
+    """Join the files of a stack; paths of first values are relative to ``folder``."""
     # Connect the parts, for first and for other frames.
     joiner = _Joiner(content, files, folder)
     at_next = joiner.joints(first=False)

@@ -10,12 +10,7 @@ from me2e_compress.runtime.stack.part_graph import PartGraph, misfit, told
 
 
 class FeedSource(NamedTuple):
-    """The source of an input.
-
-    Attributes:
-        part: the part that gives it; empty for a frame's input or the state.
-        name: name of the output, or of the input of the stack.
-    """
+    """An output that feeds an input; the part is empty for a frame or the state."""
 
     part: str
     name: str
@@ -27,13 +22,7 @@ Sources = Mapping[str, Mapping[str, FeedSource]]
 
 @dataclasses.dataclass(frozen=True)
 class Joints:
-    """The connections of the files at one kind of frame.
-
-    Attributes:
-        order: the parts that run, in topological order.
-        graphs: the file that runs, by part.
-        sources: the source of each input, by part and input.
-    """
+    """The connections of the files at one kind of frame, parts in topological order."""
 
     order: tuple[str, ...]
     graphs: Mapping[str, PartGraph]
@@ -41,12 +30,7 @@ class Joints:
 
     @classmethod
     def of(cls, graphs: Mapping[str, PartGraph], sources: Sources) -> "Joints":
-        """Check that all connections fit, and sort the parts.
-
-        Raises:
-            GraphError: an output is missing or of another type or shape than the input
-                that it feeds, or the parts form a cycle.
-        """
+        """Check that all connections fit, and sort the parts; refuse cycles."""
         for part, fed in sources.items():
             for name, source in fed.items():
                 if source.part:
@@ -145,11 +129,7 @@ class Names:
         raise GraphError(f"{where}: no part gives {text}; there is {', '.join(there)}")
 
     def inputs(self, text: str, where: str) -> tuple[tuple[str, str], ...]:
-        """Find the (part, input) pairs of a text: ``PART.NAME``, or all of that name.
-
-        Raises:
-            GraphError: there is none.
-        """
+        """Find the (part, input) pairs of a text: ``PART.NAME``, or any of a name."""
         part, _, name = text.partition(".")
         if takers := self.takers(text):
             return tuple((each, text) for each in takers)

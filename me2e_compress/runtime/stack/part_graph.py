@@ -17,13 +17,8 @@ from me2e_compress.runtime.recurrence import SessionPort, declared_pairs
 class PartGraph:
     """The interface of one ONNX file of a stack.
 
-    Attributes:
-        label: ``head``, or ``head.first_frame``.
-        part: the part that the file belongs to.
-        path: the file.
-        inputs: inputs by name; the shape is empty where it is unknown.
-        outputs: outputs by name.
-        metadata: metadata of the file.
+    ``label`` is ``head`` or ``head.first_frame``; a port of unknown shape has an empty
+    one.
     """
 
     label: str

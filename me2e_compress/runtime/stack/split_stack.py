@@ -25,7 +25,6 @@ class SplitStack:
 
     Attributes:
         path: path of the TOML file.
-        content: content of the TOML file.
         files: the ONNX files by label: ``head``, ``head.first_frame``.
         inputs: the inputs by name, including the state.
         outputs: the outputs present at every frame, by name: ``NAME``, or ``PART.NAME``
@@ -33,8 +32,6 @@ class SplitStack:
         answers: part and output behind each of these names.
         recurrent: ``{input: output}`` of the state that is fed forward.
         first_values: first values of recurrent inputs that are not zeros.
-        at_first: connections of the files where a scene begins.
-        at_next: connections at other frames.
         metadata: metadata of all files and of the TOML file, which wins.
     """
 
@@ -128,11 +125,7 @@ def is_stack(path: str | Path) -> bool:
 
 
 def digest_of_files(path: Path) -> str:
-    """Return the SHA-256 of an ONNX file with its weights, or of a whole stack.
-
-    Raises:
-        GraphError: the files of a stack do not fit each other.
-    """
+    """Return the SHA-256 of an ONNX file with its weights, or of a whole stack."""
     return SplitStack.load(path).sha256() if is_stack(path) else graph.sha256_of(path)
 
 

@@ -48,12 +48,7 @@ class StackSession:
         release: bool = False,
         provider: Provider = CPU,
     ) -> Self:
-        """Open every file; the options are those of :class:`Session`.
-
-        Raises:
-            GraphError: onnxruntime cannot run one of them; the message names it.
-            ProviderError: the provider is not available.
-        """
+        """Open every file; the options are those of :class:`Session`."""
         sessions = dict[str, Session]()
         for label, each in stack.files.items():
             try:
@@ -93,9 +88,6 @@ class StackSession:
         """Return the first values of the recurrent inputs that a first frame reads.
 
         ``held`` takes precedence, then the stack's first values, then zeros.
-
-        Raises:
-            GraphError: an input of unknown shape has no first value.
         """
         known = {**self.stack.first_values, **held}
         read = {name for _, _, name in self.stack.at_first.outside()}
@@ -112,12 +104,7 @@ class StackSession:
         *,
         first: bool = False,
     ) -> dict[str, Array]:
-        """Run every file once, in topological order.
-
-        Raises:
-            FramesError: an input is missing or has the wrong type or shape.
-            GraphError: a node failed on these inputs.
-        """
+        """Run every file once, in topological order."""
         wanted = self.outputs if outputs is None else outputs
         runs = {each.label: each.values for each in self.runs(feeds, first=first)}
         graphs = self._joints(first=first).graphs
@@ -134,12 +121,7 @@ class StackSession:
         first: bool = False,
         parts: Collection[str] | None = None,
     ) -> Iterator[PartRun]:
-        """Run the files lazily, one for each item; ``parts`` restricts which ones run.
-
-        Raises:
-            FramesError: an input is missing or has the wrong type or shape.
-            GraphError: a node failed on these inputs.
-        """
+        """Run the files lazily, one for each item; ``parts`` restricts them."""
         joints = self._joints(first=first)
         values = dict[FeedSource, Array]()
         for part in joints.order:
@@ -185,11 +167,6 @@ def open_session(
     """Open an ONNX file, or the stack that a TOML file describes.
 
     The options are those of :class:`Session`.
-
-    Raises:
-        GraphError: no such file, files that do not fit each other, or onnxruntime
-            cannot run one.
-        ProviderError: the provider is not available.
     """
     if is_stack(path):
         return StackSession.open(

@@ -95,6 +95,7 @@ def stratified(routes: Sequence[Route], seed: int) -> tuple[Route, ...]:
     a round abilities are spread evenly. The order of the input does not matter;
     ``seed`` decides which type, and which of its routes, comes first.
     """
+    # shuffle the routes of each type
     draw = random.Random(seed)
     by_type = defaultdict[str, list[Route]](list)
     for route in sorted(routes, key=lambda each: each.id):
@@ -103,11 +104,13 @@ def stratified(routes: Sequence[Route], seed: int) -> tuple[Route, ...]:
     for name, own in sorted(by_type.items()):
         draw.shuffle(own)
         by_ability[own[0].ability].append(name)
+    # spread the types of each ability evenly over a round
     place = dict[str, float]()
     for _, types in sorted(by_ability.items()):
         draw.shuffle(types)
         place |= {name: (at + 0.5) / len(types) for at, name in enumerate(types)}
     types = sorted(by_type, key=lambda name: (place[name], name))
+    # one route of every type per round
     rounds = max(map(len, by_type.values()), default=0)
     return tuple(
         by_type[name][turn]

@@ -102,6 +102,7 @@ def make_drives(
         StudyError: The folder belongs to another search.
         Me2eError: The float model cannot drive, or frames do not fit.
     """
+    # make the models; identical files count once
     _claim(study, folder)
     workspace = Workspace(folder)
     made = prepare_all(study, workspace, listener)
@@ -111,6 +112,7 @@ def make_drives(
         if not each.failure:
             by_file.setdefault(each.sha256, each)
     firsts = list(by_file.values())
+    # time and weigh each distinct file
     clock = time_all(study, firsts, workspace, listener)
     spent = _joules(study, firsts, joules, listener)
     weighed = dict[str, Weighed]()
@@ -120,6 +122,7 @@ def make_drives(
             raise StudyError(f"variant {name}: {each.variant.policy} is not a model")
         size = graph.size(graph.load(each.model)).weight_bytes
         weighed[name] = Weighed(size / 1e6, median.value, spent[name])
+    # every scheme shares the results of its file
     prepared = {
         each.variant.name: by_file[each.sha256] for each in made if not each.failure
     }
@@ -151,6 +154,7 @@ def _joules(
 
 def _claim(study: Study, folder: Path) -> None:
     """Write what decides the drives, or check that an existing folder agrees."""
+    # an empty folder is claimed, any other one must match
     asked, path = _decisive(study), folder / ASKED
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -164,6 +168,7 @@ def _claim(study: Study, folder: Path) -> None:
         raise StudyError(f"{path}: {error.strerror}") from error
     except documents.MalformedError as error:
         raise StudyError(f"{path}: not JSON: {error}") from error
+    # what decides the drives must be the same
     before = before if isinstance(before, dict) else {}
     for key, value in asked.items():
         if before.get(key) != value:

@@ -64,18 +64,21 @@ def search_on_road(
             the model cannot drive.
         EnergyError: An energy counter responds but is not usable.
     """
+    # check the outputs before hours of work
     path, recipe_file = model_path(model), Path(output)
     inputs = (path, frames, options.module_map, options.adapter)
     check_folder(options.drives, inputs)
     with writing([recipe_file], inputs, folders=[options.drives], force=options.force):
         study, grid = planned(path, Path(frames), options)
         tell(ahead(study, grid, options, engine))
+        # make and weigh all schemes, drive those within the budgets
         made = make_drives(
             study, options.drives, joules_here(), engine or LocalEngine(), listener
         )
         fitting = within(made, options)
         rungs = climbed(made, fitting, options, tell)
         winner = rungs[-1].standings[0].name
+        # the recipe of the winner
         text = recipe.to_toml(
             grid[winner].passes(options.rules, options.runs_on, options.dims)
         )
@@ -104,10 +107,12 @@ def planned(
         EvaluationError: Routes or latency are unknown.
         StudyError: A module's name is no file name, or a study cannot use the latency.
     """
+    # the grid of the model's modules
     loaded = graph.load(path)
     modules = GridModules.of(loaded, load_map(options.module_map, loaded))
     points = modules.grid(options.modules, options.ablate, options.most_ablated)
     grid = {each.name: each for each in points}
+    # the float model is the baseline
     routes, set_size = routes_named(options.routes)
     driver = driver_named(str(path), options.adapter)
     adapter = driver.adapter if isinstance(driver, OnnxDriver) else None
@@ -120,6 +125,7 @@ def planned(
         )
         for name, point in grid.items()
     ]
+    # one condition, with routes mixed from the first on
     study = Study(
         title=f"search {path.name}",
         variants=(baseline, *variants),

@@ -25,6 +25,7 @@ def plans_before(accident: Accident) -> Figure:
     All are in the frame of the ego at the last moment, which looks to the right.
     """
     with styled():
+        # the road, in the ego's frame at the collision
         figure = Figure(figsize=(WIDTH_IN, 3.6), layout="constrained")
         axes = figure.subplots()
         here = accident.moments[-1].ego
@@ -35,11 +36,13 @@ def plans_before(accident: Accident) -> Figure:
             solid_capstyle="round",
             zorder=0,
         )
+        # later moments are darker
         shades = colormaps["viridis_r"](np.linspace(0.1, 1.0, len(accident.moments)))
         last_us = accident.moments[-1].time_us
         for moment, shade in zip(accident.moments, shades, strict=True):
             _moment(axes, moment, here, shade, moment.time_us - last_us)
         _frame(axes, accident.moments, here)
+        # legend beside the plot, title above
         axes.legend(
             frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5)
         )

@@ -110,9 +110,11 @@ def facts_of(
     prepared: PreparedVariant, clock: Clock, known: Mapping[str, ModelFacts]
 ) -> ModelFacts:
     """Collect the facts of a variant's file, unless they are already known."""
+    # latencies are scaled to the device
     name = prepared.variant.name
     trace = clock.traces.get(name)
     latency_us = () if trace is None else _scaled(trace.samples_us, clock.scale)
+    # known facts are reused if the file is the same
     before = known.get(name)
     if prepared.model is None:
         return ModelFacts(name, failure=prepared.failure)
@@ -122,6 +124,7 @@ def facts_of(
             if before.latency_us == latency_us
             else replace(before, latency_us=latency_us, modules_us={})
         )
+    # otherwise count the graph anew
     module_map = prepared.variant.module_map
     found = inspect(prepared.model, module_map, None, DEFAULT_PROCESS)
     modelled = found.modelled_energy

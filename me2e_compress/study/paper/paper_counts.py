@@ -23,6 +23,7 @@ COUNTS = ("tensors", "int8 operators", "compute-intensive", "MB")
 
 def table_4(result: "PaperResult") -> Table:
     """Show the int8 parts of each file, with the paper's counts in separate columns."""
+    # other stacks are named "stack scheme"
     stacks = dict.fromkeys(
         each.variant.rsplit(" ", 1)[0] for each in result.facts if each.of_another_stack
     )
@@ -71,6 +72,7 @@ def _given(row: PublishedInt8) -> tuple[Cell, ...]:
 
 def partners(result: "PaperResult") -> Table:
     """Show what was hit, as shares of the collisions."""
+    # shares of each kind of partner, by drive
     rows = []
     for (variant, condition), cell in result.cells.items():
         found = collisions(cell)

@@ -44,6 +44,7 @@ def efficiency_and_comfort(result: "PaperResult") -> Figure | None:
 
 def where_the_time_goes(result: "PaperResult") -> Figure | None:
     """Draw figure 7: stacked module times, and tails; None without both."""
+    # both panels need measurements
     baseline = result.fact(result.study.baseline)
     timed = [each for each in result.facts if each.latency_us]
     if not timed or not baseline.modules_us:
@@ -51,7 +52,9 @@ def where_the_time_goes(result: "PaperResult") -> Figure | None:
     with styled():
         figure = Figure(figsize=(WIDTH_IN, 3.4), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
+        # modules of the baseline on the left
         _stack(left, baseline.modules_us, baseline.variant)
+        # tails of several variants on the right
         names = _shown_tails(result)
         colours = colormaps["tab10"].colors  # type: ignore[attr-defined]
         for name, colour in zip(names, (BASELINE, *colours), strict=False):
@@ -106,6 +109,7 @@ def _draw_rates(
     column: RouteColumn,
 ) -> None:
     """Draw one column over the rates, and the driver at its own latency."""
+    # mean and interval at each rate
     found = [(fps, _mean(result, name, where, column)) for fps, where in driven]
     known = [(fps, each) for fps, each in found if each.value is not None]
     sure = [
@@ -118,6 +122,7 @@ def _draw_rates(
         axes.fill_between(*band, color=ACCENT, alpha=0.15, linewidth=0)
     values = np.array([(fps, each.value) for fps, each in known], np.float64)
     axes.plot(*values.T, "o-", color=ACCENT, markersize=4)
+    # rates that share the last condition are shaded
     free = [fps for fps, where in driven if where == driven[-1][1]]
     if len(free) > 1:
         axes.axvspan(min(free), max(free), color=RULE, alpha=0.45, linewidth=0)
@@ -137,6 +142,7 @@ def _draw_rates(
 def _draw_own(
     axes: Axes, result: "PaperResult", name: str, column: RouteColumn
 ) -> None:
+    # the first condition that charges each model's own latency
     fps = result.fact(name).fps
     traced = [each.name for each in result.study.conditions if each.traced]
     if fps is None or not traced or result.cell(name, traced[0]) is None:
@@ -144,6 +150,7 @@ def _draw_own(
     own = _mean(result, name, traced[0], column)
     if own.value is None:
         return
+    # a diamond with its interval
     if own.low is not None and own.high is not None:
         axes.plot([fps] * 2, [own.low, own.high], color=INK, linewidth=1.4)
     axes.plot(fps, own.value, "D", color=INK, markersize=5)
@@ -194,16 +201,19 @@ def _mean(
 
 def _stack(axes: Axes, parts: Mapping[str, tuple[int, ...]], name: str) -> None:
     """Draw one bar per inference, one colour per module, the largest at the bottom."""
+    # largest module first, at the bottom
     colours = colormaps["tab10"].colors  # type: ignore[attr-defined]
     ordered = sorted(parts.items(), key=lambda part: -sum(part[1]))
     total = sum(sum(samples) for _, samples in ordered)
     count = len(ordered[0][1])
+    # one bar per inference
     at, floor = np.arange(1, count + 1), np.zeros(count)
     for (module, samples), colour in zip(ordered, colours, strict=False):
         height = np.array(samples) / 1e3
         label = f"{module}  {sum(samples) / max(1, total):.0%}"
         axes.bar(at, height, 1.0, floor, color=colour, label=label, linewidth=0)
         floor += height
+    # legend in the order of the stack
     axes.set_xlim(0.5, count + 0.5)
     axes.set_xlabel(f"inference of {name}, under a profiler")
     axes.set_title("milliseconds by module, on the device", color=MUTED)

@@ -122,6 +122,7 @@ RATE_QUESTIONS = (
 
 def _of_the_stage(where: str, tail: str, even: str) -> tuple[PaperQuestion, ...]:
     """Ask about the collision optimisation at one speed of the network."""
+    # tail and mean latency, with and without the stage
     with_it = ("optimizer", tail)
     return (
         PaperQuestion(

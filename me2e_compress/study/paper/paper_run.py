@@ -80,6 +80,7 @@ def read_paper(
     Raises:
         StudyError: A folder holds no such files, or one that cannot be read.
     """
+    # finished cells, and facts of their files
     folder = Path(records)
     about, facts = load_facts(folder / FILE)
     found = [DriveRecord.load(path) for path in sorted(folder.glob("*.jsonl"))]
@@ -87,6 +88,7 @@ def read_paper(
     scale = about.get("device_scale")
     if not isinstance(scale, float | int):
         raise StudyError(f"{folder / FILE}: no device_scale")
+    # other stacks' files may be counted anew
     names = [each.name for each in study.variants]
     facts |= {found.variant: found for each in weigh for found in weighed(each)}
     weighed_too = (each for each in facts.values() if each.of_another_stack)
@@ -154,9 +156,11 @@ def _accident(
     setup: DriveSetup, prepared: Sequence[PreparedVariant], result: PaperResult
 ) -> Accident | None:
     """Return the baseline's first accident, at the highest rate that has one."""
+    # an accident is recorded once
     path = setup.workspace.folder / "records" / ACCIDENT
     if path.is_file():
         return Accident.load(path)
+    # the highest rate comes first
     study = setup.study
     driver = next(each for each in prepared if each.variant is study.reference)
     for condition in sorted(study.conditions, key=partial(held_frames, study)):
@@ -164,6 +168,7 @@ def _accident(
         happened = None if record is None else first_accident(record)
         if record is None or happened is None:
             continue
+        # drive the route again, this time watched
         job = setup.job(driver, condition)
         if job is None:
             continue
@@ -231,6 +236,7 @@ def _with_joules(
     listener: Listener,
 ) -> list[ModelFacts]:
     """Measure joules per frame if this machine has a counter."""
+    # models whose energy is not known yet
     models = {
         each.variant.name: each.model
         for each, facts in zip(prepared, found, strict=True)
@@ -238,6 +244,7 @@ def _with_joules(
     }
     if study.held_out is None or not models:
         return list(found)
+    # all are measured together, and share their noise
     measured = measure_energy(
         models,
         CalibrationSet(study.held_out),

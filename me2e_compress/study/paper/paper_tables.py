@@ -65,9 +65,11 @@ def all_paper_tables(result: "PaperResult") -> tuple[Table, ...]:
 
 def table_2(result: "PaperResult", block: "StudyBlock") -> Table:
     """Show one driver at the paper's rates, and at latencies of its own."""
+    # the condition of each number of held frames
     study, name = result.study, block.variants[0]
     conditions = [each for each in study.conditions if each.name in block.conditions]
     held = {held_frames(study, each): each.name for each in reversed(conditions)}
+    # the paper's rates
     rows = []
     for given in published.RATES:
         frames = skipped_decisions(round(1e6 / given.fps)) + 1
@@ -81,6 +83,7 @@ def table_2(result: "PaperResult", block: "StudyBlock") -> Table:
                 *given_cells(given),
             )
         )
+    # the driver's own latencies
     own = published.RATES_RT["UniAD"]
     for each in conditions:
         if each.traced or each.mean_of:
@@ -108,11 +111,13 @@ def table_2(result: "PaperResult", block: "StudyBlock") -> Table:
 
 def table_3(result: "PaperResult", block: "StudyBlock") -> Table:
     """Show the driver without some modules, each variant at its own latency."""
+    # all variants drive under one condition
     condition = block.conditions[0]
     base = result.fact("exact")
     energy = EnergyColumns.of(result, block.variants, condition)
     rows = []
     for name in block.variants:
+        # sizes are relative to the whole graph
         fact = result.fact(name)
         whole = name in (result.study.baseline, base.variant)
         given = published.MODULES_AWAY.get(name)
@@ -152,6 +157,7 @@ def table_3(result: "PaperResult", block: "StudyBlock") -> Table:
 
 def table_5(result: "PaperResult", block: "StudyBlock") -> Table:
     """Show int8 by module, under each condition."""
+    # the first variant is the float graph
     base = block.variants[0]
     rankings = [ranking_note(result, block.variants, each) for each in block.conditions]
     rows = []
@@ -189,6 +195,7 @@ def table_5(result: "PaperResult", block: "StudyBlock") -> Table:
 
 def table_6(result: "PaperResult", block: "StudyBlock") -> Table:
     """Show the driver with its rate limited."""
+    # the condition of each number of held frames
     study, name = result.study, block.variants[0]
     held = {
         held_frames(study, each): each.name
@@ -197,6 +204,7 @@ def table_6(result: "PaperResult", block: "StudyBlock") -> Table:
     }
     rows = []
     for given in published.LIMITED:
+        # the paper's rates; watts are not measured here
         frames = skipped_decisions(round(1e6 / given.fps)) + 1
         condition = held.get(frames, "")
         fact = result.fact(name)
@@ -231,6 +239,7 @@ def table_6(result: "PaperResult", block: "StudyBlock") -> Table:
 
 def tail(result: "PaperResult", block: "StudyBlock") -> Table:
     """Compare a host stage in critical frames with its mean at every frame."""
+    # one row per variant and condition
     base = result.study.baseline
     rows = [
         (

@@ -253,6 +253,7 @@ class PaperQuestion:
 
 def findings_table(found: tuple[Finding, ...], preview: str) -> Table:
     """Show every question with its verdict and interval."""
+    # an untested finding has a reason instead of a difference
     rows = [
         (
             Cell(each.question),

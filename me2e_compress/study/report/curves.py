@@ -21,6 +21,7 @@ def curves(outcome: StudyResult) -> str | None:
     """Draw driving score and success rate as SVG; None below three conditions."""
     if len(outcome.study.conditions) < ENOUGH:
         return None
+    # two panels over the same conditions
     panels: tuple[tuple[str, Score], ...] = (
         ("driving score", lambda scores: scores.driving_score),
         ("success rate, %", lambda scores: scores.success_rate),
@@ -28,6 +29,7 @@ def curves(outcome: StudyResult) -> str | None:
     names = [condition.name for condition in outcome.study.conditions]
     with styled():
         figure = Figure(figsize=(WIDTH_IN, 3.0), layout="constrained")
+        # one curve per variant
         for axes, (title, pick) in zip(figure.subplots(1, 2), panels, strict=True):
             for variant in outcome.variants:
                 _curve(axes, variant.name, _found(outcome, variant.name, pick), outcome)
@@ -53,12 +55,14 @@ def _found(
 def _curve(
     axes: Axes, name: str, found: Sequence[Estimate | None], outcome: StudyResult
 ) -> None:
+    # conditions under which the variant was driven
     colour = BASELINE if name == outcome.study.baseline else ACCENT
     driven = [
         (place, each.value, each.low, each.high)
         for place, each in enumerate(found)
         if each is not None and each.value is not None
     ]
+    # intervals below the line
     for place, _, low, high in driven:
         if low is not None and high is not None:
             axes.plot([place] * 2, [low, high], color=colour, alpha=0.3, linewidth=1.6)
@@ -70,6 +74,7 @@ def _curve(
         linewidth=1.2,
         markersize=5,
     )
+    # the name at the end of the curve
     if driven and len(outcome.variants) > 1:
         place, value, *_ = driven[-1]
         axes.annotate(

@@ -63,6 +63,7 @@ def front(points: Sequence[Point]) -> list[Point]:
 
 def pareto(outcome: StudyResult, condition: Condition) -> str | None:
     """Draw driving score against latency and against size; None below two points."""
+    # panels with at least two points
     latency = _points(outcome, condition, "latency")
     size = _points(outcome, condition, "size")
     panels = [
@@ -81,6 +82,7 @@ def pareto(outcome: StudyResult, condition: Condition) -> str | None:
         for each, (points, words) in zip(axes, panels, strict=True):
             _scatter(each, points, words)
         axes[0].set_ylabel("driving score")
+        # names are placed last, when the limits are final
         figure.canvas.draw_idle()
         for each, (points, _) in zip(axes, panels, strict=True):
             named = [(p.name, p.cost, p.height) for p in _named(points)]
@@ -90,6 +92,7 @@ def pareto(outcome: StudyResult, condition: Condition) -> str | None:
 
 def forest(outcome: StudyResult) -> str | None:
     """Draw every difference to the baseline with its interval; None without one."""
+    # drives that have a difference to the baseline
     rows = [each for each in outcome.drives if each.difference is not None]
     if not rows:
         return None
@@ -99,6 +102,7 @@ def forest(outcome: StudyResult) -> str | None:
         height = 0.9 + 0.26 * len(rows)
         figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
         panels = figure.subplots(1, 2, sharey=True)
+        # one panel per score, sharing the rows
         driving = [r.difference.driving_score for r in rows if r.difference]
         success = [r.difference.success_rate for r in rows if r.difference]
         titles = ("driving score, points", "success rate, points")
@@ -132,6 +136,7 @@ def _named(points: Sequence[Point]) -> Sequence[Point]:
 def _scatter(axes: Axes, points: Sequence[Point], words: str) -> None:
     bare(axes)
     axes.grid(visible=True, axis="y")
+    # the Pareto front as a step
     best = front(points)
     axes.step(
         [p.cost for p in best],
@@ -142,6 +147,7 @@ def _scatter(axes: Axes, points: Sequence[Point], words: str) -> None:
         linewidth=1.2,
         zorder=1,
     )
+    # intervals only for points that are named
     named = _named(points)
     for point in points:
         colour = BASELINE if point.baseline else ACCENT
@@ -163,6 +169,7 @@ def _scatter(axes: Axes, points: Sequence[Point], words: str) -> None:
             markersize=5,
             zorder=3,
         )
+    # room for the names on the right
     axes.set_xlabel(words)
     axes.margins(x=0.12)
     axes.set_xlim(left=0.0)
@@ -186,12 +193,14 @@ def _place_names(
     figure: Figure, axes: Axes, names: Sequence[tuple[str, float, float]]
 ) -> None:
     """Write names right of their points, shifted where they would overlap."""
+    # positions in points, independent of the axes
     scale = POINTS_AN_INCH / figure.dpi
     ends = list[tuple[float, float, float]]()
     spots = [
         (name, x, y, axes.transData.transform((x, y)) * scale) for name, x, y in names
     ]
     for name, x, y, (left, up) in sorted(spots, key=lambda spot: -spot[3][1]):
+        # from the top down, move below the names already placed
         start = left + GAP_PT
         end = start + CHARACTER_PT * len(name)
         height = up
@@ -200,6 +209,7 @@ def _place_names(
             if meets and other_height - height < LINE_PT:
                 height = other_height - LINE_PT
         ends.append((start, end, height))
+        # a line connects a moved name with its point
         moved = abs(height - up) > 1.0
         axes.annotate(
             name,

@@ -90,6 +90,7 @@ def html(
 
 
 def _lede(outcome: StudyResult) -> str:
+    # what was driven
     study = outcome.study
     driven, whole = outcome.coverage
     share = f"{driven}" if driven == whole else f"{driven} of {whole}"
@@ -99,6 +100,7 @@ def _lede(outcome: StudyResult) -> str:
         f"{_count(len(study.variants), 'variant')} on {share} routes {where}, "
         f"closed loop; {_count(len(study.conditions), 'condition')}: {names}."
     )
+    # what so many routes can show
     found = [each.difference for each in outcome.drives if each.difference is not None]
     if not found:
         return said

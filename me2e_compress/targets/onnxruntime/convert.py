@@ -79,10 +79,6 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
     A layer becomes int8 if both its input and its weight come through a pair, and it
     has a kernel. Weights are stored as int8 or, by ModelOpt, in float before a
     QuantizeLinear. Biases stored as int32 become float again.
-
-    Raises:
-        PreconditionError: no activation is quantized, or a pair is not symmetric int8
-            with float32 scales, one for an activation.
     """
     copy = model.clone()
     graph.infer_shapes(copy)

@@ -29,26 +29,16 @@ class CpuSeconds:
     """Nanoseconds of one core for one unit of work.
 
     Attributes:
-        machine: description of the machine.
         kernel: any kernel call.
-        float_mac: a multiply-accumulate in float32.
-        float_grouped_mac: a multiply-accumulate of a grouped convolution.
         float_element: an element that a layer reads or writes.
         float_reorder: an element passed between a convolution, which works on channels
             in blocks, and anything else.
-        float_weight: a weight.
-        int8_mac: a multiply-accumulate of uint8 and int8.
-        int8_grouped_mac: a multiply-accumulate of a grouped convolution.
         int8_patch: a pixel copied into place for a kernel larger than 1.
         int8_answer: an element that a convolution rounds to uint8.
         int8_product: a float32 output element of a matrix product.
-        int8_weight: a weight.
         float_sampled_mac: a multiply-accumulate of a fused operator that samples
             feature maps too large for the cache.
-        int8_sampled_mac: the same with uint8 maps.
         requantize: extra time for a uint8 output element of a matrix product.
-        quantize: an element, float32 to uint8.
-        dequantize: an element, uint8 to float32.
     """
 
     machine: str
@@ -157,10 +147,7 @@ def work_of(layer: ir.Node) -> tuple[Counts, Counts] | None:
 
 
 def sampled_macs(node: ir.Node) -> int | None:
-    """Count the products of a fused operator on maps too large for the cache.
-
-    Returns None where shapes are open.
-    """
+    """Count a fused operator's products on maps larger than the cache, if known."""
     found, shape = find(node), static_shape(node.inputs[0])
     macs = None if found is None else found[0].cost(node, found[1]).macs
     if macs is None or shape is None:

@@ -17,10 +17,9 @@ from me2e_compress.targets.weights import QuantizedWeight
 
 @dataclasses.dataclass(frozen=True)
 class Draft:
-    """A float graph, and what of it becomes int8.
+    """A float graph, and what of it becomes int8; lowering changes the graph in place.
 
     Attributes:
-        model: the graph; lowering changes it in place.
         weights: weights of the layers to quantize, by the name of their first output.
         reach: max(|low|, |high|) of the activations whose range is known, by name.
         sampled: output names of the fused operators that sample int8.
@@ -33,11 +32,7 @@ class Draft:
 
 
 def lower(draft: Draft) -> ir.Model:
-    """Write the int8 part of a draft into its graph.
-
-    Raises:
-        FramesError: the range of a tensor is unknown.
-    """
+    """Write the int8 part of a draft into its graph."""
     main = draft.model.graph
     region = find_region(main, {*draft.weights, *draft.sampled})
     if missing := [name for name in region.ranged if name not in draft.reach]:

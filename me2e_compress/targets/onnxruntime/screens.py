@@ -23,8 +23,7 @@ def screen_products(writer: Writer) -> None:
     * that both a QuantizeLinear and something else read;
     * that is a MatMul whose only reader is an Add: the two become a float Gemm first.
 
-    The int8 layers and pairs must have been written. Convolutions are not affected:
-    their output is read only through its pair.
+    Convolutions are not affected: their output is read only through its pair.
     """
     products = [
         node

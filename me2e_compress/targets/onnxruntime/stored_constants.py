@@ -15,12 +15,7 @@ Floats = npt.NDArray[np.float32]
 
 
 def step_of(node: ir.Node) -> Floats:
-    """Read the scale of a QuantizeLinear or DequantizeLinear.
-
-    Raises:
-        PreconditionError: the scale is not a float32 constant, or the integers are not
-            int8 with zero point 0.
-    """
+    """Read the float32 scale of a symmetric int8 QuantizeLinear or DequantizeLinear."""
     scale = graph.array_of(node.inputs[1])
     zero = graph.array_of(graph.input_at(node, 2))
     name = node.name or node.outputs[0].name
@@ -47,10 +42,7 @@ def weight_of(layer: ir.Node) -> QuantizedWeight | None:
 
     A MatMul by [1, ..., K, N] reads [K, N]. onnxruntime's own quantizer, and so
     ModelOpt, puts scales along axis 1 of such a weight, which is K: no kernel takes it.
-
-    Raises:
-        PreconditionError: it is not on the symmetric int8 grid with one scale for each
-            output channel, or one in all.
+    Another grid than symmetric int8, or other axes, are a PreconditionError.
     """
     node = producer_of(layer.inputs[1])
     if node is None or node.op_type != DEQUANTIZE:

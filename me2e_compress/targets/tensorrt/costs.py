@@ -14,14 +14,7 @@ from me2e_compress.quantization.costs import Border, Costs
 
 @dataclasses.dataclass(frozen=True)
 class GpuRates:
-    """Peak rates of a GPU.
-
-    Attributes:
-        machine: description of the GPU.
-        half_macs: dense multiply-accumulates per second in float16.
-        int8_macs: the same in int8.
-        memory: bytes per second.
-    """
+    """Peak rates of a GPU: dense multiply-accumulates and bytes per second."""
 
     machine: str
     half_macs: float

@@ -74,7 +74,7 @@ class MultiheadAttention(nn.Module):
         key_pos: Tensor,
         ignore: Tensor | None = None,
     ) -> Tensor:
-        """Map [B, Q, 256] and keys, which are the values too, to [B, Q, 256]."""
+        """Map [B, Q, 256] and keys, which are also the values, to [B, Q, 256]."""
         attended: Tensor = self.attn(query + query_pos, key + key_pos, key, ignore)
         return query + attended
 

@@ -23,8 +23,8 @@ def inverse_sigmoid(x: Tensor) -> Tensor:
 def precise_sigmoid(x: Tensor) -> Tensor:
     """Return 1 / (1 + exp(-x)) with full relative precision for small results.
 
-    onnxruntime's Sigmoid has an absolute error of 8e-8: near 1e-5, where
-    `inverse_sigmoid` ends, that moves the logit by 8e-3.
+    onnxruntime's Sigmoid is exact to 8e-8: near 1e-5, where `inverse_sigmoid` ends,
+    that moves the logit by 8e-3.
     """
     return torch.reciprocal(1 + torch.exp(-x))
 
@@ -57,10 +57,7 @@ class DecoderLayer(nn.Module):
         at: Tensor,
         ignore: Tensor | None = None,
     ) -> Tensor:
-        """Map [1, Q, 256] to [1, Q, 256]; ``at`` are reference points [1, Q, 2].
-
-        ``ignore`` is [1, Q] bool: queries that the others must not see.
-        """
+        """Map [1, Q, 256] to the same; ``at`` is [1, Q, 2], ``ignore`` [1, Q] bool."""
         query = self.norms[0](self.attentions[0](query, query, pos, pos, ignore))
         query = self.norms[1](self.attentions[1](query, pos, bev, at))
         out: Tensor = self.norms[2](self.ffns[0](query))
@@ -68,11 +65,7 @@ class DecoderLayer(nn.Module):
 
 
 class Decoder(nn.Module):
-    """`DecoderLayer`s with a regression branch after each.
-
-    ``height`` adds a third coordinate to references; ``precise`` is for references that
-    are fed back as logits from frame to frame.
-    """
+    """`DecoderLayer`s and branches; ``precise`` if references are fed back."""
 
     def __init__(
         self,
@@ -99,14 +92,10 @@ class Decoder(nn.Module):
     ) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
         """Decode queries [1, Q, 256] with references [1, Q, 2 or 3], 0..1.
 
-        ``pos`` is [1, Q, 256] and ``bev`` [1, cells, 256]. Columns 0 and 1 of a layer's
-        branch, and 4 with heights, move the reference. ``ignore`` is [1, Q] bool, true
-        for queries that the others must not see.
-
-        Returns:
-            For every layer: queries [1, Q, 256], raw regressions [1, Q, code] and
-                refined
-            references [1, Q, 2 or 3].
+        Columns 0 and 1 of a layer's branch, and 4 with heights, move the reference.
+        ``ignore`` is [1, Q] bool, true for queries that the others must not see.
+        Returns for every layer queries [1, Q, 256], raw regressions [1, Q, code] and
+        refined references.
         """
         queries, regressions, references = [], [], []
         for layer, branch in zip(self.layers, branches, strict=True):

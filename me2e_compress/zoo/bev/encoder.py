@@ -100,7 +100,6 @@ class CameraAttention(nn.Module):
 
 
 def _by_level(weights: Tensor, levels: int) -> Tensor:
-    """Split [..., levels * points] into [..., levels, points]."""
     return weights.unsqueeze(3) if levels == 1 else weights.unflatten(3, (levels, -1))
 
 
@@ -118,10 +117,9 @@ class SpatialCrossAttention(nn.Module):
     def forward(
         self, query: Tensor, tokens: Tensor, at: Tensor, visible: Tensor
     ) -> Tensor:
-        """Attend as `CameraAttention`, averaged over the cameras that see the cell.
+        """Attend as `CameraAttention`, averaged over cameras that see the cell.
 
-        ``visible`` is [cameras, cells, 1] float32, 1 or 0. Returns [1, cells, 256],
-        with the residual.
+        ``visible`` is [cameras, cells, 1] float32, 1 or 0.
         """
         seen = self.deformable_attention(query, tokens, at) * visible
         count = torch.maximum(visible.sum(0, keepdim=True), ONE)
@@ -158,8 +156,7 @@ class EncoderLayer(nn.Module):
 
 
 class BevEncoder(nn.Module):
-    """`EncoderLayer`s over a grid of cells; ``hws`` are the feature levels of a camera.
-    """
+    """`EncoderLayer`s over a grid; ``hws`` are the feature levels of a camera."""
 
     pillars: Tensor
     cells: Tensor
@@ -197,17 +194,13 @@ class BevEncoder(nn.Module):
         tokens: Tensor,
         lidar2img: Tensor,
     ) -> Tensor:
-        """Encode one frame to [1, cells, 256].
+        """Encode one frame, query and pos [1, cells, 256], to [1, cells, 256].
 
-        Args:
-            query: [1, cells, 256], learned embedding plus ego motion.
-            pos: [1, cells, 256].
-            previous: [1, cells, 256], the last BEV turned to the current heading.
-            first: bool scalar: there is no previous BEV.
-            shift: [1, 2], ego translation relative to the grid. As in the original, it
-                moves the reference points of both halves of the queue.
-            tokens: [cameras, h * w, 256].
-            lidar2img: [1, cameras, 4, 4].
+        ``previous`` [1, cells, 256] is the last BEV turned to the current heading,
+        ``tokens`` [cameras, h * w, 256], ``lidar2img`` [1, cameras, 4, 4]. The bool
+        ``first`` says that there is no previous BEV. As in the original, ``shift`` [1,
+        2], the ego translation relative to the grid, moves the reference points of both
+        halves of the queue.
         """
         pillars_at, visible = project(self.pillars, lidar2img, self.image_hw)
         cells_at = self.cells + shift[:, None]

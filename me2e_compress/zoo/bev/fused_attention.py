@@ -28,8 +28,6 @@ def fused_deformable_attention(
 
 
 class _Fused(torch.autograd.Function):
-    """Samples of feature levels, weighted and summed; no gradient."""
-
     @staticmethod
     def forward(
         ctx: object,
@@ -38,7 +36,6 @@ class _Fused(torch.autograd.Function):
         locations: Tensor,
         weights: Tensor,
     ) -> Tensor:
-        """Compute it with torch's own sampler."""
         # Sample level by level
         hws = _pairs(sizes)
         batch, _, heads, channels = value.shape

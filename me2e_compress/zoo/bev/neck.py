@@ -22,11 +22,10 @@ class ConvModule(nn.Module):
 
 
 class FeaturePyramid(nn.Module):
-    """Stages to 256 channels each, and coarser levels on top (Lin et al. 2017).
+    """Stages, the finest first, to 256 channels each, and ``extra`` levels on top.
 
-    ``channels`` of the stages are listed from the finest. Each of the ``extra`` levels
-    is a strided convolution of the level before. ``hws`` are the rows and columns of
-    several stages: without them the exporter would write shape arithmetic.
+    Lin et al. 2017. ``hws`` are the rows and columns of several stages: without them
+    the exporter would write shape arithmetic.
     """
 
     def __init__(

@@ -29,11 +29,9 @@ def project(
 ) -> tuple[Tensor, Tensor]:
     """Project pillars [heights, cells, 4, 1] into the cameras.
 
-    ``lidar2img`` [1, cameras, 4, 4] maps metres to pixels times depth.
-
-    Returns:
-        Positions [cameras, cells, heights, 2], 0..1 within the image, and float32
-        [cameras, cells, 1]: 1 where a camera sees any point of the pillar.
+    ``lidar2img`` [1, cameras, 4, 4] maps metres to pixels times depth. Returns
+    positions [cameras, cells, heights, 2], 0..1 within the image, and float32 [cameras,
+    cells, 1]: 1 where a camera sees any point of the pillar.
     """
     seen = torch.matmul(lidar2img[0][:, None, None], points.unsqueeze(0)).squeeze(-1)
     depth = seen[..., 2:3]
@@ -74,7 +72,7 @@ def cell_positions(grid: BevGrid) -> Tensor:
 def turn(
     bev: Tensor, can_bus: Tensor, cells: Tensor, grid: BevGrid, sampling: Sampling
 ) -> Tensor:
-    """Rotate the previous BEV [cells, 1, 256] to the current heading, to the nearest cell.
+    """Rotate the previous BEV [cells, 1, 256] to the current heading, nearest cell.
 
     The last of ``can_bus`` [18] is the change of yaw in degrees; ``cells`` [cells, 2]
     are from `cell_positions`. Returns [1, cells, 256].

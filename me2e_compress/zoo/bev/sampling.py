@@ -16,14 +16,11 @@ def sample(
     sampling: Sampling,
     mode: Literal["bilinear", "nearest"] = "bilinear",
 ) -> Tensor:
-    """Sample ``image`` at ``grid``: [N, C, Q, P] float32; outside of the image is zero.
+    """Sample an image [N, C, H, W] at positions [N, Q, P, 2]; return [N, C, Q, P].
 
-    Args:
-        image: [N, C, H, W] float32.
-        grid: [N, Q, P, 2] float32, x then y, -1 and 1 are the outer edges.
-        sampling: ``operator`` uses grid_sample (ONNX opset 16 and later), the others
-            write the same in operators of opset 13.
-        mode: interpolation between pixels.
+    All are float32. Positions are x then y, -1 and 1 the outer edges; outside is zero.
+    ``operator`` uses grid_sample (ONNX opset 16 and later), the other samplings write
+    the same in operators of opset 13.
     """
     if sampling == "operator":
         return functional.grid_sample(

@@ -24,10 +24,7 @@ class ImageTrunk(ResNet):
 
 
 class RecurrentCell(nn.Module):
-    """A gated recurrent unit (Cho et al. 2014) with the names of ``nn.GRUCell``.
-
-    The exporter does not support ``GRUCell``.
-    """
+    """An ``nn.GRUCell`` (Cho et al. 2014) that the exporter supports."""
 
     def __init__(self, size: int, hidden: int) -> None:
         super().__init__()

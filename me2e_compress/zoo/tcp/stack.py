@@ -29,14 +29,10 @@ class Tcp(nn.Module):
     Wu et al. 2022, written from the published description, with the published
     dimensions and the original's parameter names. Nothing is remembered between frames.
     PID control of the waypoints, the choice of an action and the fusion of both heads
-    are up to the host.
-
-    Args:
-        heads: ``bench2drive`` scores 39 actions; ``beta``, the original, returns Beta
-            distributions of acceleration and steer.
-        training_branches: hold the weights of the branches used only in training:
-            1,375,491 parameters of Bench2DriveZoo's 26,593,444, which never run here.
-        config: sizes.
+    are up to the host. Head ``bench2drive`` scores 39 actions; ``beta``, the original,
+    returns Beta distributions of acceleration and steer. ``training_branches`` holds
+    the branches used only in training: 1,375,491 parameters of Bench2DriveZoo's
+    26,593,444.
     """
 
     def __init__(

@@ -117,8 +117,7 @@ def initialise(
 def _hold_centres(model: UniadTiny) -> None:
     """Make the layers move the centre of a box only a little.
 
-    Where a query reads depends on its position, and that on what it read: if centres
-    move by whole cells, rounding errors grow from layer to layer and frame to frame.
+    If centres move by whole cells, rounding errors grow between layers and frames.
     """
     for branch in model.pts_bbox_head.reg_branches:
         for parameter in branch.get_submodule("4").parameters():
@@ -126,7 +125,7 @@ def _hold_centres(model: UniadTiny) -> None:
 
 
 def _open_masks(model: UniadTiny) -> None:
-    """Let cells see instances by a margin: features of cells are positive on average.
+    """Make features of cells positive on average.
 
     Of millions of random logits some are at the threshold, where rounding decides.
     """
@@ -135,7 +134,6 @@ def _open_masks(model: UniadTiny) -> None:
 
 
 def _normalised(neck: FeaturePyramid, stages: list[Tensor]) -> list[Tensor]:
-    """Give every level unit deviation per channel, and return the levels."""
     maps = [
         _unit(conv, stage)
         for conv, stage in zip(neck.lateral_convs, stages, strict=True)
@@ -173,7 +171,6 @@ def _unit(module: nn.Module, x: Tensor) -> Tensor:
 
 
 def _balance_classes(model: UniadTiny, cells: Tensor, beginning: float) -> None:
-    """Shift the class logits so that few queries become tracks, of every class."""
     head, query = model.pts_bbox_head, model.query_embedding.weight[None]
     pos, content = query.chunk(2, 2)
     at = model.reference_points(pos).sigmoid()
@@ -187,8 +184,6 @@ def _balance_classes(model: UniadTiny, cells: Tensor, beginning: float) -> None:
 
 
 class _Occupancy(nn.Module):
-    """The occupancy head with some invented agents."""
-
     def __init__(self, model: UniadTiny, noise: torch.Generator) -> None:
         super().__init__()
         self.head = model.occ_head
@@ -205,6 +200,5 @@ class _Occupancy(nn.Module):
         self.motion = Forecasts(nothing, nothing, modes, query)
 
     def forward(self, bev: Tensor) -> Tensor:
-        """Map [1, cells, 256] to occupancy."""
         out: Tensor = self.head(bev, self.agents, self.motion, torch.ones(AGENTS))
         return out

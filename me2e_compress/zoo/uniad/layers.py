@@ -7,8 +7,7 @@ from me2e_compress.zoo.bev.sizes import EMBED, FEED_FORWARD
 
 
 class TransformerLayer(nn.Module):
-    """Self-attention, cross-attention, feed-forward, as ``nn.TransformerDecoderLayer``.
-    """
+    """Self-attention, cross-attention and feed-forward, as in torch's decoder."""
 
     def __init__(self, *, cross: bool = True) -> None:
         super().__init__()

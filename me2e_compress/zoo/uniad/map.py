@@ -92,10 +92,7 @@ class LaneDecoder(nn.Module):
         at: Tensor,
         branches: nn.ModuleList,
     ) -> tuple[Tensor, Tensor]:
-        """Refine lanes: content and position, [1, lanes, 256], at points 0..1.
-
-        Returns queries [1, lanes, 256] and boxes [1, lanes, 4] (cx, cy, w, h, 0..1).
-        """
+        """Refine lanes, content and position [1, lanes, 256]; also return boxes."""
         query, pos = lanes
         layers = zip(self.layers, branches, strict=True)
         for number, (layer, branch) in enumerate(layers):
@@ -131,10 +128,10 @@ class MapTransformer(nn.Module):
     def forward(
         self, cells: Tensor, pos: Tensor, lanes: Tensor, branches: nn.ModuleList
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Decode lanes [lanes, 512], position then content.
+        """Decode lanes [lanes, 512], position then content, from cells [1, cells, 256].
 
-        ``cells`` and ``pos`` are [1, cells, 256]. Returns cells, lane queries [1,
-        lanes, 256] and boxes [1, lanes, 4] (cx, cy, w, h, 0..1).
+        Returns cells, lane queries [1, lanes, 256] and boxes [1, lanes, 4] (cx, cy, w,
+        h).
         """
         pos = pos + self.level_embeds[0]
         cells = self.encoder(cells, pos, self.places)
@@ -157,13 +154,9 @@ class Lanes(NamedTuple):
 class MapHead(nn.Module):
     """Finds lanes in the upsampled view.
 
-    Args:
-        config: sizes.
-        sampling: see `sample`.
-        dead: hold weights that inference never reads: an embedding of the cells, the
-            background head, the branches of the mask heads, attention for three more
-            levels.
-        trained: hold that attention and use it as in training (see `DecoderAttention`).
+    ``dead`` holds weights that inference never reads: an embedding of the cells, the
+    background head, the branches of the mask heads, attention for three more levels.
+    ``trained`` uses that attention as in training (see `DecoderAttention`).
     """
 
     def __init__(

@@ -73,15 +73,10 @@ class MotionFormer(nn.Module):
     ) -> Tensor:
         """Let the modes [A, 6, 256] read agents, lanes and the view in one layer.
 
-        Args:
-            layer: index of the layer.
-            query: [A, 6, 256], of the previous layer.
-            intent: goals of the modes.
-            agents: track queries [1, A, 256], their positions [1, A, 256], and [1, A]
-                bool, true where a slot holds no agent.
-            lanes: lane queries with their positions, [1, lanes, 256].
-            bev: [1, cells, 256], the upsampled view.
-            at: [A, 6, 12, 2], the trajectories so far, metres, lidar frame.
+        ``agents`` are track queries and positions [1, A, 256], and [1, A] bool, true in
+        empty slots; ``lanes`` are queries plus positions, [1, lanes, 256]; ``bev`` is
+        the upsampled view [1, cells, 256]; ``at`` [A, 6, 12, 2] are the trajectories so
+        far, metres, lidar frame.
         """
         # Fuse the goals into the query
         dynamic = self.dynamic_embed_fuser(torch.cat(intent.goals, -1))
@@ -126,10 +121,7 @@ class Forecasts(NamedTuple):
 
 
 class MotionHead(nn.Module):
-    """Anchors, embeddings, `MotionFormer` and its branches.
-
-    ``dead`` holds ``layer_track_query_fuser``, which inference never reads.
-    """
+    """Anchors, embeddings and `MotionFormer`; ``dead`` holds an unused fuser."""
 
     def __init__(
         self, config: UniadConfig, sampling: Sampling, *, dead: bool = False
@@ -167,8 +159,7 @@ class MotionHead(nn.Module):
     def forward(self, agents: Agents, lanes: Tensor, bev: Tensor) -> Forecasts:
         """Predict the motion of all agents in all modes.
 
-        ``lanes`` are lane queries with their positions, [1, lanes, 256]; ``bev`` [1,
-        cells, 256] is the upsampled view.
+        ``lanes`` are [1, lanes, 256]; ``bev`` is the upsampled view [1, cells, 256].
         """
         # Anchors and positions in the frames of the agents
         frames = AgentFrames.of(agents.boxes)

@@ -43,8 +43,7 @@ class AgentFrames(NamedTuple):
 
     @classmethod
     def of(cls, boxes: Tensor) -> Self:
-        """Return the frames of boxes [A, 10]. As in the original, an agent faces yaw - pi.
-        """
+        """Return the frames of boxes [A, 10]; agents face yaw - pi (original)."""
         sin, cos = boxes[:, 6:7], boxes[:, 7:8]
         length = torch.maximum((sin * sin + cos * cos).sqrt(), TINY)
         return cls(

@@ -12,11 +12,7 @@ GOAL_POINTS = 4
 
 
 class GoalAttention(nn.Module):
-    """Four samples per head around each of the twelve points of a trajectory.
-
-    ``grid`` defines the trajectory's metres; ``hw`` are the rows and columns of the
-    upsampled view.
-    """
+    """Four samples per head around each of the twelve points of a trajectory."""
 
     def __init__(self, grid: BevGrid, hw: tuple[int, int], sampling: Sampling) -> None:
         super().__init__()
@@ -39,8 +35,7 @@ class GoalAttention(nn.Module):
     def forward(self, query: Tensor, pos: Tensor, bev: Tensor, at: Tensor) -> Tensor:
         """Map queries [1, Q, 256], one per agent and mode, to [1, Q, 256].
 
-        ``pos`` [1, Q, 256] is added to the query; ``bev`` is [1, cells, 256] and ``at``
-        [1, Q, 12, 2], metres in the ego frame. The residual is included.
+        ``bev`` is [1, cells, 256] and ``at`` [1, Q, 12, 2], metres in the ego frame.
         """
         asked = query + pos
         heads, steps, points = ATTENTION_HEADS, AGENT_STEPS, GOAL_POINTS

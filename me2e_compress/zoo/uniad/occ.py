@@ -33,10 +33,7 @@ class StateAttention(nn.Module):
         self.attn = PackedAttention()
 
     def forward(self, x: Tensor, key: Tensor, ignore: Tensor | None = None) -> Tensor:
-        """Map [1, cells, 256] and keys [1, K, 256] to [1, cells, 256].
-
-        ``ignore`` is [1, cells, K] bool.
-        """
+        """Attend to keys [1, K, 256]; ``ignore`` is [1, cells, K] bool."""
         out: Tensor = x + self.attn(x, key, key, ignore)
         return out
 
@@ -140,17 +137,11 @@ class OccHead(nn.Module):
     def forward(
         self, bev: Tensor, agents: Agents, motion: Forecasts, scores: Tensor
     ) -> Tensor:
-        """Predict the occupancy by all agents except the ego.
+        """Predict the occupancy by all agents except the ego, [1, 5, rows, columns].
 
-        Args:
-            bev: [1, cells, 256], the upsampled view.
-            agents: A agents and the ego.
-            motion: of the same agents.
-            scores: [A], of the tracks; empty slots and other classes than vehicles
-                occupy nothing.
-
-        Returns:
-            [1, 5, rows, columns], probabilities times the score of the occupying track.
+        It is the probability times the score of the occupying track. ``bev`` is the
+        upsampled view [1, cells, 256], ``scores`` [A] those of tracks; empty slots and
+        other classes than vehicles occupy nothing.
         """
         # Which tracks are no vehicles
         state = self.base_downscale(self.bev_light_proj(self.bev_sampler(bev)))

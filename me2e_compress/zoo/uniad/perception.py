@@ -110,8 +110,7 @@ class TrackTransformer(nn.Module):
     ) -> tuple[Tensor, tuple[list[Tensor], ...]]:
         """Encode levels [cameras, 256, h, w], then decode the track queries.
 
-        ``cells`` are BEV queries and their positions, [1, cells, 256] each. Returns the
-        BEV [1, cells, 256] and the result of `Decoder`.
+        ``cells`` are BEV queries and their positions, [1, cells, 256] each.
         """
         with region("bev_encoder"):
             bev = self.bev(levels, *cells, motions)

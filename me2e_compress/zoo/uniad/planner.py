@@ -57,12 +57,9 @@ class PlanningHead(nn.Module):
     ) -> Tensor:
         """Plan [1, 6, 2], metres in the lidar frame, every 0.5 s.
 
-        Args:
-            modes: [1, 6, 256], the ego's queries of the last motion layer.
-            track: [1, 256], the ego's track query.
-            command: [1] int64.
-            bev: [1, cells, 256], the upsampled view.
-            bev_pos: [1, cells, 256].
+        ``modes`` [1, 6, 256] are the ego's queries of the last motion layer, ``track``
+        [1, 256] its track query, ``command`` [1] int64, ``bev`` [1, cells, 256] the
+        upsampled view.
         """
         # Fuse command, track and modes into one query
         told = self.navi_embed(command).unsqueeze(1).expand_as(modes)

@@ -13,7 +13,6 @@ HALF = EMBED // 2
 
 
 def _divisors() -> Tensor:
-    """Return the wave lengths [64], over 2 pi."""
     return TEMPERATURE ** (torch.arange(0, HALF, 2) / HALF)
 
 

@@ -109,7 +109,7 @@ class UniadTiny(nn.Module):
         prev_timestamp: Tensor,
         *prev_tracks: Tensor,
     ) -> tuple[Tensor, ...]:
-        """Process one frame.
+        """Process one frame; return the next recurrent inputs, then the other outputs.
 
         Args:
             img: [1, 6, 3, rows, columns] float32, normalised.
@@ -119,15 +119,12 @@ class UniadTiny(nn.Module):
             l2g_r_mat: [1, 3, 3] float32, rows are the lidar's axes in the world.
             l2g_t: [1, 3] float32, metres: position of the lidar.
             timestamp: [1] float32, seconds since any start, so that they are small.
-            prev_bev: [cells, 1, 256] float32; this and all other recurrent inputs are
-                zeros at the start of a scene.
+            prev_bev: [cells, 1, 256] float32; all recurrent inputs are zeros at the
+                start.
             prev_l2g_r_mat: of the last frame, like the next two.
             prev_l2g_t: [1, 3].
             prev_timestamp: [1].
             prev_tracks: the fields of `TrackSlots`.
-
-        Returns:
-            The outputs for all recurrent inputs, then the other outputs of the stack.
         """
         # Images to features
         before = LidarPose(prev_l2g_r_mat, prev_l2g_t, prev_timestamp)
@@ -191,8 +188,7 @@ class UniadTiny(nn.Module):
     def _queries(
         self, tracks: TrackSlots, before: LidarPose, now: LidarPose
     ) -> Queries:
-        """Return the new queries, the last of them the ego's, then those of the tracks.
-        """
+        """Return the new queries, the last of them the ego's, then the tracks'."""
         new = self.query_embedding.weight
         at = self.reference_points(new[:, :EMBED])
         carried = self.velo_update(tracks.ref_pts, tracks.velocity, before, now)

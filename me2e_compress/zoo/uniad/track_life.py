@@ -105,8 +105,7 @@ class TrackLife(nn.Module):
 
 
 class VelocityUpdate(nn.Module):
-    """Moves reference points to the current frame, by their velocity and the ego motion.
-    """
+    """Moves reference points to the current frame by velocity and ego motion."""
 
     def __init__(self, pc_range: tuple[float, ...]) -> None:
         super().__init__()
@@ -120,10 +119,7 @@ class VelocityUpdate(nn.Module):
     def forward(
         self, ref_pts: Tensor, velocity: Tensor, before: LidarPose, now: LidarPose
     ) -> Tensor:
-        """Map logits [slots, 3] and metres per second [slots, 2] to logits [slots, 3].
-
-        The world rotates back by the transpose, which is a rotation's inverse.
-        """
+        """Map logits [slots, 3] and metres per second [slots, 2] to logits."""
         points = precise_sigmoid(ref_pts) * self.extent + self.low
         seconds = now.seconds - before.seconds
         moved = torch.cat([velocity, torch.zeros_like(velocity[:, :1])], 1) * seconds

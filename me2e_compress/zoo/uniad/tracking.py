@@ -24,12 +24,9 @@ class MemoryBank(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return tracks [tracks, 256], and ``bank`` and ``held`` of the next frame.
 
-        Args:
-            track: [tracks, 256].
-            bank: [tracks, 4, 256], the newest last.
-            held: [tracks, 4] float32, 1 where an entry of the bank is set. A track
-                whose newest entry is empty stays unchanged.
-            due: [tracks] bool: a new entry replaces the oldest.
+        ``bank`` [tracks, 4, 256] has the newest entry last; ``held`` [tracks, 4] is 1
+        where an entry is set. A track whose newest entry is empty stays unchanged.
+        Where ``due`` [tracks] is true a new entry replaces the oldest.
         """
         # Recall: mix the track with its past
         empty = held < 1
@@ -63,9 +60,9 @@ class QueryInteraction(nn.Module):
         self.norm2 = nn.LayerNorm(EMBED)
 
     def forward(self, query: Tensor, track: Tensor, ignore: Tensor) -> Tensor:
-        """Update queries [1, tracks, 512], position then content, by tracks [1, tracks, 256].
+        """Update queries [1, tracks, 512], position then content.
 
-        ``ignore`` is [1, tracks] bool, true where a slot holds no track.
+        Tracks are [1, tracks, 256]; ``ignore`` [1, tracks] bool is true in empty slots.
         """
         pos, content = query.chunk(2, 2)
         asked = pos + track

@@ -47,10 +47,7 @@ CALIBRATION_STRIDE = 2
 
 
 def initialise(model: VadTiny, images: Tensor, seed: int) -> None:
-    """Draw all parameters, then the statistics of the image branch, in place.
-
-    ``images`` are [N, 3, H, W], normalised.
-    """
+    """Draw parameters, then statistics of images [N, 3, H, W], normalised, in place."""
     draw_weights(model, Gains(GAINS, last_norm=r"bn3\.weight$"), seed)
     with one_thread():
         _calibrate(model, images)

@@ -90,8 +90,7 @@ class MotionHead(PerceptionHead):
         self.traj_cls_branches = nn.ModuleList([classifier(1, 2 * EMBED)])
 
     def lanes(self, vectors: MapOutputs) -> tuple[Tensor, Tensor]:
-        """Return one query [1, 100, 256] and one position [1, 100, 2] per map vector.
-        """
+        """Return a query [1, 100, 256] and a position [1, 100, 2] per vector."""
         with region("map"):
             return self.lane_encoder(vectors.queries), nearest_points(
                 vectors.points[-1]
@@ -128,9 +127,8 @@ class MotionHead(PerceptionHead):
     ) -> Tensor:
         """Let each agent-mode attend to the likely map vectors near it.
 
-        The original gathers these vectors; here all of them stay and the others are
-        masked, which gives the same attention at fixed shapes. One empty vector is
-        always visible.
+        The original gathers these vectors; here the others are masked, which gives the
+        same attention at fixed shapes. One empty vector is always visible.
         """
         # Mask unlikely and distant vectors
         lane_query, lane_at = lanes
@@ -151,5 +149,4 @@ class MotionHead(PerceptionHead):
 
 
 def _append_zero(x: Tensor) -> Tensor:
-    """Append zeros (or false) as one more entry of axis 1."""
     return torch.cat([x, torch.zeros_like(x[:, :1])], 1)

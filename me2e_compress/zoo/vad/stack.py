@@ -36,9 +36,8 @@ class VadTiny(nn.Module):
     ) -> Outputs:
         """Process one frame and return the outputs in the order of the stack.
 
-        ``img`` is [1, 6, 3, 384, 640], normalised, ``lidar2img`` [1, 6, 4, 4],
-        ``can_bus`` [18] and ``prev_bev`` [10000, 1, 256], zeros at the start of a
-        scene; all float32.
+        ``img`` is [1, 6, 3, 384, 640], normalised; ``prev_bev`` [10000, 1, 256] is zero
+        at the start of a scene; all inputs are float32.
         """
         with region("backbone"):
             features = self.img_backbone(img.flatten(0, 1))

@@ -91,7 +91,6 @@ class Plugin:
     """The inputs and attributes of a plugin.
 
     Attributes:
-        source: the library that has it.
         inputs: least and most number of inputs.
         attributes: required attributes.
         types: element types of its first input.

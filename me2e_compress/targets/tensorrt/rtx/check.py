@@ -49,10 +49,8 @@ _KINDS = {
 class Kernel:
     """One convolution or matrix product of a built plan.
 
-    Attributes:
-        kind: ``convolution``, ``deconvolution`` or ``product``.
-        nodes: names of the ONNX nodes that it computes, possibly several merged ones.
-        operands: element types of its first two operands, ``?`` if unknown.
+    ``nodes`` are the ONNX nodes that it computes, possibly several merged ones;
+    ``operands`` the element types of its first two operands, ``?`` if unknown.
     """
 
     kind: str
@@ -70,12 +68,10 @@ class BuildResult:
     """The result of TensorRT-RTX for a graph.
 
     Attributes:
-        version: version of TensorRT-RTX.
         cut: nodes that were cut out, because it has no plugin library.
         parsed: whether the parser accepted the graph.
         built: whether the builder did; None if it was not run.
         layers: number of layers of the parsed network.
-        errors: errors of parser and builder.
         kernels: convolutions and products of the built plan.
         missing: convolutions (Conv) that the graph's quantization plan makes int8 and
             that no int8 kernel computes; None if the graph has no plan, or was not

@@ -13,14 +13,9 @@ LACKING = frozenset({"DeformConv", "NonMaxSuppression", "NonZero", "RoiAlign"})
 def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:
     """Cut a graph at plugins: their outputs become inputs, their inputs outputs.
 
-    Nodes with a local function are not plugins: the parser reads the function. Shapes
-    must be inferred.
-
-    Returns:
-        The copy, and the names of the nodes that were cut out.
-
-    Raises:
-        PreconditionError: type or shape of a plugin's output is unknown.
+    Nodes with a local function are not plugins: the parser reads the function. Types
+    and shapes must be known. Returns the copy, and the names of the nodes that were cut
+    out.
     """
     copy = model.clone()
     copy.metadata_props.clear()  # it speaks of inputs and outputs that change
