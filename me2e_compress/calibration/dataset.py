@@ -52,6 +52,7 @@ class CalibrationSet(Displayed):
             raise FramesError(f"{folder}: holds no .npz frames")
         if odd := [each for each in self.files if not each.is_file()]:
             raise FramesError(f"{odd[0]}: not a regular file")
+        # The index tells where scenes begin, and what is pixels.
         index = _index(folder / "scenes.json")
         self.scenes = _scenes(folder / "scenes.json", index, len(self.files))
         self.pixels = _pixels(folder / "scenes.json", index).inputs
@@ -112,6 +113,7 @@ class CalibrationSet(Displayed):
         seal.update(repr(self.scenes).encode())
         if self.pixels:
             seal.update(repr(sorted(self.pixels.items())).encode())
+        # The directory of each archive has its checksums.
         for path in self.files:
             try:
                 with zipfile.ZipFile(path) as archive:
@@ -138,6 +140,7 @@ class CalibrationSet(Displayed):
         """
         fixed = static_inputs(model)
         for path in self.files:
+            # Compare headers before any array is read.
             held = self._as_fed(path, declared(path), PixelInput.fed)
             asked = {name: held[name] for name in held if name not in fixed}
             _check_frame(asked, model, str(path))
@@ -150,6 +153,7 @@ class CalibrationSet(Displayed):
 def _check_frame(frame: Mapping[str, Declared], model: ir.Model, source: str) -> None:
     """Check names, dtypes and shapes before arrays are read."""
     ports = {str(value.name): value for value in model.graph.inputs}
+    # Recurrent inputs may come from the model itself.
     optional = recurrent_inputs(model)
     for name, value in ports.items():
         array = frame.get(name)
@@ -213,6 +217,7 @@ def synthetic(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
             raise PreconditionError(
                 f"input {value.name} is {value.dtype.name}: seeded inputs are numbers"
             )
+    # Frames are drawn lazily, all from one generator.
     generator = np.random.default_rng(seed)
     return (
         Frame(index, index == 0, {str(v.name): _draw(v, generator) for v in ports})

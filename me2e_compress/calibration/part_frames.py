@@ -36,6 +36,7 @@ class PartFrames:
         scenes = frozenset(whole.scenes)
         first = stack.at_first.graphs[self._file.part].label
         other = stack.at_next.graphs.get(self._file.part)
+        # The frames at which this file runs.
         self._rows = [
             at
             for at in range(len(whole))
@@ -83,6 +84,7 @@ class PartFrames:
         """Compute one frame; continuing from the previous one is cheapest."""
         row = self._rows[index]
         opens = max(at for at in self._openings if at <= row)
+        # Continue from the last frame, or from the scene's start.
         begin = self._next if opens < self._next <= row else opens
         for at in range(begin, row):
             self._step(at)
@@ -96,6 +98,7 @@ class PartFrames:
             self._state = self._session.first_state(frame.arrays)
         answers = dict[tuple[str, str], Array]()
         feeds = {**frame.arrays, **self._state}
+        # Run only the files that feed this one.
         parts = {*self._needed, self._file.part}
         for run in self._session.runs(feeds, first=frame.starts_scene, parts=parts):
             if run.label == self._file.label:

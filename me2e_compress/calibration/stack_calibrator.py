@@ -87,6 +87,7 @@ class _Job:
         for label, each in rows.items():
             if not each:
                 raise FramesError(f"{label}: runs at none of {len(self.frames)} frames")
+        # Each file has statistics of the frames at which it ran.
         return {
             label: Statistics(
                 graph.digest(model),
@@ -124,6 +125,7 @@ class _Job:
         """Run the stack over all frames, with probes in every file."""
         sessions = {label: self._session(label, probes[label]) for label in self.models}
         session = _ProbedStack(self.stack, sessions, self.settings.provider)
+        # Replaying the stack runs the probes of all its files.
         for at, _ in enumerate(replay(session, self.frames, ())):
             for label, readings in session.taken.items():
                 take(at, label, readings.reshape(-1, probes[label].width))

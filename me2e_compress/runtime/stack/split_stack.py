@@ -62,6 +62,7 @@ class SplitStack:
                 for entry in content.part
                 for label, file in entry.files()
             }
+            # Join the files; messages begin with the TOML file.
             joined = join(content, tuple(files.values()), path.parent)
         except GraphError as error:
             raise GraphError(f"{path}: {error}") from error

@@ -108,6 +108,7 @@ class StackSession:
         wanted = self.outputs if outputs is None else outputs
         runs = {each.label: each.values for each in self.runs(feeds, first=first)}
         graphs = self._joints(first=first).graphs
+        # Look up each output by the part that computes it.
         found = dict[str, Array]()
         for name in wanted:
             part, output = self.stack.answers[name]
@@ -168,6 +169,7 @@ def open_session(
 
     The options are those of :class:`Session`.
     """
+    # The suffix tells a stack from a single graph.
     if is_stack(path):
         return StackSession.open(
             SplitStack.load(path).saying(said or {}),
