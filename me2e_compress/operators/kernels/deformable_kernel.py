@@ -1,8 +1,7 @@
 """The kernel of multi-scale deformable attention, vectorized per block of queries.
 
 For all points of one query the positions and weights of the four corners are computed
-first; then the rows are summed (:mod:`weighted_rows`). One kernel serves any number
-of levels, points, heads and channels.
+first; then the rows are summed (:mod:`weighted_rows`). All sizes are read at run time.
 """
 
 from collections.abc import Callable, Mapping
