@@ -20,7 +20,7 @@ from me2e_compress import documents
 from me2e_compress.calibration.archives import Declared, declared, load_arrays
 from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.calibration.static_inputs import check_static, static_inputs
-from me2e_compress.display import Displayed, Table, reason, table
+from me2e_compress.display import Displayed, Table, counted, reason, table
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.runtime.frames import Array, Frame
@@ -60,7 +60,8 @@ class CalibrationSet(Displayed):
     @property
     def headline(self) -> str:
         """The folder and the numbers of frames and scenes."""
-        return f"{self.folder}: {len(self)} frames in {len(self.scenes)} scenes"
+        frames, scenes = counted(len(self), "frame"), counted(len(self.scenes), "scene")
+        return f"{self.folder}: {frames} in {scenes}"
 
     def tables(self) -> tuple[Table, ...]:
         """Return a table with the type and shape of each input in the first frame."""
