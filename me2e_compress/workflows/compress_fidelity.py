@@ -1,7 +1,7 @@
 """Measure what lossy passes did to a model, on frames kept out of calibration."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +17,7 @@ from me2e_compress.fidelity.compare import Fidelity, Reference
 from me2e_compress.fidelity.floor import Floor, Shortfall, unsteady_outputs
 from me2e_compress.manager import Report
 from me2e_compress.manager.report import LossyPass
-from me2e_compress.passes import Context
+from me2e_compress.passes import Context, Pass
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.quantization.plan.overrides import Override, overrides_text
 from me2e_compress.runtime.frames import Frames
@@ -47,22 +47,33 @@ class SplitFrames:
     samples: CalibrationSet | None = None
 
     @classmethod
-    def of(
+    def read(
         cls,
-        recording: CalibrationSet | None,
-        samples: CalibrationSet | None,
+        folder: str | Path | None,
+        model: ir.Model,
+        passes: Iterable[Pass],
         most: int,
-        *,
-        saved: bool,
+        shipped: Path | None = None,
     ) -> "SplitFrames":
-        """Keep up to `most` frames out of calibration, unless ranges are `saved`."""
-        if not most:
+        """Read and check frames; for lossy passes up to `most` are kept to measure on.
+
+        Nothing is kept out of calibration where ranges are saved. Without a `folder`
+        the `shipped` frames are used, if there are any.
+        """
+        recording = samples = None
+        if folder is not None:
+            recording = CalibrationSet(Path(folder))
+            recording.check(model)
+        elif shipped is not None:
+            samples = CalibrationSet(shipped)
+        pipeline = tuple(passes)
+        if not most or all(each.exact for each in pipeline):
             return cls(recording, None, NOT_ASKED, samples)
         if recording is None:
             reason = "no recorded frames" if samples is None else SHIPPED_FRAMES
             return cls(None, samples, reason, samples)
         calibration, measured = hold_out(recording, most)
-        if saved:
+        if any(each.reads_ranges and not each.needs_frames for each in pipeline):
             return cls(recording, measured, PERHAPS_SHARED)
         return cls(calibration, measured, SHARED if len(recording) == 1 else KEPT_OUT)
 

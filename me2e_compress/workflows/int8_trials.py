@@ -26,7 +26,7 @@ from me2e_compress.workflows.checks import (
     output_path,
 )
 from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.first_try import try_first
+from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 

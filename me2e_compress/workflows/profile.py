@@ -35,7 +35,7 @@ from me2e_compress.workflows.checks import (
 )
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.deadlines_table import check_budget
-from me2e_compress.workflows.first_try import load_interface, try_model
+from me2e_compress.workflows.first_opening import load_interface, try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.profile_result import ProfileResult
 

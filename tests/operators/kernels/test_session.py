@@ -20,12 +20,12 @@ from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.operators.kernels import availability, custom_ops, store, trampoline
 from me2e_compress.operators.kernels.kernel import CompiledKernel
 from me2e_compress.operators.kernels.machine_code import load_or_compile
-from me2e_compress.runtime.first_opening import try_apart
 from me2e_compress.runtime.fused_nodes import compiled_or_expanded
 from me2e_compress.runtime.opening import open_graph
 from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.doctor import doctor
+from me2e_compress.workflows.first_opening import try_apart
 from tests.operators.running import graph_of
 from tests.operators.test_deformable_attention import CALL, arrays_of
 
