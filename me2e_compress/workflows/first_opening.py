@@ -27,9 +27,8 @@ from me2e_compress.operators.kernels import why_not
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array, Frames
-from me2e_compress.runtime.fused_nodes import compiled_or_expanded
-from me2e_compress.runtime.opening import unsupported
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.runnable import compiled_or_expanded, unsupported
 from me2e_compress.runtime.stack.split_stack import SplitStack, is_stack
 from me2e_compress.workflows.listener import Listener
 

@@ -26,9 +26,9 @@ from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack.split_stack import is_stack
-from me2e_compress.workflows.adapted import adapted
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
+    adapted,
     check_count,
     load_map,
     model_path,
