@@ -45,10 +45,10 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.quantization.rules.safe_rules import SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.runtime.constants import evaluate_constants
 from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.tensorrt import TensorRT
+from me2e_compress.targets.weights import evaluate_constants
 
 NODES = 8000
 """As an exporter counts; more than 5,000 once constants are no nodes."""

@@ -10,7 +10,7 @@ import pytest
 
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes.base import Context
-from me2e_compress.runtime import first_opening
+from me2e_compress.workflows import first_opening
 from tests import profiles
 from tests.zoo import truth
 

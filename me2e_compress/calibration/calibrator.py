@@ -22,8 +22,8 @@ from me2e_compress.calibration.stream import (
 )
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.opening import unsupported
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.runnable import unsupported
 
 Progress: TypeAlias = Callable[[int, int], None]
 

@@ -4,7 +4,8 @@ import dataclasses
 import json
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
@@ -20,9 +21,8 @@ from rich.progress import (
 from rich.table import Table as Shown
 from rich.text import Text
 
-from me2e_compress.cli.progress_lines import ProgressLines
 from me2e_compress.cli.verbosity import is_quiet, is_verbose
-from me2e_compress.display import printable
+from me2e_compress.display import duration, printable
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Cell, Result, Table
 
@@ -223,3 +223,47 @@ def _plain(value: object) -> object:
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value
+
+
+EVERY_S = 10.0
+"""Seconds between two lines."""
+
+
+class ProgressLines:
+    """Writes the progress of a long run, seldom enough for a log.
+
+    A run of less than `EVERY_S` writes nothing, unless every new stage is written too.
+    """
+
+    def __init__(
+        self,
+        write: Callable[[str], None],
+        *,
+        stages: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._write, self._stages, self._clock = write, stages, clock
+        self._stage = ""
+        self._begun = self._said = clock()
+
+    def on_progress(self, stage: str, done: int, total: int, what: str) -> None:
+        """Write a line if it is time for one; to be called by a listener."""
+        now = self._clock()
+        if stage != self._stage:
+            self._stage, self._begun = stage, now
+            if self._stages:
+                self._write(stage)
+                self._said = now
+        if now - self._said < EVERY_S:
+            return
+        self._said = now
+        left = _left(now - self._begun, done, total)
+        said = f"{stage}: {done}/{total} {what}".rstrip()
+        self._write(", ".join(filter(None, [said, left])))
+
+
+def _left(seconds: float, done: int, total: int) -> str:
+    """Return how long the rest takes at the pace so far; empty if not known."""
+    if not 0 < done < total:
+        return ""
+    return f"{duration(seconds / done * (total - done))} left"

@@ -13,11 +13,6 @@ from me2e_compress.graph.files import (
     save,
     sha256_of,
 )
-from me2e_compress.graph.macs import (
-    macs,
-    macs_counter,
-    total_macs,
-)
 from me2e_compress.graph.nodes import (
     array_of,
     graphs_of,
@@ -43,8 +38,11 @@ from me2e_compress.graph.summary import (
     Port,
     Size,
     interface,
+    macs,
+    macs_counter,
     node_count,
     size,
+    total_macs,
 )
 
 __all__ = [

@@ -15,10 +15,14 @@ from me2e_compress import drafts
 from me2e_compress.display import reason
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import structure
-from me2e_compress.graph.external import data_file, external_tensors, settle
-from me2e_compress.graph.inline_file import write_inline
 from me2e_compress.graph.opset import lower
 from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR
+from me2e_compress.graph.weight_files import (
+    data_file,
+    external_tensors,
+    settle,
+    write_inline,
+)
 
 INLINE_LIMIT_BYTES = 1_900_000_000
 """Weights beyond this go to a data file: protobuf cannot hold 2 GiB in one message."""

@@ -12,8 +12,12 @@ from collections.abc import Collection, Iterable, Sequence
 import onnx
 
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.declared import check_port, check_tensor, check_text
-from me2e_compress.graph.signatures import check_signature
+from me2e_compress.graph.declared import (
+    check_port,
+    check_signature,
+    check_tensor,
+    check_text,
+)
 
 LARGEST_VERSION = 2**31 - 1
 DEEPEST = 32

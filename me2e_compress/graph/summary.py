@@ -1,12 +1,217 @@
-"""What a graph takes, gives and weighs: ports, nodes, bytes."""
+"""What a graph takes, gives, weighs and costs: ports, nodes, bytes, MACs."""
 
 import dataclasses
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable
 
 import onnx_ir as ir
 
-from me2e_compress.graph.macs import macs_counter, total_macs
-from me2e_compress.graph.nodes import nodes_in
+from me2e_compress.graph.nodes import graphs_of, input_at, is_plugin, nodes_in
+from me2e_compress.graph.plugins import knowledge
+from me2e_compress.graph.shapes import static_shape
+
+Counter = Callable[[ir.Node], int | None]
+
+_UNCOUNTED = frozenset(
+    {
+        "AffineGrid", "CausalConvWithState", "DFT", "Det",
+        "LinearAttention", "STFT", "SequenceMap",
+    }
+)  # fmt: skip
+"""Operators of ONNX that multiply matrices, and that no rule here counts."""
+
+_LOOPS = ("Loop", "Scan")
+
+
+def macs(node: ir.Node) -> int | None:
+    """Return a node's MACs: 0 for operators that multiply no matrices.
+
+    Conv, DeformConv and ConvTranspose: output (input) elements x kernel volume x
+    channels per group. Gemm and MatMul: rows x columns x inner dimension x batch.
+    Einsum of two operands: the product of all its dimensions. LSTM, GRU and RNN: steps
+    x batch x elements of both weights, which hold all gates and directions. Attention:
+    queries x keys x what is multiplied for each pair. Integer forms likewise. Plugins
+    of known dialects: what their operator counts.
+
+    Returns:
+        The count; None where it is not known: of an unknown plugin, a local function,
+        an operator that no rule counts, a loop around one that multiplies, or a shape
+        that is open.
+    """
+    if is_plugin(node):
+        return knowledge().macs(node)
+    if node.op_type in _LOOPS:  # nobody knows how often it runs
+        inside = (inner for inner in _inside(node) if inner.op_type not in _LOOPS)
+        return 0 if all(macs(inner) == 0 for inner in inside) else None
+    if node.op_type in _UNCOUNTED:
+        return None
+    rule = _RULES.get(node.op_type)
+    return 0 if rule is None else rule(node)
+
+
+def why_uncounted(node: ir.Node) -> str:
+    """Name a node's operator, and why nobody knows its MACs."""
+    if is_plugin(node):
+        known = knowledge().knows(node)
+        return f"{node.op_type} ({'open shape' if known else 'plugin or function'})"
+    if node.op_type in _LOOPS:
+        return f"{node.op_type} (a loop)"
+    if node.op_type in _UNCOUNTED or _has_shapes(node):
+        return f"{node.op_type} (no rule)"
+    return f"{node.op_type} (open shape)"
+
+
+def _has_shapes(node: ir.Node) -> bool:
+    values = (*node.inputs, *node.outputs)
+    return all(static_shape(v) is not None for v in values if v is not None and v.name)
+
+
+def macs_counter(model: ir.Model) -> Counter:
+    """Return :func:`macs` for the nodes of a model: calls of its functions count too.
+
+    A call is worth what the nodes of its body are; shapes inside are seldom known, so
+    that a function that multiplies matrices is mostly None.
+    """
+    bodies: dict[ir.OperatorIdentifier, int | None] = {}
+
+    def count(node: ir.Node) -> int | None:
+        key = node.op_identifier()
+        function = model.functions.get(key)
+        if function is None:
+            return macs(node)
+        if key not in bodies:
+            found, unknown = total_macs(count(inner) for inner in function.all_nodes())
+            bodies[key] = found if not unknown else None
+        return bodies[key]
+
+    return count
+
+
+def total_macs(counts: Iterable[int | None]) -> tuple[int | None, int]:
+    """Add up the MACs of nodes.
+
+    Returns:
+        The sum of those that are known, and how many are not: the sum is a lower bound
+        then. None instead of a sum of 0 where some are unknown: not measured is never
+        zero.
+    """
+    total, unknown = 0, 0
+    for count in counts:
+        if count is None:
+            unknown += 1
+        else:
+            total += count
+    return (total if total or not unknown else None), unknown
+
+
+def _inside(node: ir.Node) -> Iterable[ir.Node]:
+    """Walk the nodes of a node's bodies, and of the bodies in them."""
+    for attribute in node.attributes.values():
+        if attribute.type == ir.AttributeType.GRAPH:
+            for body in graphs_of(attribute.as_graph()):
+                yield from body
+
+
+def _conv(weight: int) -> Counter:
+    def count(node: ir.Node) -> int | None:
+        kernel = static_shape(input_at(node, weight))
+        out = static_shape(node.outputs[0])
+        return None if kernel is None or out is None else math.prod(out + kernel[1:])
+
+    return count
+
+
+def _conv_transpose(node: ir.Node) -> int | None:
+    kernel, source = static_shape(node.inputs[1]), static_shape(node.inputs[0])
+    if kernel is None or source is None:
+        return None
+    return math.prod(source + kernel[1:])
+
+
+def _matmul(node: ir.Node) -> int | None:
+    left, out = static_shape(node.inputs[0]), static_shape(node.outputs[0])
+    if left is None or out is None:
+        return None
+    return math.prod(out) * (left[-1] if left else 1)
+
+
+def _gemm(node: ir.Node) -> int | None:
+    left, out = static_shape(node.inputs[0]), static_shape(node.outputs[0])
+    if left is None or out is None:
+        return None
+    transposed = node.attributes.get_int("transA", 0)
+    return math.prod(out) * left[0 if transposed else 1]
+
+
+def _einsum(node: ir.Node) -> int | None:
+    """Count the products of two operands; a sum or transpose of one has none."""
+    if len(node.inputs) == 1:
+        return 0
+    equation = node.attributes.get_string("equation", "").replace(" ", "")
+    terms = equation.partition("->")[0].split(",")
+    if len(terms) != 2 or len(node.inputs) != 2:
+        return None
+    sizes: dict[str, int] = {}
+    for term, value in zip(terms, node.inputs, strict=True):
+        shape = static_shape(value)
+        letters = None if shape is None else _letters(term, len(shape))
+        if shape is None or letters is None:
+            return None
+        for letter, size in zip(letters, shape, strict=True):
+            sizes[letter] = max(size, sizes.get(letter, 1))
+    return math.prod(sizes.values())
+
+
+def _letters(term: str, rank: int) -> list[str] | None:
+    """Name every dimension of an Einsum's operand, those of an ellipsis by number."""
+    before, dots, after = term.partition("...")
+    more = rank - len(before) - len(after)
+    if more < 0 or (more and not dots):
+        return None
+    return [*before, *(str(more - at) for at in range(more)), *after]
+
+
+def _recurrent(node: ir.Node) -> int | None:
+    source, *weights = (static_shape(input_at(node, at)) for at in range(3))
+    if source is None or len(source) != 3 or None in weights:
+        return None
+    elements = sum(math.prod(shape or ()) for shape in weights)
+    return source[0] * source[1] * elements  # steps and batch, in either order
+
+
+def _attention(node: ir.Node) -> int | None:
+    """Count both products; the heads are an axis, or within the last one."""
+    read = [input_at(node, at) for at in (0, 1, 2, 4)]
+    known = [shape for value in read if (shape := static_shape(value))]
+    if len(known) != sum(value is not None for value in read):
+        return None
+    query, key, value, *past = known
+    if len(query) == 4:
+        width, out = query[1] * query[3], query[1] * value[3]
+    else:
+        groups = node.attributes.get_int("kv_num_heads", 1)
+        width, out = query[2], node.attributes.get_int("q_num_heads", 1) * value[2]
+        out //= groups
+    keys = key[-2] + sum(shape[2] for shape in past)
+    return query[0] * query[-2] * keys * (width + out)
+
+
+_RULES: dict[str, Counter] = {
+    "Attention": _attention,
+    "Conv": _conv(1),
+    "ConvInteger": _conv(1),
+    "ConvTranspose": _conv_transpose,
+    "DeformConv": _conv(1),
+    "Einsum": _einsum,
+    "GRU": _recurrent,
+    "Gemm": _gemm,
+    "LSTM": _recurrent,
+    "MatMul": _matmul,
+    "MatMulInteger": _matmul,
+    "QLinearConv": _conv(3),
+    "QLinearMatMul": _matmul,
+    "RNN": _recurrent,
+}
 
 
 @dataclasses.dataclass(frozen=True)

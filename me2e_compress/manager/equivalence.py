@@ -1,14 +1,17 @@
-"""Do two graphs give the same outputs?"""
+"""Do two graphs give the same outputs?
+
+On outputs that a graph draws anew at every run nothing can be compared.
+"""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
+from me2e_compress.graph.nodes import bodies_of, nodes_in
 from me2e_compress.manager import runtime_levels
 from me2e_compress.manager.output_errors import errors, tolerances
-from me2e_compress.manager.random_outputs import random_outputs
 from me2e_compress.manager.report import Verification
 from me2e_compress.manager.verification_inputs import Outputs, VerificationInputs
 from me2e_compress.runtime.session import Session, replay
@@ -104,3 +107,41 @@ def skipped(passes: tuple[str, ...], why: str) -> Verification:
 def passed(result: Verification) -> bool:
     """Say whether every output that is judged stayed within its tolerance."""
     return all(result.errors[n] <= result.tolerances[n] for n in result.judged)
+
+
+DRAWS = frozenset(
+    {
+        *("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike"),
+        *("RandomUniform", "RandomUniformLike"),
+    }
+)
+"""ONNX's operators that draw; those that name a seed draw the same in every session."""
+
+
+def random_outputs(model: ir.Model) -> tuple[str, ...]:
+    """Name the outputs of a graph that depend on what it draws without a seed."""
+    drawn = set[ir.Value]()
+    for node in model.graph:
+        if _draws(node, model) or not drawn.isdisjoint(_read_by(node)):
+            drawn.update(node.outputs)
+    return tuple(str(each.name) for each in model.graph.outputs if each in drawn)
+
+
+def _draws(node: ir.Node, model: ir.Model) -> bool:
+    """Return whether a node draws, or one in its bodies or its function does."""
+    if node.op_type in DRAWS and node.domain == "":
+        return "seed" not in node.attributes
+    function = model.functions.get(node.op_identifier())
+    bodies = bodies_of(node) if function is None else (function,)
+    return any(_draws(each, model) for body in bodies for each in body)
+
+
+def _read_by(node: ir.Node) -> Iterator[ir.Value]:
+    """Yield what a node reads, in its bodies too."""
+    for each in (node, *_inside(node)):
+        yield from (value for value in each.inputs if value is not None)
+
+
+def _inside(node: ir.Node) -> Iterator[ir.Node]:
+    for body in bodies_of(node):
+        yield from nodes_in(body)

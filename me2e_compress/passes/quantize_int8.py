@@ -6,9 +6,11 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
+from me2e_compress import rewrite
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.quantization.plan import (
     INT8,
@@ -23,8 +25,9 @@ from me2e_compress.quantization.plan import (
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
+from me2e_compress.targets.onnxruntime.writer import BY, Writer
 from me2e_compress.targets.quantized import describe_quantized
-from me2e_compress.targets.weight_only import store_weights
+from me2e_compress.targets.weights import QuantizedWeight, weights_of
 
 _SHOWN = 5
 """Number of items of a kind that a note lists."""
@@ -249,3 +252,39 @@ def _first(found: list[str], what: str) -> tuple[str, ...]:
     more = len(found) - _SHOWN
     listed = "; ".join(found[:_SHOWN])
     return (f"{what}: {listed}" + (f"; and {more} more" if more > 0 else ""),)
+
+
+def store_weights(model: ir.Model, plan: QuantPlan) -> None:
+    """Replace weights by int8 and a DequantizeLinear where layers stay float.
+
+    Given:   y = Gemm<transB = 1>(x, w, b)                      w [N, K]
+    Result:  y = Gemm(x, DequantizeLinear<axis = 1>(w_int8), b)    w_int8 [K, N]
+
+    The weight is stored as [K, N] with one scale a column: so onnxruntime (1.31) reads
+    the integers directly, in one kernel (MatMulNBits); it would dequantize a transposed
+    weight again for every frame. The graph, in which the plan's other nodes are placed,
+    is changed in place.
+
+    Raises:
+        PreconditionError: the graph is older than opset 13.
+    """
+    chosen = plan.weight_only
+    if not chosen:
+        return
+    weights = weights_of(model, chosen)
+    nodes = {str(node.outputs[0].name): node for node in model.graph}
+    writer = Writer(model.graph)
+    for decision in chosen:
+        _store(writer, nodes[decision.output], weights[decision.output])
+    rewrite.sweep(model)
+
+
+def _store(writer: Writer, node: ir.Node, weight: QuantizedWeight) -> None:
+    integers = weight.integers
+    transposed = node.attributes.get_int("transB", 0) == 1
+    if node.op_type == "Gemm" and transposed:
+        integers = integers.T.copy()
+        node.attributes["transB"] = ir.AttrInt64("transB", 0)
+        provenance.inherit(node, [node], by=BY)
+    fresh = writer.dequantized(weight.name, integers, weight.scales, 1, node)
+    node.replace_input_with(1, fresh)

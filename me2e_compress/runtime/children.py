@@ -1,10 +1,13 @@
 """Child processes that run no code of the current folder and never outlive the parent.
 
-Every process of this package is started here, or within :func:`sheltered`.
+Every process of this package is started here, or within :func:`sheltered`. This file
+is a program too, ``python -P children.py SCRIPT WORDS``, which exits with its parent. It
+imports nothing of the package, so that the script starts at once.
 """
 
 import contextlib
 import os
+import runpy
 import signal
 import subprocess
 import sys
@@ -15,8 +18,8 @@ from multiprocessing import active_children, parent_process, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 
-from me2e_compress.runtime import child_main
-
+PR_SET_PDEATHSIG = 1
+"""Option of prctl(2): the signal to receive when the parent dies."""
 _TRACKER_IS_SILENT = "ignore::UserWarning:multiprocessing.resource_tracker"
 """Silences the warning about locks that the tracker cleans up after a kill."""
 _STARTING = threading.RLock()
@@ -34,7 +37,6 @@ def sheltered() -> Iterator[None]:
         if os.name == "posix":
             with _told("PYTHONWARNINGS", _TRACKER_IS_SILENT):
                 resource_tracker.ensure_running()  # else a lock starts it unsheltered
-        # Children inherit the signal mask of this thread.
         with _deaf_to_interrupts():
             yield
 
@@ -132,8 +134,7 @@ def run_script(
     Raises:
         subprocess.TimeoutExpired: it took longer than ``timeout_s`` and was killed.
     """
-    # With -P the current folder is not searched for modules.
-    command = [sys.executable, "-P", child_main.__file__, str(script), *words]
+    command = [sys.executable, "-P", __file__, str(script), *words]
     ear, mouth = os.pipe()  # nothing is ever said: it ends when this process does
     try:
         return subprocess.run(
@@ -148,3 +149,25 @@ def run_script(
     finally:
         os.close(ear)
         os.close(mouth)
+
+
+def main() -> None:
+    """Watch the parent and run the script."""
+    if sys.platform == "linux":  # native code that holds Python's lock ends, too
+        import ctypes
+
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    threading.Thread(target=_wait_for_parent, daemon=True).start()
+    del sys.argv[0]
+    runpy.run_path(sys.argv[0], run_name="__main__")
+
+
+def _wait_for_parent() -> None:
+    """Exit when standard input closes; the parent holds it open."""
+    while os.read(0, 1):
+        pass
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -23,9 +23,8 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.files import INLINE_LIMIT_BYTES
 from me2e_compress.graph.nodes import is_read
-from me2e_compress.runtime.endless import endless
-from me2e_compress.runtime.fused_nodes import is_fused, runnable, unknown_nodes
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.runnable import runnable, unsupported
 
 # The compiled module has no stubs.
 
@@ -47,29 +46,6 @@ REFUSALS: tuple[type[Exception], ...] = (
     RuntimeError,  # an output of a type that numpy lacks, such as bfloat16
 )
 """Everything raised where a graph cannot be read, built or run."""
-
-
-def unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:
-    """Return why a graph cannot be run; None if every operator is known.
-
-    Endless loops are refused, because no signal can stop them. Fused operators are
-    supported: a kernel or a body runs them. The operators of a provider's libraries are
-    unknown before a session is built. A known operator may still lack a kernel for its
-    element type; only building a :class:`~me2e_compress.runtime.session.Session` shows
-    it.
-    """
-    if reason := endless(model):
-        return reason
-    unknown = {
-        f"{node.domain or 'ai.onnx'}::{node.op_type}": node
-        for node in unknown_nodes(model)
-        if not is_fused(node)
-    }
-    if not unknown or provider.plugins:
-        return None
-    node = next(iter(unknown.values()))
-    name = node.name or node.outputs[0].name
-    return f"onnxruntime has no operator {', '.join(unknown)} (node {name!r})"
 
 
 _INT8_STAYS = "session.qdqisint8allowed"

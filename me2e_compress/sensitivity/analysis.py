@@ -1,10 +1,13 @@
 """Measure the loss of int8 module by module, and find the nodes to blame."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Generic, TypeVar
 
 from me2e_compress.quantization.plan import RESIDUAL
 from me2e_compress.sensitivity.trials import Int8Choice, Score, Trials
+
+Item = TypeVar("Item")
 
 BLAME = 0.5
 """Nodes are to blame if they alone cost this part of what their module costs."""
@@ -68,7 +71,7 @@ def analyse(
         score = trials.score(Int8Choice((module,)))
         blamed: tuple[tuple[tuple[str, ...], float], ...] = ()
         if node_trials and score.loss > 0:
-            blamed = _Bisection(trials, module, names, node_trials).run(score.loss)
+            blamed = _blamed(trials, module, names, score.loss, node_trials)
         driving = trials.driving(Int8Choice((module,)))
         findings.append(ModuleSensitivity(module, len(names), score, driving, blamed))
     findings.sort(key=lambda each: -each.score.loss)
@@ -93,39 +96,66 @@ def names_of(trials: Trials, module: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(each.node for each in chosen if each.rule != RESIDUAL))
 
 
-class _Bisection:
-    """The search for the costly nodes of one module."""
+def _blamed(
+    trials: Trials, module: str, names: Sequence[str], loss: float, budget: int
+) -> tuple[tuple[tuple[str, ...], float], ...]:
+    """Find the groups of a module's nodes that cost much alone, the worst first."""
+    left = budget
 
-    def __init__(
-        self, trials: Trials, module: str, names: tuple[str, ...], budget: int
-    ) -> None:
-        self._trials = trials
-        self._module = module
-        self._names = names
-        self._left = budget
+    def alone(half: Sequence[str]) -> tuple[Sequence[str], float]:
+        nonlocal left
+        left -= 1
+        floats = tuple(name for name in names if name not in half)
+        return half, trials.score(Int8Choice((module,), floats)).loss
 
-    def run(self, loss: float) -> tuple[tuple[tuple[str, ...], float], ...]:
-        """Split the costly groups, the costliest first."""
-        open_groups = [(self._names, loss)]
-        blamed = []
-        while open_groups:
-            open_groups.sort(key=lambda each: -each[1])
-            group, cost = open_groups.pop(0)
-            if len(group) == 1 or self._left < 2:
-                blamed.append((group, cost))
-                continue
-            # keep the halves that alone make much of the loss
-            middle = len(group) // 2
-            halves = [
-                (half, self._loss(half)) for half in (group[:middle], group[middle:])
-            ]
-            costly = [each for each in halves if each[1] >= BLAME * loss]
-            open_groups += costly
-        # the whole module is no finding
-        found = [each for each in blamed if len(each[0]) < len(self._names)]
-        return tuple(sorted(found, key=lambda each: -each[1]))
+    found = bisect(
+        names, loss, lambda halves, _: [*map(alone, halves)], lambda: left >= 2
+    )
+    kept = [
+        (tuple(each.items), each.loss)
+        for each in found
+        if not each.spread and len(each.items) < len(names)
+    ]
+    return tuple(sorted(kept, key=lambda each: -each[1]))
 
-    def _loss(self, only: tuple[str, ...]) -> float:
-        self._left -= 1
-        floats = tuple(name for name in self._names if name not in only)
-        return self._trials.score(Int8Choice((self._module,), floats)).loss
+
+@dataclasses.dataclass(frozen=True)
+class Group(Generic[Item]):
+    """Things that are costly together, and are not split further.
+
+    ``spread`` says that neither half alone costs much of the whole.
+    """
+
+    items: Sequence[Item]
+    loss: float
+    spread: bool
+
+
+def bisect(
+    items: Sequence[Item],
+    loss: float,
+    measure: Callable[
+        [tuple[Sequence[Item], Sequence[Item]], float],
+        Sequence[tuple[Sequence[Item], float]],
+    ],
+    may_go_on: Callable[[], bool],
+) -> Iterator[Group[Item]]:
+    """Split the costliest group in half, for as long as a half costs much of the whole.
+
+    ``measure`` gets two halves and the loss of both, and returns those that may be
+    split in turn, each with its loss; ``may_go_on`` says whether trials are left.
+    Yields the groups that stay whole.
+    """
+    waiting = [(items, loss)]
+    while waiting:
+        waiting.sort(key=lambda each: -each[1])
+        group, cost = waiting.pop(0)
+        if len(group) < 2 or not may_go_on():
+            yield Group(group, cost, spread=False)
+            continue
+        middle = len(group) // 2
+        halves = measure((group[:middle], group[middle:]), cost)
+        costly = [each for each in halves if each[1] >= BLAME * loss]
+        if not costly:
+            yield Group(group, cost, spread=True)
+        waiting += costly

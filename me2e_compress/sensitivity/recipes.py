@@ -1,12 +1,12 @@
 """Choose what stays float, and write the choice as a recipe."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from me2e_compress import drafts
 from me2e_compress.errors import EvaluationError
-from me2e_compress.quantization.plan.overrides import Override
+from me2e_compress.quantization.plan.overrides import overrides_text, toml_string
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.sensitivity.analysis import Sensitivity
 from me2e_compress.sensitivity.trials import Int8Choice, Trials
@@ -121,11 +121,11 @@ def write_recipe(
             "[[pass]]",
             'name = "quantize-int8"',
             f"modules = {_array(choice.modules)}",
-            f"rules = {_string(rules)}",
-            f"target = {_string(target)}",
+            f"rules = {toml_string(rules)}",
+            f"target = {toml_string(target)}",
         ]
         if choice.floats:
-            options.append(f"overrides = {_string(overrides.name)}")
+            options.append(f"overrides = {toml_string(overrides.name)}")
         lines.append("\n".join(options) + "\n")
     # recipe and overrides together, or neither
     with drafts.all_or_none():
@@ -136,28 +136,11 @@ def write_recipe(
     return overrides
 
 
-def overrides_text(overrides: Iterable[Override]) -> str:
-    """Write overrides as the TOML that ``--overrides`` reads."""
-    entries = []
-    for each in overrides:
-        keys = ("nodes", "module", "op", "reads", "dtype", "reason")
-        given = {key: text for key in keys if (text := getattr(each, key))}
-        lines = (f"{key} = {_string(text)}\n" for key, text in given.items())
-        entries.append("[[override]]\n" + "".join(lines))
-    return "\n".join(entries)
-
-
 def _entry(name: str, dims: Mapping[str, int]) -> str:
-    sizes = ", ".join(f"{_string(dim)} = {size}" for dim, size in dims.items())
+    sizes = ", ".join(f"{toml_string(dim)} = {size}" for dim, size in dims.items())
     given = f"dims = {{{sizes}}}\n" if dims else ""
-    return f"[[pass]]\nname = {_string(name)}\n{given}"
+    return f"[[pass]]\nname = {toml_string(name)}\n{given}"
 
 
 def _array(names: tuple[str, ...]) -> str:
-    return f"[{', '.join(_string(name) for name in names)}]"
-
-
-def _string(text: str) -> str:
-    """Write a TOML basic string."""
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
+    return f"[{', '.join(toml_string(name) for name in names)}]"

@@ -1,17 +1,26 @@
 """Find the nodes or modules that restore quality when kept in float."""
 
 import dataclasses
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from itertools import islice
 from typing import TypeAlias
 
-from me2e_compress.fidelity.compare import Fidelity
+import onnx_ir as ir
+
+from me2e_compress.fidelity.compare import Fidelity, Reference
 from me2e_compress.fidelity.floor import Floor, Shortfall
 from me2e_compress.quantization.plan import FLOAT, RESIDUAL, QuantPlan
-from me2e_compress.quantization.plan.overrides import Override
-from me2e_compress.sensitivity.analysis import BLAME
-from me2e_compress.sensitivity.recipes import overrides_text
-from me2e_compress.sensitivity.trials import keep_float
+from me2e_compress.quantization.plan.overrides import (
+    Override,
+    keep_float,
+    overrides_text,
+)
+from me2e_compress.runtime.session import Session
+from me2e_compress.sensitivity.analysis import bisect
+from me2e_compress.sensitivity.suffix import Suffix
 
 MOST_TRIALS = 12
 """Variants built and run in one search: one node among a thousand, confirmed."""
@@ -84,6 +93,23 @@ def int8_nodes(plan: QuantPlan) -> tuple[Int8Node, ...]:
 
 
 def find_remedy(
+    plan: QuantPlan,
+    made: ir.Model,
+    trials: "RemedyTrials",
+    floor: Floor,
+    *,
+    unsteady: Collection[str] = (),
+    progress: Callable[[int, int, str], None] = lambda done, most, what: None,
+) -> Remedy:
+    """Search what must be float in a graph that was made by a plan, on few frames."""
+    start = trials.begin(made, floor, unsteady)
+    nodes, measure = int8_nodes(plan), trials.measure
+    return search_remedy(
+        nodes, start, measure, floor, unsteady=unsteady, progress=progress
+    )
+
+
+def search_remedy(
     nodes: Sequence[Int8Node],
     start: Fidelity,
     measure: Measure,
@@ -136,7 +162,7 @@ class _Search:
         found = start
         while below := self._floor.shortfalls(found, self._unsteady):
             # A step of the bisection, and the trial that confirms it.
-            if self._done + 2 > self._most or not self._keep(below[0]):
+            if not self._has_left(2) or not self._keep(below[0]):
                 break
             found = self._measure(self._floats(), ())
         nodes = [each for each in self._alone if each.module not in self._modules]
@@ -145,12 +171,10 @@ class _Search:
     def _keep(self, worst: Shortfall) -> bool:
         """Keep more nodes float; False if nothing is left that would help."""
         left = [each for each in self._nodes if each not in self._floats()]
-        # one node that is to blame
-        group = self._bisect(left, worst)
+        group = self._narrow(left, worst)
         if len(group) == 1:
             self._alone += group
             return True
-        # else the module with most of the costly nodes
         modules = Counter(each.module for each in group if each.module)
         inside = {each.module for each in left}
         if not modules or len(inside) == 1:
@@ -158,21 +182,26 @@ class _Search:
         self._modules.append(modules.most_common(1)[0][0])
         return True
 
-    def _bisect(
+    def _narrow(
         self, group: Sequence[Int8Node], worst: Shortfall
     ) -> Sequence[Int8Node]:
         """Narrow a group down for as long as one half makes most of the noise."""
-        whole = noise = worst.excess
-        while len(group) > 1 and self._done + 1 < self._most:
-            middle = len(group) // 2
-            first, second = group[:middle], group[middle:]
+
+        def louder(
+            halves: tuple[Sequence[Int8Node], Sequence[Int8Node]], noise: float
+        ) -> list[tuple[Sequence[Int8Node], float]]:
+            first, second = halves
             floats = [each for each in self._nodes if each not in first]
-            one = self._floor.excess(self._measure(floats, group), worst.output)
+            found = self._measure(floats, [*first, *second])
+            one = self._floor.excess(found, worst.output)
             other = max(noise**2 - one**2, 0.0) ** 0.5
-            if max(one, other) < BLAME * whole:
-                break
-            group, noise = (first, one) if one >= other else (second, other)
-        return group
+            return [(first, one) if one >= other else (second, other)]
+
+        may_go_on = partial(self._has_left, 2)
+        return next(bisect(group, worst.excess, louder, may_go_on)).items
+
+    def _has_left(self, trials: int) -> bool:
+        return self._done + trials <= self._most
 
     def _floats(self) -> list[Int8Node]:
         return [
@@ -187,3 +216,77 @@ class _Search:
         self._progress(self._done, self._most, "")
         self._done += 1
         return self._run(floats, group)
+
+
+Build: TypeAlias = Callable[[Sequence[Override]], ir.Model]
+"""Builds the int8 graph again, with overrides behind those that it was built with."""
+
+
+class RemedyTrials:
+    """Variants of one quantization, compared with the float graph.
+
+    While a group is narrowed down, everything before it is float and answers as it did:
+    where that saves more MACs than it costs, only what is behind the group is run
+    again. ``before`` is the float graph whose answers ``reference`` holds.
+    """
+
+    def __init__(self, before: ir.Model, build: Build, reference: Reference) -> None:
+        self._before = before
+        self._build = build
+        self._reference = reference
+        self._suffix: tuple[Suffix, Reference] | None = None
+        self._within: frozenset[str] = frozenset()
+
+    def begin(
+        self, made: ir.Model, floor: Floor, unsteady: Collection[str]
+    ) -> Fidelity:
+        """Compare the int8 graph, on its first frame alone if that shows the loss."""
+        whole = self._reference
+        first = tuple(islice(whole.frames, 1))
+        self._reference = Reference(whole.session, first, whole.answers[:1])
+        found = self._compare(made)
+        if not floor.shortfalls(found, unsteady):
+            self._reference = whole
+            found = self._compare(made)
+        return found
+
+    def measure(
+        self, floats: Sequence[Int8Node], group: Sequence[Int8Node] = ()
+    ) -> Fidelity:
+        """Build a variant and compare it.
+
+        ``floats`` become float; ``group`` holds every node that is int8 then, or is
+        empty.
+        """
+        made = self._build([keep_float(each.name, "") for each in floats])
+        # run only what is behind the group, if that can be cut out of the variant
+        found = self._narrowed(group)
+        if found is not None:
+            suffix, reference = found
+            part = suffix.cut(made)
+            if part is not None:
+                return reference.compare(self._session(part))
+        return self._compare(made)
+
+    def _compare(self, model: ir.Model) -> Fidelity:
+        return self._reference.compare(self._session(model))
+
+    def _session(self, model: ir.Model) -> Session:
+        provider = self._reference.session.provider
+        return Session(model, release=True, provider=provider)
+
+    def _narrowed(self, group: Sequence[Int8Node]) -> tuple[Suffix, Reference] | None:
+        """Return what is behind a group, if running only that is worth its capture."""
+        if not group or len(self._reference.answers) > 1:
+            return None  # of several frames the state would be another
+        names = frozenset(each.name for each in group)
+        known = self._suffix if names <= self._within else None
+        whole = 1.0 if known is None else known[0].share
+        found = Suffix.behind(self._before, names)
+        if found is None or not found.outputs:
+            return None
+        # Each trial saves the difference; capturing costs a run of the graph.
+        if math.log2(len(names)) * (whole - found.share) > 1:
+            known = found, found.capture(self._before, self._reference)
+            self._suffix, self._within = known, names
+        return known

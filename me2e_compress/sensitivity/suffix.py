@@ -1,7 +1,7 @@
 """Re-run only the part of a graph that a change can reach."""
 
 import dataclasses
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Self
 
 import numpy as np
@@ -9,7 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph, rewrite
 from me2e_compress.fidelity.compare import Reference
-from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.recurrence import RECURRENT
 from me2e_compress.runtime.session import DTYPES, Session, replay
 from me2e_compress.targets.quantized import PAIR
@@ -32,7 +32,6 @@ class Suffix:
         """Find what the named nodes reach; None in a graph with subgraphs."""
         if any(True for _ in model.graph.subgraphs()):
             return None  # their bodies read values by name
-        # what the nodes reach, and what that reads from before
         count, total, inside = graph.macs_counter(model), 0, 0
         reached, read = set[ir.Value](), dict[str, None]()
         for node in model.graph:
@@ -53,7 +52,6 @@ class Suffix:
 
         Returns the reference's answers, with frames that hold the boundary too.
         """
-        # a copy of the graph that outputs the boundary too
         probe = model.clone()
         values = _values(probe)
         known = {str(each.name) for each in probe.graph.outputs}
@@ -61,14 +59,13 @@ class Suffix:
         probe.graph.outputs.extend(added)
         session = Session(probe, release=True, provider=reference.session.provider)
         found = replay(session, reference.frames, self.boundary)
-        # frames with these values
-        frames = [
+        frames = (
             dataclasses.replace(
                 frame, arrays={**_states(session), **frame.arrays, **entering}
             )
             for frame, entering in zip(reference.frames, found, strict=True)
-        ]
-        return Reference(reference.session, _Kept(tuple(frames)), reference.answers)
+        )
+        return Reference(reference.session, tuple(frames), reference.answers)
 
     def cut(self, variant: ir.Model) -> ir.Model | None:
         """Cut the suffix out of a variant; None if it does not stand alone.
@@ -96,19 +93,6 @@ class Suffix:
         part.metadata_props.clear()
         part.metadata_props[RECURRENT] = "{}"  # states are inputs like others here
         return part
-
-
-@dataclasses.dataclass(frozen=True)
-class _Kept:
-    """Frames in memory."""
-
-    frames: tuple[Frame, ...]
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __iter__(self) -> Iterator[Frame]:
-        return iter(self.frames)
 
 
 def _values(model: ir.Model) -> dict[str, ir.Value]:

@@ -11,17 +11,14 @@ from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.fidelity.compare import Fidelity, Reference
 from me2e_compress.modules import ModuleMap
-from me2e_compress.quantization.plan import FLOAT, Overrides, QuantPlan, make_plan
-from me2e_compress.quantization.plan.overrides import Override
+from me2e_compress.quantization.plan import Overrides, QuantPlan, make_plan
+from me2e_compress.quantization.plan.overrides import keep_float
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import Target
-
-_GLOB = str.maketrans({"[": "[[]", "?": "[?]", "*": "[*]"})
-"""Makes a name a pattern that matches only itself."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,11 +33,6 @@ class Int8Choice:
         return Overrides(
             override=tuple(keep_float(name, "sensitive") for name in self.floats)
         )
-
-
-def keep_float(name: str, reason: str) -> Override:
-    """Return the override that keeps one node in float."""
-    return Override(dtype=FLOAT, nodes=name.translate(_GLOB), reason=reason)
 
 
 Drive: TypeAlias = Callable[[Int8Choice, ir.Model], float]

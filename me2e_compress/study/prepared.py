@@ -20,7 +20,7 @@ from me2e_compress.study.workspace import Workspace
 from me2e_compress.version import __version__
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import beside
-from me2e_compress.workflows.first_try import load_interface, try_file
+from me2e_compress.workflows.first_opening import load_interface, try_file
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.zoo.weights_record import named_weights
 

@@ -1,18 +1,19 @@
 """Quantize the planned weights to int8, one scale per channel."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
+from me2e_compress import rewrite
 from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import opset_of
 from me2e_compress.quantization.plan import Decision
-from me2e_compress.runtime.constants import evaluate_constants
 from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.session import run_once
 
 MIN_OPSET = 13
 """The first opset whose DequantizeLinear has an axis, i.e. one scale a channel."""
@@ -111,3 +112,25 @@ def _quantize(
         array, axis = array.reshape(array.shape[-2:]), 1
     integers, scales = quantize_weight(array.astype(np.float32), axis)
     return QuantizedWeight(name, integers, scales, axis)
+
+
+def evaluate_constants(model: ir.Model, names: Sequence[str]) -> dict[str, Array]:
+    """Compute values that :func:`~me2e_compress.graph.nodes.constant_values` lists.
+
+    Raises:
+        GraphError: onnxruntime cannot compute them.
+        FramesError: one of them depends on an input after all.
+    """
+    if not names:
+        return {}
+    # Cut a copy of the graph down to the wanted values and run it.
+    part = model.clone()
+    part.metadata_props.clear()  # it speaks of inputs and outputs that go
+    made = {str(each.name): each for node in part.graph for each in node.outputs}
+    part.graph.outputs.clear()
+    part.graph.outputs.extend(made[name] for name in names)
+    rewrite.sweep(part)
+    used = [value for value in part.graph.inputs if value.uses()]
+    part.graph.inputs.clear()
+    part.graph.inputs.extend(used)
+    return run_once(part, {})

@@ -34,7 +34,7 @@ from me2e_compress.workflows.checks import (
     read_graph,
 )
 from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.first_try import try_first
+from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 

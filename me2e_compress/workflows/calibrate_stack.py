@@ -17,7 +17,7 @@ from me2e_compress.workflows.calibrate import CalibrateOptions
 from me2e_compress.workflows.calibrate_result import CalibrateResult
 from me2e_compress.workflows.checks import check_folder, model_path, read_graph
 from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.first_try import try_file
+from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 from me2e_compress.workflows.result import Result, Table

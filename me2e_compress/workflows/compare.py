@@ -8,15 +8,13 @@ from me2e_compress.errors import GraphError
 from me2e_compress.fidelity.compare import Fidelity, common_adapter
 from me2e_compress.fidelity.compare import compare as measure
 from me2e_compress.fidelity.matched_sets import SetFidelity
-from me2e_compress.fidelity.open_loop import OpenLoopTally
+from me2e_compress.fidelity.open_loop import OpenLoop, OpenLoopTally
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack.stack_session import open_session
-from me2e_compress.workflows.adapted import adapted
-from me2e_compress.workflows.checks import model_path
-from me2e_compress.workflows.first_try import load_interface, try_model
+from me2e_compress.workflows.checks import adapted, model_path
+from me2e_compress.workflows.first_opening import load_interface, try_model
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.plan_quality import OpenLoop
 from me2e_compress.workflows.result import Result, Table, counted, table
 
 

@@ -10,7 +10,6 @@ from typing import TypeAlias
 import onnx_ir as ir
 
 from me2e_compress import recipe as recipes
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import SQNR_FLOOR_DB, Floor
 from me2e_compress.manager import PassManager, Report
@@ -39,7 +38,7 @@ from me2e_compress.workflows.compress_result import (
     write_result,
     written_files,
 )
-from me2e_compress.workflows.first_try import try_first
+from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.zoo.shipped import sample_frames
@@ -196,7 +195,8 @@ def compress(
     ):
         loaded = read_graph(source, listener, options.adapter)
         modules = load_map(options.module_map, loaded)
-        split = _split(source, loaded, frames, passes, options)
+        most, shipped = options.measure_frames, sample_frames(source)
+        split = SplitFrames.read(frames, loaded, passes, most, shipped)
         files = source, output, output.parent
         return compress_graph(loaded, files, passes, modules, split, options, listener)
 
@@ -236,26 +236,6 @@ def compress_graph(
     loss = measure_loss(report, context, frames_of, Floor(options.floor), listener)
     seconds = process_time() - start
     return write_result(report, source, output, int8, loss, seconds)
-
-
-def _split(
-    source: Path,
-    loaded: ir.Model,
-    folder: str | Path | None,
-    passes: tuple[Pass, ...],
-    options: CompressOptions,
-) -> SplitFrames:
-    """Read and check the frames, and keep some for the measurement."""
-    recording = samples = None
-    if folder is not None:
-        recording = CalibrationSet(Path(folder))
-        recording.check(loaded)
-    elif (shipped := sample_frames(source)) is not None:
-        samples = CalibrationSet(shipped)
-    lossy = not all(each.exact for each in passes)
-    saved = any(each.reads_ranges and not each.needs_frames for each in passes)
-    most = options.measure_frames if lossy else 0
-    return SplitFrames.of(recording, samples, most, saved=saved)
 
 
 def _refuse_unproven(report: Report, options: CompressOptions) -> None:

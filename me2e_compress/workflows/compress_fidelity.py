@@ -1,9 +1,8 @@
 """Measure what lossy passes did to a model, on frames kept out of calibration."""
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
@@ -18,13 +17,13 @@ from me2e_compress.fidelity.compare import Fidelity, Reference
 from me2e_compress.fidelity.floor import Floor, Shortfall, unsteady_outputs
 from me2e_compress.manager import Report
 from me2e_compress.manager.report import LossyPass
-from me2e_compress.passes import Context
-from me2e_compress.quantization.plan import QuantPlan, plan_of
+from me2e_compress.passes import Context, Pass
+from me2e_compress.quantization.plan import plan_of
+from me2e_compress.quantization.plan.overrides import Override, overrides_text
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.session import Session
-from me2e_compress.sensitivity.remedy import Remedy, find_remedy, int8_nodes
+from me2e_compress.sensitivity.remedy import Remedy, RemedyTrials, find_remedy
 from me2e_compress.workflows.listener import Listener
-from me2e_compress.workflows.remedy_trials import RemedyTrials
 
 KEPT_OUT = "kept out of calibration"
 SHARED = "calibrated on as well: there is no other"
@@ -48,22 +47,33 @@ class SplitFrames:
     samples: CalibrationSet | None = None
 
     @classmethod
-    def of(
+    def read(
         cls,
-        recording: CalibrationSet | None,
-        samples: CalibrationSet | None,
+        folder: str | Path | None,
+        model: ir.Model,
+        passes: Iterable[Pass],
         most: int,
-        *,
-        saved: bool,
+        shipped: Path | None = None,
     ) -> "SplitFrames":
-        """Keep up to `most` frames out of calibration, unless ranges are `saved`."""
-        if not most:
+        """Read and check frames; for lossy passes up to `most` are kept to measure on.
+
+        Nothing is kept out of calibration where ranges are saved. Without a `folder`
+        the `shipped` frames are used, if there are any.
+        """
+        recording = samples = None
+        if folder is not None:
+            recording = CalibrationSet(Path(folder))
+            recording.check(model)
+        elif shipped is not None:
+            samples = CalibrationSet(shipped)
+        pipeline = tuple(passes)
+        if not most or all(each.exact for each in pipeline):
             return cls(recording, None, NOT_ASKED, samples)
         if recording is None:
             reason = "no recorded frames" if samples is None else SHIPPED_FRAMES
             return cls(None, samples, reason, samples)
         calibration, measured = hold_out(recording, most)
-        if saved:
+        if any(each.reads_ranges and not each.needs_frames for each in pipeline):
             return cls(recording, measured, PERHAPS_SHARED)
         return cls(calibration, measured, SHARED if len(recording) == 1 else KEPT_OUT)
 
@@ -169,42 +179,33 @@ class _Measurement:
         plan = plan_of(self.report.model)
         if plan is None or "overrides" not in quantizer.applied.option_names():
             return guilty
+        build = partial(self._with_overrides, quantizer)
+        trials = RemedyTrials(quantizer.before, build, reference)
+        progress = partial(self.listener.on_progress, "search")
         try:
-            remedy = self._search(quantizer, plan, reference, found.unsteady)
+            remedy = find_remedy(
+                plan,
+                self.report.model,
+                trials,
+                self.floor,
+                unsteady=found.unsteady,
+                progress=progress,
+            )
         except Me2eError:  # a variant that cannot be made or compared ends the search
             return guilty
         return dataclasses.replace(guilty, remedy=remedy)
 
-    def _search(
-        self,
-        quantizer: LossyPass,
-        plan: QuantPlan,
-        reference: Reference,
-        unsteady: Collection[str],
-    ) -> Remedy:
-        reference, start = self._fewer(reference, unsteady)
+    def _with_overrides(
+        self, quantizer: LossyPass, more: Sequence[Override]
+    ) -> ir.Model:
+        """Run the pass that quantized again; what the user decided still holds."""
+        asked = getattr(quantizer.applied, "overrides", None)
+        text = "" if asked is None else Path(asked).read_text(encoding="utf-8")
         with TemporaryDirectory(prefix="me2e-trial-") as folder:
             path = Path(folder) / "overrides.toml"
-            trial = RemedyTrials(quantizer, self.context, reference, path)
-            return find_remedy(
-                int8_nodes(plan),
-                start,
-                trial.measure,
-                self.floor,
-                unsteady=unsteady,
-                progress=partial(self.listener.on_progress, "search"),
-            )
-
-    def _fewer(
-        self, reference: Reference, unsteady: Collection[str]
-    ) -> tuple[Reference, Fidelity]:
-        """Take the first frame alone if it shows the loss, so that trials cost less."""
-        first = tuple(islice(reference.frames, 1))
-        few = Reference(reference.session, first, reference.answers[:1])
-        found = self._compare(few)
-        if self.floor.shortfalls(found, unsteady):
-            return few, found
-        return reference, self._compare(reference)
+            path.write_text(f"{text}\n{overrides_text(more)}", encoding="utf-8")
+            again = quantizer.applied.with_options({"overrides": path})
+            return again.run(quantizer.before.clone(), self.context).model
 
     def _reference(self, first: LossyPass) -> Reference:
         return Reference.of(self._session(first.before), self.frames)

@@ -10,7 +10,6 @@ from time import process_time
 import numpy as np
 
 from me2e_compress import drafts
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.part_frames import PartFrames
 from me2e_compress.calibration.sample import FrameSubset
 from me2e_compress.calibration.stream import Recording
@@ -115,7 +114,9 @@ def _compress(
     listener: Listener,
 ) -> StackCompressResult:
     start = process_time()
-    split = _split(whole, frames, pipelines, options)
+    passes = [each for every in pipelines.values() for each in every]
+    most = options.measure_frames
+    split = SplitFrames.read(frames, whole.interface(), passes, most)
     modules = map_of_stack(whole, options.module_map)
     # every file is compressed on its own inputs within the running float stack
     found = {
@@ -173,23 +174,6 @@ def _options_of(label: str, options: CompressOptions) -> CompressOptions:
     """Return the options of one file: its own ranges, and leave to stay float."""
     ranges = None if options.ranges is None else Path(options.ranges) / f"{label}.json"
     return dataclasses.replace(options, ranges=ranges, allow_empty=True)
-
-
-def _split(
-    whole: SplitStack,
-    folder: str | Path | None,
-    pipelines: Pipelines,
-    options: CompressOptions,
-) -> SplitFrames:
-    recording = None
-    if folder is not None:
-        recording = CalibrationSet(Path(folder))
-        recording.check(whole.interface())
-    passes = [each for every in pipelines.values() for each in every]
-    lossy = not all(each.exact for each in passes)
-    saved = any(each.reads_ranges and not each.needs_frames for each in passes)
-    most = options.measure_frames if lossy else 0
-    return SplitFrames.of(recording, None, most, saved=saved)
 
 
 def _of_part(

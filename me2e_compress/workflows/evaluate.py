@@ -22,7 +22,7 @@ from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.workflows.checks import check_folder, check_number, model_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.evaluate_result import EvaluateResult
-from me2e_compress.workflows.first_try import try_file
+from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.other_evaluators import (
     HIGHWAY,

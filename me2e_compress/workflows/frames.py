@@ -20,7 +20,7 @@ from me2e_compress.version import __version__
 from me2e_compress.workflows.adapted_log import AdaptedInputs
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
 from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.first_try import try_file
+from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.logged_inputs import inputs_of_model, inputs_of_stack
 from me2e_compress.workflows.result import Result, Table, counted

@@ -10,8 +10,8 @@ import onnx_ir as ir
 from me2e_compress import graph, recipe
 from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.graph import provenance
-from me2e_compress.graph.macs import why_uncounted
 from me2e_compress.graph.opset import lowered
+from me2e_compress.graph.summary import why_uncounted
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import Item, ModuleMap, assign, itemise
 from me2e_compress.passes import Context
@@ -24,8 +24,7 @@ from me2e_compress.runtime.energy.modelled import (
 )
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.recurrence import recurrent_inputs
-from me2e_compress.workflows.adapted import adapted
-from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
+from me2e_compress.workflows.checks import adapted, lacking_shapes, load_map, model_path
 from me2e_compress.workflows.inspect_result import InspectResult
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.module_costs import (

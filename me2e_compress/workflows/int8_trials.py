@@ -17,16 +17,16 @@ from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
 from me2e_compress.targets import TARGETS
-from me2e_compress.workflows.adapted import adapted
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
     Given,
+    adapted,
     check_count,
     load_map,
     output_path,
 )
 from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.first_try import try_first
+from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 

@@ -15,7 +15,7 @@ from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets import TARGETS, LintFinding
 from me2e_compress.targets.tensorrt.rtx import BuildResult, check
 from me2e_compress.workflows.checks import load_map, model_path
-from me2e_compress.workflows.first_try import try_first
+from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, counted, table
 

@@ -11,7 +11,7 @@ from me2e_compress.driving.adapter import ImageNormalization
 from me2e_compress.driving.adapter.images import Triple
 from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.runtime.recurrence import recurrent_inputs
-from me2e_compress.workflows.first_try import load_interface
+from me2e_compress.workflows.first_opening import load_interface
 from me2e_compress.zoo.stacks import STACKS, Stack
 
 STACK = "me2e.stack"

@@ -26,16 +26,16 @@ from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack.split_stack import is_stack
-from me2e_compress.workflows.adapted import adapted
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
+    adapted,
     check_count,
     load_map,
     model_path,
 )
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.deadlines_table import check_budget
-from me2e_compress.workflows.first_try import load_interface, try_model
+from me2e_compress.workflows.first_opening import load_interface, try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.profile_result import ProfileResult
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.cli.app import COMMANDS
-from me2e_compress.cli.console import listening
-from me2e_compress.cli.progress_lines import EVERY_S, ProgressLines
+from me2e_compress.cli.console import EVERY_S, ProgressLines, listening
 from me2e_compress.cli.verbosity import Verbosity, set_verbosity
 from me2e_compress.display import duration
 from me2e_compress.version import __version__

@@ -11,9 +11,9 @@ from onnx import TensorProto, helper
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.carried import can_carry
-from me2e_compress.graph.macs import macs
 from me2e_compress.graph.shapes import infer_shapes, static_shape
-from me2e_compress.manager.random_outputs import random_outputs
+from me2e_compress.graph.summary import macs
+from me2e_compress.manager.equivalence import random_outputs
 from tests.calls import calls
 
 OPSETS = [helper.make_opsetid("", 17), helper.make_opsetid("own", 1)]

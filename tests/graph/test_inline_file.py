@@ -7,8 +7,8 @@ import onnx
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.graph import inline_file
-from me2e_compress.graph.inline_file import write_inline
+from me2e_compress.graph import weight_files
+from me2e_compress.graph.weight_files import write_inline
 from tests.nets import conv_attention
 
 DTYPES = ("float32", "float64", "float16", "int64", "int32", "int8", "uint8", "bool")
@@ -41,7 +41,7 @@ def full() -> ir.Model:
 def test_the_bytes_are_those_of_onnx(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, limit: int, loaded: bool
 ) -> None:
-    monkeypatch.setattr(inline_file, "LARGE_BYTES", limit)
+    monkeypatch.setattr(weight_files, "LARGE_BYTES", limit)
     model = full()
     if loaded:
         onnx.save(ir.to_proto(model), tmp_path / "first.onnx")
@@ -57,7 +57,7 @@ def test_the_bytes_are_those_of_onnx(
 def test_the_model_stays_as_it_is(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(inline_file, "LARGE_BYTES", 0)
+    monkeypatch.setattr(weight_files, "LARGE_BYTES", 0)
     model = full()
     before = {
         name: value.const_value for name, value in model.graph.initializers.items()
@@ -72,6 +72,6 @@ def test_the_model_stays_as_it_is(
 @pytest.mark.parametrize("number", [0, 1, 127, 128, 300, 2**21, 2**32 + 5])
 def test_lengths_are_varints(number: int) -> None:
     message = onnx.TensorProto(dims=[number])
-    assert message.SerializeToString()[-len(inline_file._varint(number)) :] == (
-        inline_file._varint(number)
+    assert message.SerializeToString()[-len(weight_files._varint(number)) :] == (
+        weight_files._varint(number)
     )

@@ -2,7 +2,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.graph.macs import why_uncounted
+from me2e_compress.graph.summary import why_uncounted
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17, "f" : 1, "trt" : 1]>\n'
 

@@ -1,7 +1,7 @@
 import onnx_ir as ir
 
 from me2e_compress.graph import infer_shapes, macs, static_shape
-from me2e_compress.graph.macs import why_uncounted
+from me2e_compress.graph.summary import why_uncounted
 
 # the second sampler's queries come from what the first gives; neither has a shape
 CHAIN = """

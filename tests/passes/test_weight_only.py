@@ -14,11 +14,11 @@ from me2e_compress.manager import PassManager
 from me2e_compress.passes import Context
 from me2e_compress.passes.base import PassResult
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.float_weights import float_weights
 from me2e_compress.quantization.plan import WEIGHT_ONLY, plan_of
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import TARGETS
 from me2e_compress.targets.weights import quantize_weight
+from me2e_compress.workflows.int8_outcome import float_weights
 from tests.frames import record
 from tests.nets import MODULES, net
 

@@ -4,7 +4,7 @@ import pytest
 
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.float_weights import FloatWeight, float_weights
+from me2e_compress.workflows.int8_outcome import FloatWeight, float_weights
 from tests.nets import MODULES, net
 
 TEXT = """

@@ -7,7 +7,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.runtime.endless import endless
+from me2e_compress.runtime.runnable import endless
 from me2e_compress.runtime.session import Session
 
 LOOP = """

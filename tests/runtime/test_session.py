@@ -7,10 +7,10 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import constant_values
-from me2e_compress.runtime.constants import evaluate_constants
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.opening import unsupported
+from me2e_compress.runtime.runnable import unsupported
 from me2e_compress.runtime.session import Session, replay, run_once
+from me2e_compress.targets.weights import evaluate_constants
 
 COUNTER = """
 <ir_version: 9, opset_import: ["" : 17]>

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from me2e_compress.fidelity.compare import Fidelity, OutputFidelity
 from me2e_compress.fidelity.floor import Floor
 from me2e_compress.quantization.plan.overrides import Overrides
-from me2e_compress.sensitivity.remedy import Int8Node, Measure, Remedy, find_remedy
+from me2e_compress.sensitivity.remedy import Int8Node, Measure, Remedy, search_remedy
 
 NODES = [
     Int8Node(f"/m{at // 16}/n{at}[x]", "MatMul", f"m{at // 16}") for at in range(64)
@@ -28,7 +28,7 @@ def made(noise: Mapping[int, float]) -> Measure:
 
 def search(noise: Mapping[int, float], most: int = 14) -> Remedy:
     measure = made(noise)
-    return find_remedy(NODES, measure([], []), measure, Floor(20.0), most_trials=most)
+    return search_remedy(NODES, measure([], []), measure, Floor(20.0), most_trials=most)
 
 
 def test_one_node_among_many_is_found_in_a_trial_a_halving() -> None:

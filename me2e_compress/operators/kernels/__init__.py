@@ -4,7 +4,7 @@ A session calls them on its own threads for the nodes of
 :data:`~me2e_compress.operators.kernels.kernel.DOMAIN`.
 """
 
-from me2e_compress.operators.kernels.availability import why_not
 from me2e_compress.operators.kernels.kernel import DOMAIN, KERNELS, CompiledKernel
+from me2e_compress.operators.kernels.trampoline import why_not
 
 __all__ = ["DOMAIN", "KERNELS", "CompiledKernel", "why_not"]

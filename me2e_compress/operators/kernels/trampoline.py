@@ -16,6 +16,7 @@ import platform
 import struct
 import sys
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 
 from me2e_compress.operators.kernels.store import default_folder, keep, private
@@ -61,7 +62,7 @@ _MACHINES: Mapping[str, _Machine] = {
 }
 
 
-def why_not() -> str | None:
+def _no_trampoline() -> str | None:
     """Return why this platform has no trampoline; None if it has one."""
     if sys.platform != "linux":
         return f"there are kernels on Linux only, not on {sys.platform}"
@@ -163,3 +164,20 @@ def load(folder: Path) -> Trampoline:
 def trampoline() -> Trampoline:
     """Open the shared object once per process, or raise an OSError."""
     return load(default_folder())
+
+
+def why_not() -> str | None:
+    """Return why this machine runs no kernels; None if it does.
+
+    Nothing is imported for this check: Numba itself may still fail to load.
+    """
+    if reason := _no_trampoline():
+        return reason
+    for package in ("numba", "llvmlite"):
+        if find_spec(package) is None:
+            return f"{package} is not installed: pip install 'me2e-compress[fast]'"
+    try:
+        trampoline()
+    except OSError as error:
+        return f"neither the cache folder nor memory may hold code that runs: {error}"
+    return None

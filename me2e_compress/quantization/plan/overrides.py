@@ -20,7 +20,7 @@ that they stand for. Where two overrides match a node, the later counts.
 
 import dataclasses
 import fnmatch
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, Self
 
@@ -31,6 +31,9 @@ from me2e_compress import documents
 from me2e_compress.errors import RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan.decision import FLOAT, INT8, Decision
+
+_GLOB = str.maketrans({"[": "[[]", "?": "[?]", "*": "[*]"})
+"""Makes a name a pattern that matches only itself."""
 
 _UNSUPPORTED = "only int8 and float are supported (no int4, fp8 or mixed 16 bit)"
 
@@ -80,6 +83,28 @@ class Override(_Strict):
             "reads": self.reads,
         }
         return {key: value for key, value in matchers.items() if value is not None}
+
+
+def keep_float(name: str, reason: str) -> Override:
+    """Return the override that keeps one node in float."""
+    return Override(dtype=FLOAT, nodes=name.translate(_GLOB), reason=reason)
+
+
+def overrides_text(overrides: Iterable[Override]) -> str:
+    """Write overrides as the TOML that ``--overrides`` reads."""
+    entries = []
+    for each in overrides:
+        keys = ("nodes", "module", "op", "reads", "dtype", "reason")
+        given = {key: text for key in keys if (text := getattr(each, key))}
+        lines = (f"{key} = {toml_string(text)}\n" for key, text in given.items())
+        entries.append("[[override]]\n" + "".join(lines))
+    return "\n".join(entries)
+
+
+def toml_string(text: str) -> str:
+    """Write a TOML basic string."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
 
 
 class ConcatScale(_Strict):

@@ -131,9 +131,9 @@ RULES: Registry[Rule] = Registry(
         "coordinates": f"{_HERE}.safe_rules:Coordinates",
         "ego-input": f"{_HERE}.safe_rules:EgoInput",
         "attention-weights": f"{_HERE}.safe_rules:AttentionWeights",
-        "small-product": f"{_HERE}.kernel_rules:SmallProduct",
-        "narrow-convolution": f"{_HERE}.kernel_rules:NarrowConvolution",
-        "cost": f"{_HERE}.cost_rule:CostGate",
+        "small-product": f"{_HERE}.safe_rules:SmallProduct",
+        "narrow-convolution": f"{_HERE}.safe_rules:NarrowConvolution",
+        "cost": f"{_HERE}.safe_rules:CostGate",
     },
 )
 

@@ -16,7 +16,7 @@ from me2e_compress.graph import (
 )
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN
 from me2e_compress.operators import find
-from me2e_compress.runtime.fused_nodes import known_operators
+from me2e_compress.runtime.runnable import known_operators
 from me2e_compress.targets.base import (
     LintFinding,
     LintRule,

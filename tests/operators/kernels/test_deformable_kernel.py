@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from me2e_compress.operators import Dialect, kernels
 from me2e_compress.operators.deformable_aggregation import DeformableAggregation
 from me2e_compress.operators.deformable_attention import DeformableAttention
-from me2e_compress.runtime import fused_nodes
+from me2e_compress.runtime import runnable
 from me2e_compress.runtime.session import Session
 from tests.operators.running import graph_of
 from tests.operators.test_deformable_attention import arrays_of
@@ -53,7 +53,7 @@ def test_every_dialect_answers_its_reference(
     model = graph_of(
         dialect, arrays, opset=17, constants=known, open_dims=open_dims and not known
     )
-    _, needed = fused_nodes.compiled_or_expanded(model, compiled=True)
+    _, needed = runnable.compiled_or_expanded(model, compiled=True)
     assert needed
 
     found = Session(model, threads=1).run(arrays)["result"]
@@ -78,7 +78,7 @@ def test_aggregation_over_cameras_takes_the_same_kernel() -> None:
     arrays["sampling_location"] = arrays["sampling_location"].astype(float32)
     operator = DeformableAggregation()
     model = graph_of(operator.dialects[0], arrays, opset=17)
-    _, needed = fused_nodes.compiled_or_expanded(model, compiled=True)
+    _, needed = runnable.compiled_or_expanded(model, compiled=True)
     assert [each.op_type for each in needed] == ["MultiScaleDeformableAttention"]
 
     found = Session(model, threads=1).run(arrays)["result"]
@@ -149,7 +149,7 @@ def test_int8_values_are_read_as_they_are(kind: str, made: str) -> None:
         "w": random.uniform(0, 1, (2, 50, 3, 2, 4)).astype(np.float32),
         "by_channel": random.uniform(0.01, 0.03, 24).astype(np.float32),
     }
-    ready, needed = fused_nodes.compiled_or_expanded(model, compiled=True)
+    ready, needed = runnable.compiled_or_expanded(model, compiled=True)
     assert [each.op_type for each in needed] == [
         f"MultiScaleDeformableAttention{kind.capitalize()}"
     ]
@@ -169,6 +169,6 @@ def test_scales_that_the_kernel_does_not_know_stay_in_float() -> None:
     text = STORED.replace("TYPE", "int8").replace("ZERO", "0").replace("MADE", made)
     text = text.replace("float[24] by_channel", "float[8] by_head")
 
-    _, needed = fused_nodes.compiled_or_expanded(ir.from_onnx_text(text), compiled=True)
+    _, needed = runnable.compiled_or_expanded(ir.from_onnx_text(text), compiled=True)
 
     assert [each.op_type for each in needed] == ["MultiScaleDeformableAttention"]

@@ -17,15 +17,15 @@ from me2e_compress import graph
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.operators import dialect_of, kernels
 from me2e_compress.operators.deformable_attention import DeformableAttention
-from me2e_compress.operators.kernels import availability, custom_ops, store, trampoline
+from me2e_compress.operators.kernels import custom_ops, store, trampoline
 from me2e_compress.operators.kernels.kernel import CompiledKernel
 from me2e_compress.operators.kernels.machine_code import load_or_compile
-from me2e_compress.runtime.first_opening import try_apart
-from me2e_compress.runtime.fused_nodes import compiled_or_expanded
 from me2e_compress.runtime.opening import open_graph
 from me2e_compress.runtime.providers import CpuProvider
+from me2e_compress.runtime.runnable import compiled_or_expanded
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.doctor import doctor
+from me2e_compress.workflows.first_opening import try_apart
 from tests.operators.running import graph_of
 from tests.operators.test_deformable_attention import CALL, arrays_of
 
@@ -216,7 +216,7 @@ def test_without_kernels_bodies_run(
         raise OSError("no")
 
     if why == "numba":
-        monkeypatch.setattr(availability, "find_spec", lambda name: None)
+        monkeypatch.setattr(trampoline, "find_spec", lambda name: None)
     elif why == "platform":
         monkeypatch.setattr(sys, "platform", "darwin")
     else:
@@ -230,7 +230,7 @@ def test_without_kernels_bodies_run(
 
 
 def test_doctor_says_why_no_kernel_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(availability, "find_spec", lambda name: None)
+    monkeypatch.setattr(trampoline, "find_spec", lambda name: None)
 
     (found,) = (each for each in doctor().checkups if each.what == "compiled kernels")
 

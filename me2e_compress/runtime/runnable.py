@@ -1,13 +1,15 @@
-"""Replace the fused nodes of a graph by compiled kernels or by their bodies.
+"""Whether a graph can run here, and how its fused nodes are made to.
 
-A node is replaced by its body, which calls compiled kernels where there are any, in a
-domain of their own. So nothing depends on whether onnxruntime prefers a function of
-the file or a registered operator of the same name, and no other library can register
-the same name and domain twice, which onnxruntime refuses.
+A fused node is replaced by its body, which calls compiled kernels where there are any,
+in a domain of their own. So nothing depends on whether onnxruntime prefers a function
+of the file or a registered operator of the same name, and no other library can register
+the same name and domain twice, which onnxruntime refuses. Loops that never end are
+refused: native code runs them and ignores signals.
 """
 
 import functools
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator
 
 import onnx_ir as ir
 import onnxruntime as ort
@@ -17,7 +19,7 @@ from onnxruntime.capi import (
 
 from me2e_compress import graph, operators
 from me2e_compress.errors import GraphError, PreconditionError
-from me2e_compress.graph import is_standard
+from me2e_compress.graph.nodes import array_of, bodies_of, input_at, is_standard, maker
 from me2e_compress.operators import OWN_DOMAIN, kernels
 from me2e_compress.rewrite import value_names
 from me2e_compress.runtime.int8_values import read_int8
@@ -147,3 +149,88 @@ def _opset(node: ir.Node, model: ir.Model) -> int:
 
 def _names(node: ir.Node, names: set[str]) -> set[str] | None:
     return names if isinstance(node.graph, ir.Graph) else None
+
+
+MOST_ROUNDS = 1 << 24
+"""Most iterations of a loop times those around it: one takes at least 5 us."""
+
+
+def endless(model: ir.Model) -> str | None:
+    """Describe a loop that would run for minutes or forever; None if none is known.
+
+    Loops whose condition is computed at run time are not reported.
+    """
+    for nodes in (model.graph, *model.functions.values()):
+        if (node := _endless(nodes, 1)) is not None:
+            name = node.name or node.outputs[0].name
+            return f"Loop node {name!r} goes on for more than {MOST_ROUNDS:,} rounds"
+    return None
+
+
+def _endless(nodes: Iterable[ir.Node], rounds: float) -> ir.Node | None:
+    for node in nodes:
+        if not (bodies := bodies_of(node)):
+            continue
+        inside = rounds * _rounds(node)
+        if inside > MOST_ROUNDS:
+            return node
+        for body in bodies:
+            if (found := _endless(body, inside)) is not None:
+                return found
+    return None
+
+
+def _rounds(node: ir.Node) -> float:
+    """Return the iterations of a loop if constants alone decide them; else 1."""
+    if node.op_type != "Loop" or not is_standard(node):
+        return 1
+    (body,) = bodies_of(node)
+    if len(body.inputs) < 2 or not body.outputs:
+        return 1
+    # Both conditions must be constantly true, or passed through unchanged.
+    goes_on = _origin(body.outputs[0])
+    first = input_at(node, 1)
+    if first is not None and not _is_true(first):
+        return 1
+    if goes_on is not body.inputs[1] and not _is_true(goes_on):
+        return 1
+    most = input_at(node, 0)
+    if most is None:
+        return math.inf
+    count = array_of(most)
+    return 1 if count is None or count.size != 1 else max(0, int(count.item()))
+
+
+def _is_true(value: ir.Value) -> bool:
+    array = array_of(_origin(value))
+    return array is not None and array.size == 1 and bool(array.item())
+
+
+def _origin(value: ir.Value) -> ir.Value:
+    """Follow a value back through Identity nodes."""
+    while (node := maker(value, "Identity")) is not None and node.inputs[0]:
+        value = node.inputs[0]
+    return value
+
+
+def unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:
+    """Return why a graph cannot be run; None if every operator is known.
+
+    Endless loops are refused, because no signal can stop them. Fused operators are
+    supported: a kernel or a body runs them. The operators of a provider's libraries are
+    unknown before a session is built. A known operator may still lack a kernel for its
+    element type; only building a :class:`~me2e_compress.runtime.session.Session` shows
+    it.
+    """
+    if reason := endless(model):
+        return reason
+    unknown = {
+        f"{node.domain or 'ai.onnx'}::{node.op_type}": node
+        for node in unknown_nodes(model)
+        if not is_fused(node)
+    }
+    if not unknown or provider.plugins:
+        return None
+    node = next(iter(unknown.values()))
+    name = node.name or node.outputs[0].name
+    return f"onnxruntime has no operator {', '.join(unknown)} (node {name!r})"

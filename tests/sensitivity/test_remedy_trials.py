@@ -1,5 +1,6 @@
 """What is behind a group, run alone, measures what the whole graph measures."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +9,13 @@ import pytest
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.fidelity.compare import Fidelity, Reference
-from me2e_compress.manager.report import LossyPass
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import plan_of
+from me2e_compress.quantization.plan.overrides import Override, overrides_text
 from me2e_compress.runtime.session import Session
-from me2e_compress.sensitivity.remedy import Int8Node, int8_nodes
+from me2e_compress.sensitivity.remedy import Int8Node, RemedyTrials, int8_nodes
 from me2e_compress.sensitivity.suffix import Suffix
-from me2e_compress.workflows.remedy_trials import RemedyTrials
 from tests.frames import record
 from tests.nets import MODULES, conv_attention, image, net
 
@@ -53,8 +53,14 @@ class Searched:
         assert plan is not None
         self.nodes = int8_nodes(plan)
         reference = Reference.of(Session(model), recording)
-        lossy = LossyPass(quantizer, model, made.changes)
-        self.trials = RemedyTrials(lossy, context, reference, folder / "o.toml")
+
+        def build(overrides: Sequence[Override]) -> ir.Model:
+            path = folder / "o.toml"
+            path.write_text(overrides_text(overrides))
+            again = quantizer.with_options({"overrides": path})
+            return again.run(model.clone(), context).model
+
+        self.trials = RemedyTrials(model, build, reference)
 
     def both(self, group: tuple[Int8Node, ...]) -> tuple[Fidelity, Fidelity]:
         """Measure a group in int8, what is behind it alone, and the whole graph."""

@@ -8,10 +8,10 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.errors import GraphError
-from me2e_compress.runtime import first_opening
 from me2e_compress.runtime.children import run_script
-from me2e_compress.runtime.first_opening import try_apart
 from me2e_compress.runtime.frames import Array
+from me2e_compress.workflows import first_opening
+from me2e_compress.workflows.first_opening import try_apart
 
 pytestmark = pytest.mark.opens_apart
 

@@ -8,11 +8,15 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.fidelity.compare import common_adapter, compare
-from me2e_compress.fidelity.open_loop import OpenLoopTally, ego_boxes
+from me2e_compress.fidelity.open_loop import (
+    NO_FUTURE,
+    OpenLoop,
+    OpenLoopTally,
+    ego_boxes,
+)
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.recorded_future import Box, RecordedFuture
 from me2e_compress.runtime.session import Session
-from me2e_compress.workflows.plan_quality import NO_FUTURE, OpenLoop
 
 PLANNER = """
 <ir_version: 9, opset_import: ["" : 17]>
