@@ -9,19 +9,13 @@ from typing import Any
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
-from me2e_compress.metrics.intervals import (
-    mean_estimate,
-    unseen_interval,
-    unseen_share,
-)
+from me2e_compress.metrics.intervals import unseen_interval, unseen_share
 from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_values import RouteColumn, RouteValues
 
-POINTS = "points"
-"""Difference of two percentages."""
-
-WIDEST = (-100.0, 100.0)
-"""Bounds of a route's difference, in points."""
-
+PERCENT = (0.0, 100.0)
+DS = RouteColumn[Episode]("DS", "%", lambda one: route_score(one).composed, PERCENT)
+SR = RouteColumn[Episode]("SR %", "%", lambda one: 100.0 * one.succeeded, PERCENT)
 
 SCATTER = 12.0
 """Standard deviation, points a route, of the driving score's paired difference between
@@ -122,38 +116,36 @@ def difference(
 ) -> PairedDifference:
     """Compare two drives of the same routes, at least one, route by route."""
     # routes must match, whatever their order
-    others = {episode.route: episode for episode in reference}
-    unpaired = sorted({*others} ^ {episode.route for episode in episodes})
-    if unpaired:
+    ours, others = ({each.route for each in drive} for drive in (episodes, reference))
+    if unpaired := sorted(ours ^ others):
         raise EvaluationError(
             f"route {unpaired[0]} was driven by one of the two only: differences are "
             "taken over the same routes"
         )
-    # one difference per route, with the route's scenario type
-    pairs = [(one, others[one.route]) for one in episodes]
-    types = [one.scenario for one in episodes]
-    scores = [route_score(one).composed - route_score(o).composed for one, o in pairs]
-    turns = [int(one.succeeded) - int(other.succeeded) for one, other in pairs]
+    scores, rates = (
+        column.values(episodes) - column.values(reference) for column in (DS, SR)
+    )
+    gaps, turns = scores.by_route.values(), rates.by_route.values()
     return PairedDifference(
-        _estimate(scores, types, seed),
-        _estimate([100.0 * turn for turn in turns], types, seed),
-        sum(score > 0 for score in scores),
-        sum(score < 0 for score in scores),
-        turns.count(1),
-        turns.count(-1),
+        _estimate(scores, seed),
+        _estimate(rates, seed),
+        sum(gap > 0 for gap in gaps),
+        sum(gap < 0 for gap in gaps),
+        sum(turn > 0 for turn in turns),
+        sum(turn < 0 for turn in turns),
     )
 
 
-def _estimate(values: Sequence[float], types: Sequence[str], seed: int) -> Estimate:
+def _estimate(values: RouteValues, seed: int) -> Estimate:
     """Return a mean of differences, its interval no narrower than n routes allow.
 
     The interval over types drawn anew is at least as wide as that over these types.
     """
-    found = mean_estimate(values, types, POINTS, seed, WIDEST)
+    found = values.mean(seed)
     if found.value is None or found.low is None or found.high is None:
         return found
     # widen the interval over these types
-    least, most = unseen_interval(found.value, found.n, WIDEST)
+    least, most = unseen_interval(found.value, found.n, values.bounds)
     low = found.low if least is None else min(least, found.low)
     high = found.high if most is None else max(most, found.high)
     # the interval over new types must contain it

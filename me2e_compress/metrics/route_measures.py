@@ -41,8 +41,54 @@ class RouteMeasures:
         return np.stack(columns, axis=1)
 
 
+@dataclass(frozen=True, slots=True)
+class MeasuredRoute:
+    """What the four measures of a route follow from.
+
+    ``inferences`` cost energy. ``recorded`` is false where frames are lacking although
+    the driver did not fail: then the record lacks them, not the drive.
+    """
+
+    driving_score: float
+    completion_percent: float
+    efficiency: float | None
+    comfort: float | None
+    inferences: int
+    crashed: bool
+    failed: bool
+    recorded: bool
+
+    def measures(self, j_per_frame: float | None) -> tuple[float, float, float, float]:
+        """Return driving score, efficiency, comfort and joules."""
+        efficiency, comfort, joules = self.efficiency, self.comfort, math.nan
+        if efficiency is None:
+            begun = self.completion_percent >= 100.0 / CHECKPOINTS
+            efficiency = math.nan if begun or not self.recorded else 0.0
+        if comfort is None:
+            comfort = 0.0 if self.recorded else math.nan
+        if j_per_frame is not None and (self.inferences or self.failed):
+            joules = j_per_frame * self.inferences
+        return self.driving_score, efficiency, comfort, joules
+
+    @classmethod
+    def of(cls, episode: Episode) -> Self:
+        """Measure a driven route."""
+        recorded = len(episode.frames) if episode.given is not None else 0
+        failed = bool(episode.failure)
+        return cls(
+            route_score(episode).composed,
+            episode.completion_percent,
+            efficiency(episode).value,
+            comfort(episode).value,
+            len(episode.decisions) or recorded,
+            episode.collided,
+            failed,
+            bool(episode.frames) or failed,
+        )
+
+
 def route_measures(
-    episodes: Sequence[Episode], j_per_frame: float | None
+    routes: Sequence[MeasuredRoute], j_per_frame: float | None
 ) -> RouteMeasures:
     """Return the measures of driven routes, in their order.
 
@@ -58,38 +104,8 @@ def route_measures(
     left out too. A route without moving traffic has no efficiency, nor has one without
     recorded frames or decisions.
     """
-    return RouteMeasures(
-        np.array([route_score(each).composed for each in episodes], np.float64),
-        np.array([_efficiency(each) for each in episodes], np.float64),
-        np.array([_comfort(each) for each in episodes], np.float64),
-        np.array([_joules(each, j_per_frame) for each in episodes], np.float64),
-        np.array([each.collided for each in episodes], np.bool_),
+    rows = [each.measures(j_per_frame) for each in routes]
+    return RouteMeasures.of_table(
+        np.array(rows, np.float64).reshape(-1, 4),
+        np.array([each.crashed for each in routes], np.bool_),
     )
-
-
-def _efficiency(episode: Episode) -> float:
-    found = efficiency(episode).value
-    if found is not None:
-        return found
-    begun = episode.completion_percent >= 100.0 / CHECKPOINTS
-    return math.nan if begun or not _recorded(episode) else 0.0
-
-
-def _comfort(episode: Episode) -> float:
-    found = comfort(episode).value
-    if found is not None:
-        return found
-    return 0.0 if _recorded(episode) else math.nan
-
-
-def _joules(episode: Episode, j_per_frame: float | None) -> float:
-    recorded = len(episode.frames) if episode.given is not None else 0
-    inferences = len(episode.decisions) or recorded
-    if j_per_frame is None or not (inferences or episode.failure):
-        return math.nan
-    return j_per_frame * inferences
-
-
-def _recorded(episode: Episode) -> bool:
-    """Return whether a lack of frames is the driver's failure, not the record's."""
-    return bool(episode.frames or episode.failure)

@@ -9,15 +9,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from me2e_compress.metrics.differences import POINTS, WIDEST
-from me2e_compress.metrics.intervals import mean_estimate
 from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_values import RouteColumn
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.drives import Drive
 from me2e_compress.study.route_outcomes import RouteOutcome
 
-TWICE = (2.0 * WIDEST[0], 2.0 * WIDEST[1])
-"""Bounds of a difference of differences of a route, in points."""
+PERCENT = (0.0, 100.0)
+DS = RouteColumn[RouteOutcome]("DS", "%", lambda one: one.driving_score, PERCENT)
+SR = RouteColumn[RouteOutcome]("SR %", "%", lambda one: 100.0 * one.succeeded, PERCENT)
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,8 @@ def changes(
             # the plain difference, and how far it exceeds the baseline's
             change = _change(cells[0], cells[1], ours, before, seed)
             if drive.variant != baseline:
-                score, rate = _beyond(ours, before, theirs, theirs_before, seed)
+                four = ours, before, theirs, theirs_before
+                score, rate = (_beyond(column, *four, seed) for column in (DS, SR))
                 change = replace(
                     change, beyond_driving_score=score, beyond_success_rate=rate
                 )
@@ -109,39 +110,21 @@ def _change(
     others: Sequence[RouteOutcome],
     seed: int,
 ) -> Change:
-    types = [each.scenario for each in ours]
-    scores, rates = (
-        mean_estimate(
-            [a - b for a, b in zip(mine, theirs, strict=True)],
-            *(types, POINTS, seed, WIDEST),
-        )
-        for mine, theirs in zip(_values(ours), _values(others), strict=True)
+    score, rate = (
+        (column.values(ours) - column.values(others)).mean(seed) for column in (DS, SR)
     )
-    return Change(".".join(cell), ".".join(other), scores, rates)
+    return Change(".".join(cell), ".".join(other), score, rate)
 
 
 def _beyond(
+    column: RouteColumn[RouteOutcome],
     ours: Sequence[RouteOutcome],
     before: Sequence[RouteOutcome],
     theirs: Sequence[RouteOutcome],
     theirs_before: Sequence[RouteOutcome],
     seed: int,
-) -> tuple[Estimate, Estimate]:
-    """Return how much more ours changed than theirs: driving score, success rate."""
-    types = [each.scenario for each in ours]
-    four = (_values(each) for each in (ours, before, theirs, theirs_before))
-    scores, rates = (
-        mean_estimate(
-            [(a - b) - (c - d) for a, b, c, d in zip(*columns, strict=True)],
-            *(types, POINTS, seed, TWICE),
-        )
-        for columns in zip(*four, strict=True)
-    )
-    return scores, rates
-
-
-def _values(routes: Sequence[RouteOutcome]) -> tuple[list[float], list[float]]:
-    return (
-        [each.driving_score for each in routes],
-        [100.0 * each.succeeded for each in routes],
-    )
+) -> Estimate:
+    """Return how much more ours changed than theirs."""
+    change = column.values(ours) - column.values(before)
+    their_change = column.values(theirs) - column.values(theirs_before)
+    return (change - their_change).mean(seed)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -17,10 +18,18 @@ from me2e_compress.metrics.eer import (
     rankings,
     scale_of,
 )
-from me2e_compress.metrics.episode import Ending, Given
+from me2e_compress.metrics.episode import Ending, Episode, Given
 from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
+from me2e_compress.metrics.route_measures import (
+    MeasuredRoute,
+    RouteMeasures,
+    route_measures,
+)
 from tests.metrics.drives import cruise, drive, infraction
+
+
+def measured(episodes: Sequence[Episode], j_per_frame: float | None) -> RouteMeasures:
+    return route_measures([MeasuredRoute.of(each) for each in episodes], j_per_frame)
 
 
 def measures(*rows: tuple[float, float, float, float], crashed: str) -> RouteMeasures:
@@ -171,7 +180,7 @@ def test_the_ranking_under_every_normalization() -> None:
 
 
 def test_joules_of_a_route_are_those_of_its_decisions() -> None:
-    found = route_measures([drive(driven=cruise(traffic=5.0))], 2.5)
+    found = measured([drive(driven=cruise(traffic=5.0))], 2.5)
 
     assert found.energy_j.tolist() == [2.5]  # a drive by hand has one decision
     assert found.efficiency.tolist() == pytest.approx([200.0])
@@ -185,16 +194,16 @@ def test_without_a_log_of_decisions_a_recorded_step_of_a_real_run_is_one() -> No
         given=Given("Completed", 100.0, 1.0, 100.0),
     )
 
-    assert route_measures([real], 2.5).energy_j.tolist() == [20.0]
+    assert measured([real], 2.5).energy_j.tolist() == [20.0]
 
 
 def test_no_counter_no_joules() -> None:
-    assert np.isnan(route_measures([drive()], None).energy_j).all()
+    assert np.isnan(measured([drive()], None).energy_j).all()
 
 
 def test_a_driver_that_failed_at_once_is_not_left_out() -> None:
     stuck = drive(completion=1.0, driven=cruise(1.0), ending=Ending.TIMEOUT)
-    found = route_measures([stuck], 1.0)
+    found = measured([stuck], 1.0)
 
     assert (found.efficiency[0], found.comfort[0]) == (0.0, 0.0)
 
@@ -202,7 +211,7 @@ def test_a_driver_that_failed_at_once_is_not_left_out() -> None:
 def test_without_a_record_nothing_is_made_up() -> None:
     hit = infraction(InfractionKind.COLLISION_VEHICLE)
     silent = dataclasses.replace(drive(hit, completion=2.0), decisions=())
-    found = route_measures([silent], 1.0)
+    found = measured([silent], 1.0)
 
     assert np.isnan(found.table()[0, 1:]).all()
     assert found.crashed.tolist() == [True]
@@ -210,6 +219,6 @@ def test_without_a_record_nothing_is_made_up() -> None:
 
 @pytest.mark.parametrize("kind", InfractionKind)
 def test_of_all_infractions_a_collision_alone_is_a_crash(kind: InfractionKind) -> None:
-    found = route_measures([drive(infraction(kind, 50.0)), drive()], 1.0)
+    found = measured([drive(infraction(kind, 50.0)), drive()], 1.0)
 
     assert found.crashed.tolist() == [kind.name.startswith("COLLISION"), False]

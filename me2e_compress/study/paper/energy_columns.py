@@ -1,18 +1,18 @@
 """Joules per frame and EER_AV of drives, measured and modelled separately."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Self
 
-import numpy as np
-
 from me2e_compress.metrics.eer import eer, rankings
-from me2e_compress.metrics.efficiency import CHECKPOINTS
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.metrics.route_measures import RouteMeasures
-from me2e_compress.study.drive_record import DriveRecord, RouteSummary
+from me2e_compress.metrics.route_measures import (
+    MeasuredRoute,
+    RouteMeasures,
+    route_measures,
+)
+from me2e_compress.study.drive_record import RouteSummary
 from me2e_compress.study.tables import estimate_cell, measure_cell
 from me2e_compress.workflows.result import Cell
 
@@ -83,7 +83,7 @@ def measures_by_variant(
 ) -> dict[str, RouteMeasures]:
     """Return the measures of the variants that drove under a condition."""
     return {
-        name: record_measures(cell, each)
+        name: route_measures(list(map(_measured, cell.routes)), each)
         for name, each in joules.items()
         if (cell := result.cell(name, condition)) is not None
     }
@@ -105,16 +105,17 @@ def ranking_note(result: "PaperResult", variants: Sequence[str], condition: str)
     return f"EER_AV, {energy} energy, under {condition}, ranks {'; '.join(parts)}."
 
 
-def record_measures(record: DriveRecord, j_per_frame: float | None) -> RouteMeasures:
-    """Return the four measures of each route, as `route_measures` does of episodes."""
-    routes = record.routes
-    joules = [_route_joules(each, j_per_frame) for each in routes]
-    return RouteMeasures(
-        np.array([each.driving_score for each in routes], np.float64),
-        np.array([_efficiency(each) for each in routes], np.float64),
-        np.array([_comfort(each) for each in routes], np.float64),
-        np.array(joules, np.float64),
-        np.array([bool(each.collisions) for each in routes], np.bool_),
+def _measured(route: RouteSummary) -> MeasuredRoute:
+    failed = route.ending == Ending.POLICY_FAILED.value
+    return MeasuredRoute(
+        route.driving_score,
+        route.completion,
+        route.efficiency,
+        route.comfort,
+        route.decisions,
+        bool(route.collisions),
+        failed,
+        bool(route.duration_us) or failed,
     )
 
 
@@ -127,33 +128,6 @@ def _scores(
         why = result.why_not(name, condition)
         found.setdefault(name, Estimate(Measure(None, "points", why), None, None, 0))
     return found
-
-
-def _efficiency(route: RouteSummary) -> float:
-    if route.efficiency is not None:
-        return route.efficiency
-    begun = route.completion >= 100.0 / CHECKPOINTS
-    return math.nan if begun or not _recorded(route) else 0.0
-
-
-def _comfort(route: RouteSummary) -> float:
-    if route.comfort is not None:
-        return route.comfort
-    return 0.0 if _recorded(route) else math.nan
-
-
-def _route_joules(route: RouteSummary, j_per_frame: float | None) -> float:
-    if j_per_frame is None or not (route.decisions or _failed(route)):
-        return math.nan
-    return j_per_frame * route.decisions
-
-
-def _recorded(route: RouteSummary) -> bool:
-    return bool(route.duration_us or _failed(route))
-
-
-def _failed(route: RouteSummary) -> bool:
-    return route.ending == Ending.POLICY_FAILED.value
 
 
 def _joules(found: tuple[float, float, float] | None, why: str) -> Estimate:

@@ -12,7 +12,7 @@ from matplotlib.ticker import PercentFormatter
 from me2e_compress.driving.realtime import skipped_decisions
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.study.paper.published import RATES, PublishedDrive
-from me2e_compress.study.paper.route_columns import DC, DE, DS, RouteColumn, mean_of
+from me2e_compress.study.paper.route_columns import DC, DE, DS, Column, mean_of
 from me2e_compress.study.report.figures import WIDTH_IN
 from me2e_compress.study.report.style import (
     ACCENT,
@@ -67,7 +67,7 @@ def where_the_time_goes(result: "PaperResult") -> Figure | None:
         return figure
 
 
-def _over_rates(result: "PaperResult", columns: Sequence[RouteColumn]) -> Figure | None:
+def _over_rates(result: "PaperResult", columns: Sequence[Column]) -> Figure | None:
     block = next((b for b in result.study.blocks if b.name == "table-2"), None)
     if block is None:
         return None
@@ -106,7 +106,7 @@ def _draw_rates(
     result: "PaperResult",
     name: str,
     driven: Sequence[tuple[float, str]],
-    column: RouteColumn,
+    column: Column,
 ) -> None:
     """Draw one column over the rates, and the driver at its own latency."""
     # mean and interval at each rate
@@ -139,9 +139,7 @@ def _draw_rates(
     axes.set_title(f"{column.name}: {name}, 95 % interval", color=MUTED)
 
 
-def _draw_own(
-    axes: Axes, result: "PaperResult", name: str, column: RouteColumn
-) -> None:
+def _draw_own(axes: Axes, result: "PaperResult", name: str, column: Column) -> None:
     # the first condition that charges each model's own latency
     fps = result.fact(name).fps
     traced = [each.name for each in result.study.conditions if each.traced]
@@ -163,7 +161,7 @@ def _draw_own(
     )
 
 
-def _draw_given(axes: Axes, column: RouteColumn) -> None:
+def _draw_given(axes: Axes, column: Column) -> None:
     """Draw the paper's own figures, on axes of their own."""
     pick = {"DS": _ds, "DE %": _de, "DC": _dc}[column.name]
     at, values = [row.fps for row in RATES], [pick(row) for row in RATES]
@@ -193,9 +191,7 @@ def _dc(row: PublishedDrive) -> float:
     return row.dc
 
 
-def _mean(
-    result: "PaperResult", name: str, condition: str, column: RouteColumn
-) -> Estimate:
+def _mean(result: "PaperResult", name: str, condition: str, column: Column) -> Estimate:
     return mean_of(result.cells[name, condition], column, result.study.seed)
 
 

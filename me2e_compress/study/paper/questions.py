@@ -22,9 +22,7 @@ from me2e_compress.study.paper.energy_columns import (
 )
 from me2e_compress.study.paper.route_columns import (
     DS,
-    RouteColumn,
-    gaps,
-    mean_gap,
+    Column,
     mean_of,
     paired,
 )
@@ -140,7 +138,7 @@ class Evidence:
             raise UntestedError(self.result.why_not(*name))
         return found
 
-    def mean(self, name: CellName, column: RouteColumn) -> float:
+    def mean(self, name: CellName, column: Column) -> float:
         """Return a mean over the routes of a drive."""
         found = mean_of(self.cell(name), column, self.seed)
         if found.value is None:
@@ -148,7 +146,7 @@ class Evidence:
         return found.value
 
     def difference(
-        self, one: CellName, other: CellName, column: RouteColumn = DS
+        self, one: CellName, other: CellName, column: Column = DS
     ) -> Estimate:
         """Return the mean of one minus the other over the same routes."""
         return paired(self.cell(one), self.cell(other), column, self.seed)
@@ -157,10 +155,9 @@ class Evidence:
         self, first: CellName, middle: CellName, last: CellName
     ) -> Estimate:
         """Return how much more DS changes from first to middle than to last."""
-        early = gaps(self.cell(middle), self.cell(first), DS)
-        late = gaps(self.cell(last), self.cell(middle), DS)
-        both = {name: gap - late[name] for name, gap in early.items() if name in late}
-        return mean_gap(both, self.cell(middle), DS, self.seed, of=2)
+        drives = (self.cell(name) for name in (first, middle, last))
+        early, halfway, late = (DS.values(each.routes) for each in drives)
+        return ((halfway - early) - (late - halfway)).mean(self.seed)
 
     def static_share(self, one: CellName, other: CellName) -> Estimate:
         """Return the increase of the share of collisions with static objects."""
