@@ -1,39 +1,14 @@
-"""A finished draft takes its place in one step; who claims the place hears of it first.
-
-Between a rename and the note of it a process can be killed. What is about to stand in
-a place is therefore told before: a later run knows it again, whichever came last.
-"""
+"""A finished draft takes its place in one step, and several places change as a set."""
 
 import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
-_CLAIMED: dict[Path, Callable[[Path], None]] = {}
-"""Who is told of a draft before it is put in a place."""
 _SETS: list[list[tuple[Path, Path]]] = []
 """Of each open block: the places where something was put, and what was there."""
-
-
-@contextlib.contextmanager
-def announced(path: Path, told: Callable[[Path], None]) -> Iterator[None]:
-    """Be told of every draft just before it takes a place.
-
-    Args:
-        path: the place.
-        told: is called with the draft.
-    """
-    place = _place(path)
-    before = _CLAIMED.get(place)
-    _CLAIMED[place] = told
-    try:
-        yield
-    finally:
-        del _CLAIMED[place]
-        if before is not None:
-            _CLAIMED[place] = before
 
 
 def put(draft: Path, path: Path) -> None:
@@ -46,8 +21,6 @@ def put(draft: Path, path: Path) -> None:
     Raises:
         OSError: it cannot be put there.
     """
-    if (told := _CLAIMED.get(_place(path))) is not None:
-        told(draft)
     if not draft.is_dir():
         _keep(path)
         os.replace(draft, path)
@@ -110,7 +83,3 @@ def naming(path: Path) -> Iterator[None]:
         if error.errno is None:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
-
-
-def _place(path: Path) -> Path:
-    return path.absolute().parent.resolve() / path.name

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import documents
+from me2e_compress import documents, marks
 from me2e_compress.calibration.archives import Declared, declared, load_arrays
 from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.calibration.static_inputs import check_static, static_inputs
@@ -241,6 +241,8 @@ def _future(frame: Path) -> RecordedFuture | None:
         return None
     with documents.reading(path, FramesError, "not a recorded future"):
         found = documents.from_json(documents.content(path))
+        if isinstance(found, dict):
+            found.pop(*marks.IN_JSON, None)
         return RecordedFuture.model_validate(found)
 
 

@@ -12,7 +12,7 @@ from me2e_compress.calibration.observers import OBSERVERS, Observer
 from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.display import Displayed, Table, counted, table
 from me2e_compress.errors import FramesError
-from me2e_compress.runtime.atomic import write_json
+from me2e_compress.runtime.atomic import write_document
 
 OUTLIER_CREST = 64
 """Crest factor (largest magnitude over root mean square) from which a tensor is
@@ -86,7 +86,7 @@ class Ranges(Displayed):
 
     def save(self, path: Path) -> None:
         """Write JSON atomically."""
-        write_json(path, dataclasses.asdict(self), indent=1)
+        write_document(path, dataclasses.asdict(self), indent=1)
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -10,11 +10,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from me2e_compress import documents, drafts
+from me2e_compress import documents, drafts, marks
 from me2e_compress.calibration.dataset import FUTURE
 from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.errors import FramesError
-from me2e_compress.runtime.atomic import write_json
+from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.frames import Array, Frame
 
 INDEX = "scenes.json"
@@ -61,7 +61,7 @@ def write_recording(
     _check_replaceable(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     # Write into a hidden folder first; it may hold an earlier run.
-    partial = folder.with_name(f".{folder.name}.partial")
+    partial = partial_of(folder)
     _check_replaceable(partial, PROGRESS)
     draft = _Draft(partial, _with_pixels(about, pixels or {}), key)
     try:
@@ -77,6 +77,11 @@ def write_recording(
         if len(draft.scenes) < 2:  # nothing to go on from
             shutil.rmtree(draft.folder, ignore_errors=True)
     return folder
+
+
+def partial_of(folder: Path) -> Path:
+    """Return the folder in which a recording is written until it is complete."""
+    return folder.with_name(f".{folder.name}.partial")
 
 
 def _with_pixels(
@@ -102,8 +107,9 @@ class _Draft:
         """Keep the complete scenes of an earlier run of the same frames, if any."""
         kept = self._kept()
         if kept is None:
-            shutil.rmtree(self.folder, ignore_errors=True)
-            self.folder.mkdir()
+            self.folder.mkdir(exist_ok=True)  # it stays, because it may be locked
+            for each in self.folder.iterdir():
+                each.unlink()
             (self.folder / PROGRESS).touch()  # from now on it is known as ours
             return Begin()
         scenes, places = kept
@@ -128,18 +134,21 @@ class _Draft:
             self.scenes.append(self.count)
             self.places.append(frame.place)
             record = {"scenes": self.scenes, "places": self.places}
-            write_json(self.folder / PROGRESS, {"key": self.key, **record})
+            write_document(self.folder / PROGRESS, {"key": self.key, **record})
         path = self._frame(self.count)
         with drafts.naming(path):
             _write_npz(path, frame.arrays)
             if frame.future is not None:
-                text = frame.future.model_dump_json()
-                path.with_suffix(FUTURE).write_text(f"{text}\n")
+                future = marks.IN_JSON | frame.future.model_dump(mode="json")
+                path.with_suffix(FUTURE).write_text(f"{json.dumps(future)}\n")
         self.count += 1
 
     def finish(self) -> None:
         """Write the index, which makes the folder a recording."""
-        index = {"scenes": self.scenes, **self.about, "count": self.count}
+        for left in self.folder.glob(f".{PROGRESS}.*"):  # by a kill
+            left.unlink()
+        about = {**self.about, "count": self.count}
+        index = {**marks.IN_JSON, "scenes": self.scenes, **about}
         with drafts.naming(self.folder / INDEX):
             (self.folder / INDEX).write_text(json.dumps(index, indent=1) + "\n")
 
@@ -172,6 +181,7 @@ def _check_replaceable(folder: Path, mark: str = INDEX) -> None:
 def _write_npz(path: Path, arrays: Mapping[str, Array]) -> None:
     """Write like numpy.savez_compressed, at a fast level, reproducibly."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        archive.comment = marks.BYTES
         for name, value in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy")
             entry.compress_type = zipfile.ZIP_DEFLATED

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from me2e_compress import documents
+from me2e_compress import documents, marks
 from me2e_compress.calibration.archives import load_arrays
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes
@@ -68,6 +68,7 @@ class CalibrationCheckpoint:
         # The state shares the archive, under a prefix.
         content = io.BytesIO()
         with zipfile.ZipFile(content, "w") as archive:
+            archive.comment = marks.BYTES
             for name, array in {
                 "key": np.array(json.dumps(self.key)),
                 "done": np.array(progress.done),

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import io
 import itertools
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self, TypeAlias
@@ -11,6 +12,7 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress import marks
 from me2e_compress.calibration.archives import load_arrays
 from me2e_compress.calibration.shares import Share, check_whole
 from me2e_compress.errors import FramesError
@@ -117,6 +119,8 @@ class Statistics:
             counts=np.empty(0, np.int64) if self.counts is None else self.counts,
             share=np.array(_listed(self.share), np.int64),
         )
+        with zipfile.ZipFile(content, "a") as archive:
+            archive.comment = marks.BYTES
         write_bytes(path, content.getvalue())
 
     @classmethod

@@ -1,5 +1,6 @@
 """Read and write ONNX files: weights mapped, outputs atomic, sources untouched."""
 
+import contextlib
 import hashlib
 import os
 import tempfile
@@ -11,7 +12,7 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 from google.protobuf.message import DecodeError
 
-from me2e_compress import drafts
+from me2e_compress import drafts, marks
 from me2e_compress.display import reason
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import structure
@@ -123,17 +124,31 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
         tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as folder,
     ):
         draft = Path(folder) / path.name
-        if external:
-            ir.save(model, draft, format="protobuf", external_data=data.name)
-        else:
-            write_inline(_inlined(model), draft)
+        with _ours(model):
+            if external:
+                ir.save(model, draft, format="protobuf", external_data=data.name)
+            else:
+                write_inline(_inlined(model), draft)
         # The earlier model keeps its weights until the new one stands in its place.
         draft_data = draft.with_name(data.name)
         if draft_data.exists():
+            with draft_data.open("ab") as stream:
+                stream.write(marks.BYTES)
             drafts.put(draft_data, data)
         drafts.put(draft, path)
     for old in earlier:
         drafts.remove(old)
+
+
+@contextlib.contextmanager
+def _ours(model: ir.Model) -> Iterator[None]:
+    """Let a model name us as its producer while it is written."""
+    before = model.producer_name, model.producer_version
+    model.producer_name, model.producer_version = marks.PRODUCER, None
+    try:
+        yield
+    finally:
+        model.producer_name, model.producer_version = before
 
 
 def data_names(path: Path) -> tuple[Path, Path]:

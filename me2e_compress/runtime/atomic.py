@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from me2e_compress import drafts
+from me2e_compress import drafts, marks
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -32,3 +32,10 @@ def write_json(path: Path, record: dict[str, Any], indent: int | None = None) ->
     """Write a JSON file atomically; the same record gives the same bytes."""
     text = json.dumps(record, indent=indent, allow_nan=False, ensure_ascii=False)
     write_bytes(path, f"{text}\n".encode())
+
+
+def write_document(
+    path: Path, record: dict[str, Any], indent: int | None = None
+) -> None:
+    """Write a JSON file that says that we wrote it, and may so be replaced."""
+    write_json(path, marks.IN_JSON | record, indent)

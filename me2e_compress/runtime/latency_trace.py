@@ -11,7 +11,7 @@ from me2e_compress import documents
 from me2e_compress.display import Displayed, Table, counted, not_measured, table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.percentiles import percentile, too_few
-from me2e_compress.runtime.atomic import write_json
+from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.others_load import Load
 
 PERCENTILES = (50, 90, 99)
@@ -151,7 +151,7 @@ class LatencyTrace(Displayed):
     def save(self, path: Path) -> None:
         """Write the trace atomically."""
         try:
-            write_json(path, self.to_json())
+            write_document(path, self.to_json())
         except OSError as error:
             raise EvaluationError(
                 f"{path}: cannot be written: {error.strerror}"

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from me2e_compress import drafts
+from me2e_compress import drafts, marks
 from me2e_compress.errors import EvaluationError
 from me2e_compress.quantization.plan.overrides import overrides_text, toml_string
 from me2e_compress.runtime.atomic import write_bytes
@@ -129,10 +129,11 @@ def write_recipe(
         lines.append("\n".join(options) + "\n")
     # recipe and overrides together, or neither
     with drafts.all_or_none():
-        write_bytes(path, "\n".join(lines).encode())
+        write_bytes(path, (marks.IN_TOML + "\n".join(lines)).encode())
         if not choice.floats or not choice.modules:
             return None
-        write_bytes(overrides, overrides_text(choice.overrides().override).encode())
+        text = marks.IN_TOML + overrides_text(choice.overrides().override)
+        write_bytes(overrides, text.encode())
     return overrides
 
 

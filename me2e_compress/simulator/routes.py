@@ -9,6 +9,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
+from me2e_compress.marks import IN_JSON
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 
@@ -98,7 +99,9 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
 
 def save_routes(routes: Sequence[Route], path: Path) -> None:
     """Write a manifest atomically, one route a line."""
-    lines = ",\n".join(json.dumps(asdict(route)) for route in routes)
+    records = [asdict(route) for route in routes]
+    records[:1] = [IN_JSON | each for each in records[:1]]  # a list has no other place
+    lines = ",\n".join(map(json.dumps, records))
     try:
         write_bytes(path, f"[\n{lines}\n]\n".encode())
     except OSError as error:

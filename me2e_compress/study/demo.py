@@ -85,7 +85,7 @@ class DriverDemo:
         routes: Routes that both drive: a number or ``ID,ID``.
         workers: Number of concurrent routes.
         provider: Execution provider for the graphs.
-        force: Also replace files that were changed since we wrote them.
+        force: Also replace files that we did not write.
 
     Raises:
         RecipeError: There is no such recipe.

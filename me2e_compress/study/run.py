@@ -41,7 +41,7 @@ def run_study(
             evaluator other than highway ignores it.
         listener: Is called with progress and warnings.
         pictures: Number of routes on which two drives are shown side by side.
-        force: Also replace a report that was changed since we wrote it.
+        force: Also replace a report that we did not write.
 
     Raises:
         GraphError: The folder is a file or an input.

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from me2e_compress import drafts
+from me2e_compress import drafts, marks
 from me2e_compress.display import in_markdown
 from me2e_compress.errors import StudyError
-from me2e_compress.runtime.atomic import write_bytes, write_json
+from me2e_compress.runtime.atomic import write_bytes, write_document
 from me2e_compress.study.all_tables import all_tables
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report import Section, html
@@ -39,17 +39,17 @@ def write_study(
         folder: Created if needed.
         command: The command line that reproduces the study, word by word.
         sections: Additional sections of the page.
-        force: Also replace files that were changed since we wrote them.
+        force: Also replace files that we did not write.
 
     Raises:
         StudyError: The folder cannot be written.
-        GraphError: A file was changed since we wrote it.
+        GraphError: A file is there that we did not write.
     """
     # paths, and all tables as Markdown
     folder = Path(folder)
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
     title = f"{outcome.study.title}{outcome.study.preview}"
-    heading = f"# {in_markdown(title)}\n\n"
+    heading = f"{marks.IN_MARKDOWN}# {in_markdown(title)}\n\n"
     text = heading + "\n".join(table.markdown() for table in all_tables(outcome))
     # all files are written, or none
     try:
@@ -58,7 +58,7 @@ def write_study(
             writing([written.record, written.tables, written.report], force=force),
             drafts.all_or_none(),
         ):
-            write_json(written.record, outcome.to_json(), indent=1)
+            write_document(written.record, outcome.to_json(), indent=1)
             write_bytes(written.tables, text.encode())
             write_bytes(written.report, html(outcome, command, sections).encode())
     except OSError as error:

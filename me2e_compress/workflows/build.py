@@ -22,7 +22,7 @@ class BuildOptions:
 
     Attributes:
         settings: settings of the TensorRT builder.
-        force: replace outputs that are not as we left them, too.
+        force: replace outputs that we did not write, too.
     """
 
     settings: EngineSettings = dataclasses.field(default_factory=EngineSettings)

@@ -60,7 +60,7 @@ class CalibrateOptions:
         adapter: TOML file that says which outputs are fed back; give it to ``compress``
             too.
         provider: what runs the graph.
-        force: replace outputs that are not as we left them, too.
+        force: replace outputs that we did not write, too.
 
     Raises:
         RecipeError: The method, a number or the shard is not valid.

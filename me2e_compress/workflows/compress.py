@@ -73,7 +73,7 @@ class CompressOptions:
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         adapter: TOML file whose plan and state become metadata of the graph.
         provider: what runs graphs, to calibrate, check and measure.
-        force: replace outputs that are not as we left them, too.
+        force: replace outputs that we did not write, too.
     """
 
     scheme: str | None = None

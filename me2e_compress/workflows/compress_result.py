@@ -9,7 +9,7 @@ from me2e_compress import drafts, graph
 from me2e_compress.manager import Report
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.quantization.plan import plan_of, save_plan
-from me2e_compress.runtime.atomic import write_json
+from me2e_compress.runtime.atomic import write_document
 from me2e_compress.workflows.compress_fidelity import MeasuredLoss
 from me2e_compress.workflows.compress_verdict import (
     alerts,
@@ -180,6 +180,6 @@ def write_result(
             save_plan(plan, beside(output, "plan"))
         about = weights | loss_record(report, int8, loss)
         record = report.record(source, output) | about
-        write_json(beside(output, "report"), record, indent=2)
+        write_document(beside(output, "report"), record, indent=2)
     sizes = graph.file_bytes(source), graph.file_bytes(output)
     return CompressResult(source, output, report, record, *sizes, int8, loss, seconds)

@@ -9,7 +9,7 @@ from time import process_time
 
 import numpy as np
 
-from me2e_compress import drafts
+from me2e_compress import drafts, marks
 from me2e_compress.calibration.part_frames import PartFrames
 from me2e_compress.calibration.sample import FrameSubset
 from me2e_compress.calibration.stream import Recording
@@ -24,7 +24,7 @@ from me2e_compress.fidelity.compare import compare
 from me2e_compress.fidelity.floor import Floor
 from me2e_compress.manager.pass_manager import collector_paused
 from me2e_compress.passes import Pass
-from me2e_compress.runtime.atomic import write_bytes, write_json
+from me2e_compress.runtime.atomic import write_bytes, write_document
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.stack.split_stack import SplitStack
 from me2e_compress.runtime.stack.stack_file import PartEntry
@@ -136,7 +136,7 @@ def _compress(
     small = SplitStack.load(_write_toml(whole, draft))
     loss = _measured(whole, small, split, found, options)
     record = stack_record(whole, small, found, loss)
-    write_json(draft / REPORT, record, indent=2)
+    write_document(draft / REPORT, record, indent=2)
     seconds = process_time() - start
     # results name the files where the draft will be put
     moved = {
@@ -237,11 +237,13 @@ def _write_toml(whole: SplitStack, draft: Path) -> Path:
         value = whole.first_values.get(name, value)
         if value is not None:
             file = draft / f"first_value_{at}.npy"
-            np.save(file, value, allow_pickle=False)
+            with file.open("wb") as stream:
+                np.save(stream, value, allow_pickle=False)
+                stream.write(marks.BYTES)
             state[name] = entry.model_copy(update={"first": file.name})
     path = draft / whole.path.name
     small = said.model_copy(update={"part": parts, "state": state})
-    write_bytes(path, small.text().encode())
+    write_bytes(path, (marks.IN_TOML + small.text()).encode())
     return path
 
 

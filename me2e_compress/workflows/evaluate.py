@@ -63,7 +63,7 @@ class EvaluateOptions:
         address: address of a Ray cluster.
         render: draw these routes as GIF and PNG; chosen as ``routes`` is.
         provider: what runs the model; policies other than graphs ignore it.
-        force: replace outputs that are not as we left them, too.
+        force: replace outputs that we did not write, too.
         evaluator: ``highway``, whose options are those above; or another by name,
             ``name{option=value}``, which gets the policy as its option ``policy``.
     """

@@ -41,7 +41,7 @@ class ExportOptions:
         heads: which last layers: ``nuscenes`` or ``bench2drive`` of vad-tiny,
             ``bench2drive`` or ``beta`` of tcp; None is the first.
         seed: seed of the initial weights; None is 0.
-        force: replace outputs that are not as we left them, too.
+        force: replace outputs that we did not write, too.
         operators: ``plugin`` writes deformable attention as one node.
         dialect: plugin library whose form that node has; None is the toolkit's own
             form.

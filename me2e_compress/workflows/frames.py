@@ -7,7 +7,12 @@ from pathlib import Path
 from me2e_compress.calibration.logs import LOGS, DriveLog
 from me2e_compress.calibration.logs.log_frames import LoggedInputs
 from me2e_compress.calibration.pixels import PixelInput
-from me2e_compress.calibration.recording import Begin, Source, write_recording
+from me2e_compress.calibration.recording import (
+    Begin,
+    Source,
+    partial_of,
+    write_recording,
+)
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file
@@ -42,7 +47,7 @@ class FramesOptions:
         seed: seed of everything random.
         scene_length: frames a scene; None is `SCENE_LENGTH` of a synthetic world,
             `DRIVEN_SCENE_LENGTH` of a driven route, all that a log has.
-        force: replace outputs that are not as we left them, too.
+        force: replace outputs that we did not write, too.
         provider: what opens the model whose frames they are.
         log: recorded driving that they are made from; None makes them up.
         adapter: TOML file that adapts an ONNX file to the policy contract, or the name
@@ -127,7 +132,7 @@ def record_frames(
     """
     options, folder = options or FramesOptions(), Path(folder)
     check_folder(folder, (source, options.adapter))
-    with writing(trees=[folder], force=options.force):
+    with writing(trees=[folder], folders=[partial_of(folder)], force=options.force):
         return _recorded(source, folder, options, listener)
 
 

@@ -47,7 +47,7 @@ class TrialOptions:
         adapter: TOML file that says which output is the plan, which are fed back, and
             how the model drives.
         provider: what runs the graphs.
-        force: replace outputs that are not as we left them, too.
+        force: replace outputs that we did not write, too.
     """
 
     scheme: str = "full"

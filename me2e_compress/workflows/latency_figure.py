@@ -13,6 +13,7 @@ from matplotlib.style import context
 from matplotlib.ticker import PercentFormatter
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.marks import MARK
 from me2e_compress.metrics.percentiles import percentile, too_few
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.latency_trace import LatencyTrace, Microseconds
@@ -47,8 +48,9 @@ def draw_modules(trace: LatencyTrace, name: str, path: Path) -> None:
     with context(_STYLE, after_reset=True):
         figure, drawn = modules_figure(trace, name), io.BytesIO()
         kind = path.suffix.removeprefix(".")
-        undated = {"Date": None} if kind == "svg" else None
-        figure.savefig(drawn, format=kind, dpi=160, metadata=undated)
+        about = {"Software" if kind == "png" else "Creator": MARK}
+        undated = {"Date": None} if kind == "svg" else {}
+        figure.savefig(drawn, format=kind, dpi=160, metadata=about | undated)
     try:
         write_bytes(path, drawn.getvalue())
     except OSError as error:

@@ -39,7 +39,7 @@ class PlanOptions:
         module_map: preset or TOML file; None finds the preset.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         weight_only_gemv: store the weights of matrix-vector products as int8.
-        force: replace outputs that are not as we left them, too.
+        force: replace outputs that we did not write, too.
     """
 
     scheme: str | None = None

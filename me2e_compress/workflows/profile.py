@@ -57,7 +57,7 @@ class ProfileOptions:
         by_module: also measure modules and operators, in inferences of their own.
         module_map: preset or TOML file; None finds the preset.
         figure: draw modules over inferences as PNG, SVG or PDF; measures them.
-        force: replace outputs that are not as we left them, too.
+        force: replace outputs that we did not write, too.
         energy: also measure joules by ``auto`` or a named counter; None does not.
         energy_output: file of the joules; None is beside the trace, ``.energy.json``.
         schedule: how long energy is measured, and how often; None takes the defaults.

@@ -29,7 +29,7 @@ class RoutesOptions:
         variants: number of variants of each scenario type.
         scenarios: ``all``, or ``NAME,NAME``.
         workers: scenario types at a time.
-        force: replace outputs that are not as we left them, too.
+        force: replace outputs that we did not write, too.
     """
 
     seed: int = 0

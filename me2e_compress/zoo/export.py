@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, cast
 import onnx
 
 from me2e_compress.errors import GraphError, MissingExtraError
+from me2e_compress.marks import PRODUCER
 from me2e_compress.zoo.construct import construct
 from me2e_compress.zoo.model_files import write
 from me2e_compress.zoo.stacks import TCP, UNIADS, Stack, find
@@ -92,6 +93,7 @@ def save(graph: onnx.ModelProto, metadata: Mapping[str, str], path: Path) -> Pat
     """Write a traced graph with metadata properties atomically, and return the path."""
     for key, value in metadata.items():
         graph.metadata_props.add(key=key, value=value)
+    graph.producer_name, graph.producer_version = PRODUCER, ""
     return write(path, graph.SerializeToString())
 
 

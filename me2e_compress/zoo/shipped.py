@@ -123,14 +123,24 @@ def sample_frames(model: Path, folder: Path | None = None) -> Path | None:
 
     Two frames of a drive suffice to verify exact passes, but not to calibrate.
     """
-    folder = folder or WEIGHTS
+    name = _copied(model, folder := folder or WEIGHTS)
+    frames = folder / f"{name}-frames"
+    return frames if name is not None and frames.is_dir() else None
+
+
+def is_copy(path: Path) -> bool:
+    """Return whether a file is a copy of a model that ships."""
+    return path.is_file() and _copied(path, WEIGHTS) is not None
+
+
+def _copied(model: Path, folder: Path) -> str | None:
+    """Return the name of the shipped model that a file is a copy of."""
     for name in SHIPPED:
-        known, frames = card(name, folder), folder / f"{name}-frames"
-        # Compare sizes before hashing
-        if not frames.is_dir() or model.stat().st_size != known.bytes:
+        known = card(name, folder)
+        if model.stat().st_size != known.bytes:
             continue
         if hashlib.sha256(model.read_bytes()).hexdigest() == known.sha256:
-            return frames
+            return name
     return None
 
 

@@ -10,6 +10,7 @@ import pytest
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.recording import Begin, Source, write_recording
 from me2e_compress.errors import FramesError
+from me2e_compress.marks import IN_JSON
 from me2e_compress.runtime.frames import Frame
 
 
@@ -48,6 +49,7 @@ def test_the_index_says_where_the_frames_are_from(tmp_path: Path) -> None:
     folder = write_recording(tmp_path / "frames", source(3), {"stack": "s", "seed": 4})
 
     assert json.loads((folder / "scenes.json").read_text()) == {
+        **IN_JSON,
         "scenes": [0, 2],
         "stack": "s",
         "seed": 4,

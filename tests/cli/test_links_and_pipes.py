@@ -13,29 +13,11 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.recording import write_recording
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.workflows.claims import RECORD
 from me2e_compress.zoo.state_dict import read_state_dict
 from tests.cli.conftest import Command
 
 EXACT = ("compress", "in.onnx", "-o", "out.onnx", "--passes", "import-normalize")
 ONE = Frame(0, True, {"camera": np.zeros((1, 4), np.float32)})
-
-
-def test_a_link_in_the_place_of_the_record_is_not_followed(
-    command: Command,
-    files: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(files)
-    (files / "thesis.txt").write_text("years of work")
-    (files / RECORD).symlink_to("thesis.txt")
-
-    assert command(*EXACT) == 1
-
-    assert "me2e-compress.json is a link" in capsys.readouterr().err
-    assert (files / "thesis.txt").read_text() == "years of work"
-    assert not (files / "out.onnx").exists()
 
 
 @pytest.mark.parametrize("name", [".out.partial", ".out.partial.before"])

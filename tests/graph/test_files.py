@@ -9,6 +9,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import files
+from me2e_compress.marks import BYTES
 
 
 def weighted(rows: int = 64) -> ir.Model:
@@ -40,7 +41,7 @@ def test_external_weights_stay_on_disk(tmp_path: Path) -> None:
     graph.save(weighted(), tmp_path / "m.onnx", external=True)
     back = graph.load(tmp_path / "m.onnx")
     assert isinstance(back.graph.initializers["w"].const_value, ir.ExternalTensor)
-    assert (tmp_path / "m.onnx.data").stat().st_size == 64 * 8 * 4
+    assert (tmp_path / "m.onnx.data").stat().st_size == 64 * 8 * 4 + len(BYTES)
 
 
 def test_what_came_external_is_saved_external(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ def test_a_manifest_comes_back_as_it_was_written(tmp_path: Path) -> None:
     assert load_routes(file) == ROUTES
     assert list(tmp_path.iterdir()) == [file]
     assert set(json.loads(file.read_text())[0]) == {
+        "generator",
         "id",
         "scenario",
         "ability",

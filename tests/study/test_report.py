@@ -12,13 +12,13 @@ from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.runtime.others_load import Load
 from me2e_compress.study import Condition, StudyResult
 from me2e_compress.study.all_tables import MOST_ROUTES, route_table
+from me2e_compress.marks import IN_JSON, IN_MARKDOWN
 from me2e_compress.study.report import html
 from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import Point, forest, front, pareto
 from me2e_compress.study.report.findings import TIMES, findings, sure
 from me2e_compress.study.tables import MINUS
 from me2e_compress.study.write import write_study
-from me2e_compress.workflows.claims import RECORD
 from tests.study.conftest import IDEAL, ROUTES, SLOW
 
 pytestmark = pytest.mark.xdist_group("study")
@@ -195,13 +195,13 @@ def test_files_are_written_beside_each_other(
 ) -> None:
     written = write_study(found, tmp_path / "new" / "study")
 
-    assert json.loads(written.record.read_text()) == found.to_json()
+    assert json.loads(written.record.read_text()) == IN_JSON | found.to_json()
     assert written.tables.read_text().startswith(
-        "# Slow &amp; &lt;fast&gt; (preview: 2 of 220 routes)\n\n**Scoreboard, "
+        f"{IN_MARKDOWN}# Slow &amp; &lt;fast&gt; (preview: 2 of 220 routes)\n\n**Scoreboard, "
     )
     assert written.report.read_text().startswith("<!doctype html>")
     found_files = {path.name for path in (tmp_path / "new" / "study").iterdir()}
-    assert found_files == {RECORD, "report.html", "study.json", "tables.md"}
+    assert found_files == {"report.html", "study.json", "tables.md"}
 
 
 def test_a_folder_that_cannot_be_written(found: StudyResult, tmp_path: Path) -> None:

@@ -1,115 +1,75 @@
-import json
+"""What is there is replaced if it says that it is ours, and else only by force."""
+
+import errno
+import fcntl
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from me2e_compress import drafts
+from me2e_compress.calibration.recording import partial_of, write_recording
 from me2e_compress.errors import GraphError
-from me2e_compress.runtime.atomic import write_bytes
-from me2e_compress.workflows.claims import RECORD, check_ours, writing
+from me2e_compress.marks import MARK
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.workflows.claims import check_ours, writing
+from me2e_compress.zoo import shipped
 
-THEIRS = "is there, and not as me2e-compress left it"
+THEIRS = "is there, and me2e-compress did not write it"
+OURS = f"# {MARK}\n"
 
 
-def write(path: Path, text: str = "ours") -> None:
-    with writing([path]):
+def write(path: Path, text: str = OURS, *, force: bool = False) -> None:
+    with writing([path], force=force):
         path.write_text(text)
 
 
 def test_a_file_of_the_user_stays(tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("theirs")
+    (tmp_path / "out").write_text("theirs, for me2e-compress")
     with pytest.raises(GraphError, match=THEIRS):
         write(tmp_path / "out")
-    assert (tmp_path / "out").read_text() == "theirs"
+    assert (tmp_path / "out").read_text() == "theirs, for me2e-compress"
     assert [file.name for file in tmp_path.iterdir()] == ["out"]
 
 
 def test_a_file_of_the_user_goes_by_force(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("theirs")
-    with writing([tmp_path / "out"], force=True):
-        (tmp_path / "out").write_text("ours")
-    write(tmp_path / "out", "again")
+    write(tmp_path / "out", force=True)
+    assert (tmp_path / "out").read_text() == OURS
 
 
-def test_what_we_wrote_is_written_again(tmp_path: Path) -> None:
-    write(tmp_path / "out")
-    write(tmp_path / "out", "again")
-    assert (tmp_path / "out").read_text() == "again"
+def test_what_says_that_we_wrote_it_is_written_again(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text(f"{OURS}and edited since\n")
+    write(tmp_path / "out", f"{OURS}again")
+    assert (tmp_path / "out").read_text() == f"{OURS}again"
 
 
-def test_what_we_wrote_and_the_user_changed_stays(tmp_path: Path) -> None:
-    write(tmp_path / "out")
-    (tmp_path / "out").write_text("theirs now")
+def test_one_file_of_the_user_among_ours_stays(tmp_path: Path) -> None:
+    (tmp_path / "one").write_text(OURS)
+    (tmp_path / "other").write_text("theirs")
+    with pytest.raises(GraphError, match=rf"other {THEIRS}"):
+        check_ours([tmp_path / "one", tmp_path / "other"])
+
+
+@pytest.mark.parametrize("target", ["ours", "nothing"])
+def test_a_link_is_not_followed(tmp_path: Path, target: str) -> None:
+    (tmp_path / "ours").write_text(OURS)
+    (tmp_path / "out").symlink_to(target)
     with pytest.raises(GraphError, match=THEIRS):
-        check_ours([tmp_path / "out"])
-
-
-def test_a_run_that_failed_owns_what_it_wrote_and_nothing_else(tmp_path: Path) -> None:
-    (tmp_path / "theirs").write_text("theirs")
-
-    def fail() -> None:
-        with writing([tmp_path / "new", tmp_path / "theirs"], force=True):
-            (tmp_path / "new").write_text("half")
-            raise ValueError("full")
-
-    with pytest.raises(ValueError, match="full"):
-        fail()
-    check_ours([tmp_path / "new"])
-    with pytest.raises(GraphError, match=THEIRS):
-        check_ours([tmp_path / "theirs"])
-
-
-def test_looking_first_changes_nothing_of_what_is_known(tmp_path: Path) -> None:
-    files = [tmp_path / name for name in ("study.json", "tables.md", "report.html")]
-    with writing(files):
-        for file in files:
-            file.write_text(file.name)
-    known = (tmp_path / RECORD).read_text()
-    check_ours(files)
-    assert (tmp_path / RECORD).read_text() == known
-
-
-def test_outputs_that_are_not_written_stay_ours(tmp_path: Path) -> None:
-    files = [tmp_path / "one", tmp_path / "other"]
-    with writing(files):
-        for file in files:
-            file.write_text(file.name)
-    with writing(files):
-        pass
-    check_ours(files)
-
-
-def test_a_run_without_an_output_leaves_no_record(tmp_path: Path) -> None:
-    with writing([tmp_path / "out"], folders=[tmp_path / "folder"]):
-        pass
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_is_ours_as_a_whole(tmp_path: Path) -> None:
-    folder = tmp_path / "frames"
-    with writing(trees=[folder]):
-        folder.mkdir()
-        (folder / "000000.npz").write_text("ours")
-    with writing(trees=[folder]):
-        pass
-    (folder / "000001.npz").write_text("theirs")
-    with pytest.raises(GraphError, match=THEIRS), writing(trees=[folder]):
-        pass
+        write(tmp_path / "out")
+    assert (tmp_path / "ours").read_text() == OURS
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir], ids=["pipe", "folder"])
-def test_only_regular_files_are_replaced(tmp_path: Path, make: object) -> None:
-    make(tmp_path / "out")  # type: ignore[operator]
-    with (
-        pytest.raises(GraphError, match=r"name a file"),
-        writing([tmp_path / "out"], force=True),
-    ):
-        pass
+def test_only_regular_files_are_replaced(
+    tmp_path: Path, make: Callable[[Path], None]
+) -> None:
+    make(tmp_path / "out")
+    with pytest.raises(GraphError, match=r"name a file"):
+        write(tmp_path / "out", force=True)
 
 
 def test_a_device_is_no_output() -> None:
@@ -117,132 +77,111 @@ def test_a_device_is_no_output() -> None:
         write(Path("/dev/null"))
 
 
+def test_a_copy_of_a_model_that_ships_is_replaced_and_a_link_to_it_is_not(
+    tmp_path: Path,
+) -> None:
+    shipped.copy("highway", tmp_path / "copy.onnx")
+    (tmp_path / "link.onnx").symlink_to("copy.onnx")
+    check_ours([tmp_path / "copy.onnx"])
+    with pytest.raises(GraphError, match=THEIRS):
+        check_ours([tmp_path / "link.onnx"])
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    """A folder of ours, with a folder in it."""
+    (tmp_path / "out" / "in").mkdir(parents=True)
+    (tmp_path / "out" / "one").write_text(OURS)
+    (tmp_path / "out" / "in" / "other").write_text(OURS)
+    return tmp_path / "out"
+
+
+def test_a_folder_is_ours_if_all_of_it_is(tree: Path) -> None:
+    check_ours([], trees=[tree])
+    (tree / "in" / "notes.txt").write_text("theirs")
+    with pytest.raises(GraphError, match=THEIRS):
+        check_ours([], trees=[tree])
+    check_ours([], trees=[tree], force=True)
+
+
+def test_a_link_in_a_folder_or_to_a_folder_is_not_ours(tree: Path) -> None:
+    (tree.parent / "link").symlink_to(tree.name)
+    with pytest.raises(GraphError, match=THEIRS):
+        check_ours([], trees=[tree.parent / "link"])
+    (tree / "in" / "link").symlink_to("other")
+    with pytest.raises(GraphError, match=THEIRS):
+        check_ours([], trees=[tree])
+
+
+def test_an_empty_folder_is_filled(tmp_path: Path) -> None:
+    check_ours([], trees=[tmp_path, tmp_path / "new"])
+
+
 BUSY = """
 import sys
 from pathlib import Path
-from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.workflows.claims import writing
-out = Path(sys.argv[1])
-with writing([out], folders=[out.parent / "results"]):
-    write_bytes(out, b"half")
+with writing(folders=[Path(sys.argv[1])]):
     print("busy", flush=True)
     sys.stdin.read()
 """
 
 
-def test_one_writes_at_a_time_and_a_killed_run_is_gone_on_with(tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def work(folder: Path) -> None:
+    with writing(folders=[folder]):
+        (folder / "result").write_text("one")
+
+
+def test_one_works_in_a_folder_until_it_is_killed(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "results"
     with subprocess.Popen(
-        [sys.executable, "-c", BUSY, out],
+        [sys.executable, "-c", BUSY, folder],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     ) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == b"busy\n"
-        with pytest.raises(GraphError, match="out is in use: another me2e-compress"):
-            write(out)
-        with (
-            pytest.raises(GraphError, match="results is in use"),
-            writing(folders=[tmp_path / "results"]),
-        ):
-            pass
-        write(tmp_path / "beside")  # another output of the same folder
+        with pytest.raises(GraphError, match="results is in use: another me2e-compre"):
+            work(folder)
+        work(folder.with_name("beside"))
         other.kill()
-    assert "next" in json.loads((tmp_path / RECORD).read_text())["out"]
-    write(out)
-    assert out.read_text() == "ours"
+    work(folder)
+    assert [each.name for each in folder.iterdir()] == ["result"]
 
 
-@pytest.mark.parametrize("text", ["", "[", "[]", '{"out": 7}', '{"out": {"left": 7}}'])
-def test_a_record_that_says_nothing_owns_nothing(tmp_path: Path, text: str) -> None:
-    (tmp_path / RECORD).write_text(text)
-    (tmp_path / "out").write_text("theirs")
-    with pytest.raises(GraphError, match=THEIRS):
-        write(tmp_path / "out")
-
-
-Kept = Callable[[], None]
-
-
-def kills(
-    monkeypatch: pytest.MonkeyPatch, folder: Path, work: Kept, copies: Path
-) -> list[Path]:
-    """Copy a folder as a kill would leave it: before each write, and in its middle."""
-    made = list[Path]()
-
-    def keep() -> None:
-        made.append(shutil.copytree(folder, copies / str(len(made)), symlinks=True))
-
-    def first(call: Callable[..., object]) -> Callable[..., object]:
-        def kept(*given: object, **options: object) -> object:
-            keep()
-            return call(*given, **options)
-
-        return kept
-
-    def halved(handle: int, content: bytes, place: int) -> int:
-        keep()
-        pwrite(handle, content[: len(content) // 2], place)
-        keep()
-        return pwrite(handle, content, place)
-
-    pwrite = os.pwrite
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "pwrite", halved)
-        for name in ("replace", "ftruncate", "unlink"):
-            patch.setattr(os, name, first(getattr(os, name)))
-        work()
-    keep()
-    return made
-
-
-@pytest.mark.parametrize("runs_before", [0, 1])
-def test_what_a_kill_leaves_is_gone_on_with_and_what_users_change_is_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runs_before: int
-) -> None:
-    names = ("study.json", "tables.md")
-    folder = tmp_path / "study"
-    folder.mkdir()
-
-    def run(where: Path = folder, text: str = "written once more") -> None:
-        files = [where / name for name in names]
-        check_ours(files)
-        with writing(files):
-            for file in files:
-                write_bytes(file, text.encode())
-
-    for _ in range(runs_before):
-        run(text="written")
-    copies = kills(monkeypatch, folder, run, tmp_path / "copies")
-    assert len(copies) > 20
-    for copy in copies:
-        check_ours(there := [copy / name for name in names if (copy / name).exists()])
-        for file in there:
-            ours, about = file.read_text(), file.stat()
-            file.write_text("changed by me")
-            with pytest.raises(GraphError, match=THEIRS):
-                check_ours([file])
-            file.write_text(ours)
-            os.utime(file, ns=(about.st_atime_ns, about.st_mtime_ns))
-        run(copy)
-        check_ours([copy / name for name in names])
-
-
-def test_a_folder_that_a_kill_left_half_replaced_is_gone_on_with(
+def test_a_file_system_without_locks_grants_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    top = tmp_path / "top"
-    top.mkdir()
+    def none(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "no locks here")
 
-    def run(where: Path = top) -> None:
-        with writing(trees=[where / "frames"]):
-            (where / "draft").mkdir(exist_ok=True)
-            (where / "draft" / "000000.npz").write_text("ours")
-            drafts.put(where / "draft", where / "frames")
+    monkeypatch.setattr(fcntl, "flock", none)
+    work(tmp_path)
 
-    run()
-    for copy in kills(monkeypatch, top, run, tmp_path / "copies"):
-        run(copy)
-        left = (each.name for each in copy.iterdir())  # what stood there may wait aside
-        shown = sorted(each for each in left if not each.startswith(".frames."))
-        assert shown == [RECORD, "frames"]
+
+def test_a_folder_that_stayed_empty_goes_unless_it_was_there(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    with writing(folders=[tmp_path / "there", tmp_path / "new"]):
+        assert (tmp_path / "new").is_dir()
+    assert [each.name for each in tmp_path.iterdir()] == ["there"]
+
+
+def test_unfinished_frames_of_another_run_are_cleared_under_the_lock(
+    tmp_path: Path,
+) -> None:
+    partial = partial_of(tmp_path / "out")
+    partial.mkdir()
+    for name in ("progress.json", "000007.npz"):
+        (partial / name).write_text("{}")
+    frame = Frame(0, True, {"camera": np.zeros((1, 4), np.float32)})
+
+    def source(_: object) -> list[Frame]:
+        with pytest.raises(GraphError, match="partial is in use"):
+            work(partial)
+        return [frame]
+
+    with writing(folders=[partial]):
+        write_recording(tmp_path / "out", source, {})
+    names = sorted(each.name for each in (tmp_path / "out").iterdir())
+    assert names == ["000000.npz", "scenes.json"]
+    check_ours([], trees=[tmp_path / "out"])

@@ -23,7 +23,7 @@ def full_at_the_report(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, *_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-    monkeypatch.setattr(compress_result, "write_json", full)
+    monkeypatch.setattr(compress_result, "write_document", full)
 
 
 @pytest.mark.usefixtures("full_at_the_report")

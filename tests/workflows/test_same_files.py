@@ -9,7 +9,6 @@ import pytest
 
 import me2e_compress as me2e
 from me2e_compress.simulator.routes import save_routes
-from me2e_compress.workflows.claims import RECORD
 from me2e_compress.workflows.export import export_stack
 from me2e_compress.workflows.result import Result
 from me2e_compress.workflows.routes import RoutesOptions, examine_routes, make_routes
@@ -229,7 +228,7 @@ def written(folder: Path) -> dict[str, object]:
     return {
         str(path.relative_to(folder)): content(path)
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.suffix != ".log" and path.name != RECORD
+        if path.is_file() and path.suffix != ".log"
     }
 
 

@@ -12,6 +12,7 @@ from typing import Any, Self
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.worker import Driven, Job
+from me2e_compress.marks import IN_JSON
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.simulator.routes import Route, is_route_id
@@ -139,7 +140,8 @@ class ResultsFolder:
         self.keep(episode)
         try:
             with self.log.open("a", encoding="utf-8") as log:
-                log.write(f"{json.dumps(cost)}\n")
+                mark = {} if log.tell() else IN_JSON
+                log.write(f"{json.dumps(cost | mark)}\n")
         except OSError as error:
             raise _unwritable(self.log, error) from error
 

@@ -15,7 +15,7 @@ from me2e_compress.errors import RecipeError
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.operators import int8_op_types
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.runtime.atomic import write_json
+from me2e_compress.runtime.atomic import write_document
 
 METADATA = "me2e.quant_plan"
 """Key of the model's metadata under which a quantized graph carries its plan."""
@@ -180,7 +180,7 @@ def record(plan: QuantPlan) -> dict[str, object]:
 
 def save_plan(plan: QuantPlan, path: Path) -> None:
     """Write a plan as JSON, all or nothing."""
-    write_json(path, record(plan), indent=1)
+    write_document(path, record(plan), indent=1)
 
 
 def load_plan(path: Path) -> QuantPlan:

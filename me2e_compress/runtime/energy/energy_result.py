@@ -10,7 +10,7 @@ from pydantic import Field, TypeAdapter
 from me2e_compress import documents
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import EnergyError
-from me2e_compress.runtime.atomic import write_json
+from me2e_compress.runtime.atomic import write_document
 
 Finite: TypeAlias = Annotated[float, Field(allow_inf_nan=False)]
 NotNegative: TypeAlias = Annotated[float, Field(allow_inf_nan=False, ge=0)]
@@ -156,7 +156,7 @@ class EnergyResult(Displayed):
     def save(self, path: Path) -> None:
         """Write the result atomically."""
         try:
-            write_json(path, self.to_json(), indent=2)
+            write_document(path, self.to_json(), indent=2)
         except OSError as error:
             raise EnergyError(f"{path}: cannot be written: {error.strerror}") from error
 

@@ -37,7 +37,7 @@ class RoadSearchOptions:
         threads: Threads of onnxruntime while they are timed.
         seed: Seed of the order of routes, of draws from traces and of bootstraps.
         provider: What runs the models.
-        force: Also replace a recipe that was changed since we wrote it.
+        force: Also replace a recipe that we did not write.
 
     Raises:
         RecipeError: A number is too small, or int8 for another target is timed here.

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph, marks, recipe
 from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
@@ -78,8 +78,7 @@ def search_on_road(
         fitting = within(made, options)
         rungs = climbed(made, fitting, options, tell)
         winner = rungs[-1].standings[0].name
-        # the recipe of the winner
-        text = recipe.to_toml(
+        text = marks.IN_TOML + recipe.to_toml(
             grid[winner].passes(options.rules, options.runs_on, options.dims)
         )
         write_bytes(recipe_file, text.encode())

@@ -8,6 +8,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
+from me2e_compress.marks import MARK
 from me2e_compress.study.all_tables import near_misses, route_table
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report.curves import curves
@@ -52,7 +53,7 @@ def template(name: str) -> Template:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-    ).get_template(name)
+    ).get_template(name, globals={"mark": MARK})
 
 
 def html(

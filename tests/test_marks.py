@@ -1,0 +1,137 @@
+"""What we write says so, in every format; what a user made does not."""
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.recording import write_recording
+from me2e_compress.calibration.resume import CalibrationState, CalibrationCheckpoint
+from me2e_compress.calibration.statistics import Statistics
+from me2e_compress.marks import BYTES, MARK, is_marked
+from me2e_compress.runtime.atomic import write_document
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.recorded_future import RecordedFuture
+from me2e_compress.sensitivity.recipes import write_recipe
+from me2e_compress.sensitivity.trials import Int8Choice
+from me2e_compress.simulator.routes import load_routes, save_routes
+from me2e_compress.workflows.latency_figure import draw_modules
+from me2e_compress.zoo.export import save as save_export
+from tests.graph.test_files import weighted
+from tests.workflows.test_latency_figure import trace_of
+
+FUTURE = RecordedFuture(
+    waypoints=((0.0, 1.0),) * 6,
+    forward=0.0,
+    ego=(4.0, 2.0),
+    centre=(0.0, 0.0),
+    agents=None,
+    command=0,
+)
+SEEN = Statistics("m", "s", ("t",), (0,), np.zeros((1, 1, 3), np.float32))
+
+
+def export(path: Path) -> None:
+    """Write what the exporter of torch gives: it names itself."""
+    made = onnx.helper.make_model(
+        onnx.helper.make_graph([], "g", [], []),
+        producer_name="pytorch",
+        producer_version="2.13",
+    )
+    save_export(made, {"key": "value"}, path)
+
+
+def record(folder: Path) -> None:
+    arrays = {"camera": np.zeros((1, 4), np.float32)}
+    write_recording(folder, lambda _: [Frame(0, True, arrays, future=FUTURE)], {})
+
+
+def recipe(path: Path) -> None:
+    choice = Int8Choice(("head",), ("node",))
+    write_recipe(path, choice, {"fold-constants": {}}, "paper", "tensorrt")
+
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "a.json": lambda path: write_document(path, {"long": "x" * 9000}),
+    "m.onnx": lambda path: graph.save(weighted(), path),
+    "w.onnx": lambda path: graph.save(weighted(9000), path, external=True),
+    "e.onnx": export,
+    "r.toml": recipe,
+    "s.npz": SEEN.save,
+    "c.checkpoint": lambda path: CalibrationCheckpoint(path, {}).write(CalibrationState()),
+    "frames": record,
+    "routes.json": lambda path: save_routes(load_routes(), path),
+    "f.png": lambda path: draw_modules(trace_of(9), "m", path),
+    "f.svg": lambda path: draw_modules(trace_of(9), "m", path),
+    "f.pdf": lambda path: draw_modules(trace_of(9), "m", path),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_all_that_is_written_says_so(tmp_path: Path, name: str) -> None:
+    WRITERS[name](tmp_path / name)
+    written = {each.name: is_marked(each) for each in tmp_path.iterdir()}
+    assert name in written
+    assert all(written.values())
+
+
+def test_what_says_so_is_read_as_before(tmp_path: Path) -> None:
+    record(tmp_path / "frames")
+    (frame,) = CalibrationSet(tmp_path / "frames")
+    assert frame.future == FUTURE
+    save_routes(load_routes(), tmp_path / "routes.json")
+    assert load_routes(tmp_path / "routes.json") == load_routes()
+    graph.save(weighted(), tmp_path / "m.onnx")
+    assert graph.digest(graph.load(tmp_path / "m.onnx")) == graph.digest(weighted())
+
+
+def test_a_graph_that_another_program_made_of_ours_is_not_ours(tmp_path: Path) -> None:
+    graph.save(weighted(), tmp_path / "m.onnx")
+    model = onnx.load(tmp_path / "m.onnx")
+    assert (model.producer_name, model.producer_version) == ("me2e-compress", "")
+    model.producer_name = "onnx.quantize"
+    onnx.save(model, tmp_path / "m.onnx")
+    assert not is_marked(tmp_path / "m.onnx")
+
+
+def test_saving_leaves_the_name_of_the_producer_in_memory(tmp_path: Path) -> None:
+    model = weighted()
+    model.producer_name, model.producer_version = "pytorch", "2.13"
+    graph.save(model, tmp_path / "m.onnx")
+    assert (model.producer_name, model.producer_version) == ("pytorch", "2.13")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"for me2e-compress",
+        bytes(9000) + BYTES + bytes(9000),
+        b"me2e-compress" * 9,
+    ],
+    ids=["empty", "a name", "in the middle", "names"],
+)
+def test_what_does_not_say_so_is_not_ours(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "file").write_bytes(content)
+    assert not is_marked(tmp_path / "file")
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("ours")])
+def test_pipes_and_links_are_not_ours(
+    tmp_path: Path, make: Callable[[Path], None]
+) -> None:
+    (tmp_path / "ours").write_text(MARK)
+    make(tmp_path / "file")
+    assert not is_marked(tmp_path / "file")
+    assert not is_marked(tmp_path)
+
+
+def test_a_copy_is_ours_as_well(tmp_path: Path) -> None:
+    recipe(tmp_path / "r.toml")
+    assert is_marked(shutil.copy(tmp_path / "r.toml", tmp_path / "copy.toml"))
