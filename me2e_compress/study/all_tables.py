@@ -1,9 +1,9 @@
 """All tables of a study, including near misses and endings of routes."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from me2e_compress.study.drives import Drive
+from me2e_compress.study.outcome import StudyOutcome
 from me2e_compress.study.tables import (
     MISSING,
     abilities,
@@ -14,15 +14,12 @@ from me2e_compress.study.tables import (
 )
 from me2e_compress.workflows.result import Cell, Table
 
-if TYPE_CHECKING:
-    from me2e_compress.study.outcome import StudyResult
-
 MOST_ROUTES = 40
 """With more routes than this, the table of endings is left out."""
 COLUMNS = ("TTC < 1.5 s, %", "least TTC s", "PET s", "distance m", "at fault %")
 
 
-def all_tables(outcome: "StudyResult") -> tuple[Table, ...]:
+def all_tables(outcome: StudyOutcome) -> tuple[Table, ...]:
     """Return every table of a study, in reading order; a preview is marked as such."""
     compared = [differences(outcome)] if len(outcome.variants) > 1 else []
     found = (
@@ -37,7 +34,7 @@ def all_tables(outcome: "StudyResult") -> tuple[Table, ...]:
     return tuple(replace(each, title=f"{each.title}{preview}") for each in found)
 
 
-def route_table(outcome: "StudyResult") -> Table | None:
+def route_table(outcome: StudyOutcome) -> Table | None:
     """Show how each route ended for each driver; None if there are too many routes."""
     driven = [each for each in outcome.drives if each.routes]
     if not driven or len(driven[0].routes) > MOST_ROUTES:
@@ -59,7 +56,7 @@ def route_table(outcome: "StudyResult") -> Table | None:
     )
 
 
-def near_misses(outcome: "StudyResult") -> Table:
+def near_misses(outcome: StudyOutcome) -> Table:
     """Show how near every drive came to collisions, which end few routes."""
     several = len(outcome.study.conditions) > 1
     return Table(

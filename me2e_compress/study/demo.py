@@ -11,9 +11,9 @@ from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
-from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report import Section
 from me2e_compress.study.run import run_study
+from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.tables import differences, scoreboards
 from me2e_compress.study.verdict import before_and_after, road_verdict
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN

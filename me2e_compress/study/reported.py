@@ -6,11 +6,11 @@ from pathlib import Path
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.engine import Engine
 from me2e_compress.study.definition import Study
-from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.paper.paper_files import write_paper
 from me2e_compress.study.paper.paper_result import PaperResult
 from me2e_compress.study.paper.paper_run import read_paper, run_paper
 from me2e_compress.study.run import run_study
+from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.write import write_study
 from me2e_compress.workflows.listener import SILENT, Listener
 

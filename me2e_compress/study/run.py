@@ -8,11 +8,12 @@ from me2e_compress.manager.report import versions
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.file import load_study
-from me2e_compress.study.outcome import StudyResult, VariantOutcome, this_machine
+from me2e_compress.study.outcome import VariantOutcome, this_machine
 from me2e_compress.study.plan_fidelity import judge
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
 from me2e_compress.study.recorded import recorded
 from me2e_compress.study.side_by_side import take_pictures
+from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
 from me2e_compress.workflows.checks import check_folder

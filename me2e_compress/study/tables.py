@@ -1,21 +1,18 @@
 """Tables of a study: one content for the terminal, Markdown and HTML."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 from me2e_compress.metrics.abilities import ABILITIES
 from me2e_compress.metrics.differences import PairedDifference, holm
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.scores import Scores
+from me2e_compress.study.changes import Change
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.drives import Drive
+from me2e_compress.study.outcome import StudyOutcome, VariantOutcome
 from me2e_compress.study.plan_fidelity import EXACT
 from me2e_compress.workflows.result import Cell, Table, counted
 from me2e_compress.workflows.result import number as plain_number
-
-if TYPE_CHECKING:
-    from me2e_compress.study.changes import Change
-    from me2e_compress.study.outcome import StudyResult, VariantOutcome
 
 MISSING = "\N{EN DASH}"
 """Shown if nothing was measured."""
@@ -25,7 +22,7 @@ SCORES = ("DS", "SR %", "DE %", "DC")
 COSTS = ("size MB", "p50 ms", "p99 ms", "plan m", "SQNR dB")
 
 
-def scoreboards(outcome: "StudyResult") -> tuple[Table, ...]:
+def scoreboards(outcome: StudyOutcome) -> tuple[Table, ...]:
     """Show driving scores, size and latency of all variants, by condition."""
     if len(outcome.variants) > 1:
         return tuple(_scoreboard(outcome, each) for each in outcome.study.conditions)
@@ -39,7 +36,7 @@ def scoreboards(outcome: "StudyResult") -> tuple[Table, ...]:
     )
 
 
-def _scoreboard(outcome: "StudyResult", condition: Condition) -> Table:
+def _scoreboard(outcome: StudyOutcome, condition: Condition) -> Table:
     return Table(
         f"Scoreboard, {_condition(outcome, condition)}",
         ("variant", *SCORES, *COSTS),
@@ -52,7 +49,7 @@ def _scoreboard(outcome: "StudyResult", condition: Condition) -> Table:
     )
 
 
-def differences(outcome: "StudyResult") -> Table:
+def differences(outcome: StudyOutcome) -> Table:
     """Show every variant minus the baseline, paired by route."""
     # drives with a difference to the baseline
     baseline = outcome.study.baseline
@@ -107,7 +104,7 @@ def _differences_note(found: Sequence[PairedDifference]) -> str:
     return "".join(notes)
 
 
-def abilities(outcome: "StudyResult") -> tuple[Table, ...]:
+def abilities(outcome: StudyOutcome) -> tuple[Table, ...]:
     """Show the success rate by ability, in tables like the scoreboards."""
     if len(outcome.variants) > 1:
         return tuple(
@@ -146,7 +143,7 @@ def _abilities(
     )
 
 
-def change_tables(outcome: "StudyResult") -> tuple[Table, ...]:
+def change_tables(outcome: StudyOutcome) -> tuple[Table, ...]:
     """Show costs of changed conditions, and pairs of drives, if there are any."""
     # changes of a condition, and pairs of drives
     baseline = outcome.study.baseline
@@ -177,7 +174,7 @@ def change_tables(outcome: "StudyResult") -> tuple[Table, ...]:
     )
 
 
-def _change(change: "Change", *, beyond: bool) -> tuple[Cell, ...]:
+def _change(change: Change, *, beyond: bool) -> tuple[Cell, ...]:
     score = change.driving_score
     cells = (
         Cell(change.drive),
@@ -200,7 +197,7 @@ def _scores(drive: Drive) -> tuple[Cell, ...]:
     return (*map(estimate_cell, shown), estimate_cell(scores.comfort))
 
 
-def _costs(variant: "VariantOutcome") -> tuple[Cell, ...]:
+def _costs(variant: VariantOutcome) -> tuple[Cell, ...]:
     return (
         measure_cell(variant.size_mb, ".2f"),
         measure_cell(variant.latency_ms[50], ".1f"),
@@ -222,13 +219,13 @@ def _difference(found: PairedDifference, p_value: float) -> tuple[Cell, ...]:
     )
 
 
-def _condition(outcome: "StudyResult", condition: Condition) -> str:
+def _condition(outcome: StudyOutcome, condition: Condition) -> str:
     scale = outcome.device_scale
     device = "this machine" if scale == 1.0 else f"a device {scale:.3g} times slower"
     return condition.described(device)
 
 
-def _routes_note(outcome: "StudyResult") -> str:
+def _routes_note(outcome: StudyOutcome) -> str:
     driven, whole = outcome.coverage
     of = "" if driven == whole else f"{driven} of "
     share = f"{of}{counted(whole, 'route')}"
@@ -239,7 +236,7 @@ def _routes_note(outcome: "StudyResult") -> str:
     )
 
 
-def _costs_note(outcome: "StudyResult") -> str:
+def _costs_note(outcome: StudyOutcome) -> str:
     notes = []
     if outcome.timed:
         kind = "on this machine"

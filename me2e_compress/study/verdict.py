@@ -3,12 +3,12 @@
 from me2e_compress.metrics.differences import PairedDifference, shown_by
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.study.drives import Drive
-from me2e_compress.study.outcome import StudyResult
+from me2e_compress.study.outcome import StudyOutcome
 from me2e_compress.study.tables import MISSING, number
 from me2e_compress.workflows.result import Cell, Table
 
 
-def before_and_after(outcome: StudyResult, name: str) -> Table:
+def before_and_after(outcome: StudyOutcome, name: str) -> Table:
     """Compare the baseline and a variant of a study with one condition."""
     # size, latency, plan and driving, one row each
     before, after = outcome.variant(outcome.study.baseline), outcome.variant(name)
@@ -36,7 +36,7 @@ def before_and_after(outcome: StudyResult, name: str) -> Table:
     )
 
 
-def road_verdict(outcome: StudyResult, name: str) -> str:
+def road_verdict(outcome: StudyOutcome, name: str) -> str:
     """Say how a variant drives, and what so many routes can show."""
     drive = _drive(outcome, name)
     if drive.difference is None:
@@ -44,7 +44,7 @@ def road_verdict(outcome: StudyResult, name: str) -> str:
     return _road(drive.difference, outcome)
 
 
-def _road(found: PairedDifference, outcome: StudyResult) -> str:
+def _road(found: PairedDifference, outcome: StudyOutcome) -> str:
     score = found.driving_score
     routes, whole = score.n, outcome.coverage[1]
     said = f"on the road: {found.verdict}"
@@ -58,12 +58,12 @@ def _road(found: PairedDifference, outcome: StudyResult) -> str:
     return said
 
 
-def _drive(outcome: StudyResult, name: str) -> Drive:
+def _drive(outcome: StudyOutcome, name: str) -> Drive:
     (drive,) = (each for each in outcome.drives if each.variant == name)
     return drive
 
 
-def _medians(outcome: StudyResult, name: str) -> tuple[Measure, Measure]:
+def _medians(outcome: StudyOutcome, name: str) -> tuple[Measure, Measure]:
     before, after = outcome.variant(outcome.study.baseline), outcome.variant(name)
     return before.latency_ms[50], after.latency_ms[50]
 

@@ -9,8 +9,8 @@ from me2e_compress.display import in_markdown
 from me2e_compress.errors import StudyError
 from me2e_compress.runtime.atomic import write_bytes, write_document
 from me2e_compress.study.all_tables import all_tables
-from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report import Section, html
+from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.workflows.claims import writing
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Self
+from typing import Literal, Self
 
 from me2e_compress.metrics.eer import eer, rankings
 from me2e_compress.metrics.episode import Ending
@@ -13,11 +13,9 @@ from me2e_compress.metrics.route_measures import (
     route_measures,
 )
 from me2e_compress.study.drive_record import RouteSummary
+from me2e_compress.study.paper.paper_drives import PaperDrives
 from me2e_compress.study.tables import estimate_cell, measure_cell
 from me2e_compress.workflows.result import Cell
-
-if TYPE_CHECKING:
-    from me2e_compress.study.paper.paper_result import PaperResult
 
 Energy = Literal["measured", "modelled"]
 """Source of the joules per frame."""
@@ -40,7 +38,7 @@ class EnergyColumns:
     modelled_scores: Mapping[str, Estimate]
 
     @classmethod
-    def of(cls, result: "PaperResult", variants: Sequence[str], condition: str) -> Self:
+    def of(cls, result: PaperDrives, variants: Sequence[str], condition: str) -> Self:
         """Score the variants that drove; the others get reasons."""
         facts = {name: result.fact(name) for name in variants}
         measured = joules_by_variant(result, variants, "measured")
@@ -66,7 +64,7 @@ class EnergyColumns:
 
 
 def joules_by_variant(
-    result: "PaperResult", variants: Sequence[str], energy: Energy
+    result: PaperDrives, variants: Sequence[str], energy: Energy
 ) -> dict[str, float | None]:
     """Return joules per frame of one kind; None if unknown."""
     facts = {name: result.fact(name) for name in variants}
@@ -79,7 +77,7 @@ def joules_by_variant(
 
 
 def measures_by_variant(
-    result: "PaperResult", joules: Mapping[str, float | None], condition: str
+    result: PaperDrives, joules: Mapping[str, float | None], condition: str
 ) -> dict[str, RouteMeasures]:
     """Return the measures of the variants that drove under a condition."""
     return {
@@ -89,7 +87,7 @@ def measures_by_variant(
     }
 
 
-def ranking_note(result: "PaperResult", variants: Sequence[str], condition: str) -> str:
+def ranking_note(result: PaperDrives, variants: Sequence[str], condition: str) -> str:
     """Say how the variants rank, and whether that depends on the normalization."""
     energy: Energy = "measured"
     if all(result.fact(name).joules is None for name in variants):
@@ -120,7 +118,7 @@ def _measured(route: RouteSummary) -> MeasuredRoute:
 
 
 def _scores(
-    result: "PaperResult", joules: Mapping[str, float | None], condition: str
+    result: PaperDrives, joules: Mapping[str, float | None], condition: str
 ) -> dict[str, Estimate]:
     driven = measures_by_variant(result, joules, condition)
     found = dict(eer(driven, seed=result.study.seed).scores)

@@ -1,17 +1,14 @@
 """Int8 parts of each file, and collisions of each drive."""
 
 from collections import Counter
-from typing import TYPE_CHECKING
 
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.paper.model_facts import SCHEMES, ModelFacts
+from me2e_compress.study.paper.paper_drives import PaperDrives
 from me2e_compress.study.paper.published import INT8_COUNTS, PublishedInt8
 from me2e_compress.study.tables import MISSING
 from me2e_compress.workflows.result import Cell, Table
-
-if TYPE_CHECKING:
-    from me2e_compress.study.paper.paper_result import PaperResult
 
 PARTNERS = (
     InfractionKind.COLLISION_VEHICLE,
@@ -21,7 +18,7 @@ PARTNERS = (
 COUNTS = ("tensors", "int8 operators", "compute-intensive", "MB")
 
 
-def table_4(result: "PaperResult") -> Table:
+def table_4(result: PaperDrives) -> Table:
     """Show the int8 parts of each file, with the paper's counts in separate columns."""
     # other stacks are named "stack scheme"
     stacks = dict.fromkeys(
@@ -70,7 +67,7 @@ def _given(row: PublishedInt8) -> tuple[Cell, ...]:
     return (*map(Cell, texts), Cell(f"{row.megabytes:.2f}"))
 
 
-def partners(result: "PaperResult") -> Table:
+def partners(result: PaperDrives) -> Table:
     """Show what was hit, as shares of the collisions."""
     # shares of each kind of partner, by drive
     rows = []

@@ -1,7 +1,7 @@
 """The paper's figures 5 and 7, from what was driven and timed."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -11,6 +11,7 @@ from matplotlib.ticker import PercentFormatter
 
 from me2e_compress.driving.realtime import skipped_decisions
 from me2e_compress.metrics.measure import Estimate
+from me2e_compress.study.paper.paper_drives import PaperDrives
 from me2e_compress.study.paper.published import RATES, PublishedDrive
 from me2e_compress.study.paper.route_columns import DC, DE, DS, Column, mean_of
 from me2e_compress.study.report.figures import WIDTH_IN
@@ -24,25 +25,22 @@ from me2e_compress.study.report.style import (
 )
 from me2e_compress.study.workload import held_frames
 
-if TYPE_CHECKING:
-    from me2e_compress.study.paper.paper_result import PaperResult
-
 RATE_TICKS = (1, 2, 3, 5, 10, 20, 30)
 SLOWEST_SHOWN = 6
 """Variants whose tails are drawn; more lines cannot be told apart."""
 
 
-def safety(result: "PaperResult") -> Figure | None:
+def safety(result: PaperDrives) -> Figure | None:
     """Draw figure 5a: driving score over the decision rate; None without drives."""
     return _over_rates(result, (DS,))
 
 
-def efficiency_and_comfort(result: "PaperResult") -> Figure | None:
+def efficiency_and_comfort(result: PaperDrives) -> Figure | None:
     """Draw figure 5b: efficiency and comfort over the rate; None without drives."""
     return _over_rates(result, (DE, DC))
 
 
-def where_the_time_goes(result: "PaperResult") -> Figure | None:
+def where_the_time_goes(result: PaperDrives) -> Figure | None:
     """Draw figure 7: stacked module times, and tails; None without both."""
     # both panels need measurements
     baseline = result.fact(result.study.baseline)
@@ -67,7 +65,7 @@ def where_the_time_goes(result: "PaperResult") -> Figure | None:
         return figure
 
 
-def _over_rates(result: "PaperResult", columns: Sequence[Column]) -> Figure | None:
+def _over_rates(result: PaperDrives, columns: Sequence[Column]) -> Figure | None:
     block = next((b for b in result.study.blocks if b.name == "table-2"), None)
     if block is None:
         return None
@@ -85,7 +83,7 @@ def _over_rates(result: "PaperResult", columns: Sequence[Column]) -> Figure | No
 
 
 def _driven_rates(
-    result: "PaperResult", name: str, conditions: Sequence[str]
+    result: PaperDrives, name: str, conditions: Sequence[str]
 ) -> list[tuple[float, str]]:
     """Return the paper's rates that were driven, each with its condition."""
     held = {
@@ -103,7 +101,7 @@ def _driven_rates(
 
 def _draw_rates(
     axes: Axes,
-    result: "PaperResult",
+    result: PaperDrives,
     name: str,
     driven: Sequence[tuple[float, str]],
     column: Column,
@@ -139,7 +137,7 @@ def _draw_rates(
     axes.set_title(f"{column.name}: {name}, 95 % interval", color=MUTED)
 
 
-def _draw_own(axes: Axes, result: "PaperResult", name: str, column: Column) -> None:
+def _draw_own(axes: Axes, result: PaperDrives, name: str, column: Column) -> None:
     # the first condition that charges each model's own latency
     fps = result.fact(name).fps
     traced = [each.name for each in result.study.conditions if each.traced]
@@ -191,7 +189,7 @@ def _dc(row: PublishedDrive) -> float:
     return row.dc
 
 
-def _mean(result: "PaperResult", name: str, condition: str, column: Column) -> Estimate:
+def _mean(result: PaperDrives, name: str, condition: str, column: Column) -> Estimate:
     return mean_of(result.cells[name, condition], column, result.study.seed)
 
 
@@ -222,7 +220,7 @@ def _stack(axes: Axes, parts: Mapping[str, tuple[int, ...]], name: str) -> None:
     )
 
 
-def _shown_tails(result: "PaperResult") -> list[str]:
+def _shown_tails(result: PaperDrives) -> list[str]:
     """Return the baseline, and the other variants with the longest tails."""
     baseline = result.study.baseline
     others = [each for each in result.facts if each.latency_us]

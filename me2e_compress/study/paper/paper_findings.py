@@ -1,9 +1,9 @@
 """The paper's findings as questions, with the test that answers each."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from me2e_compress.metrics.measure import Estimate
+from me2e_compress.study.paper.paper_drives import PaperDrives
 from me2e_compress.study.paper.published import (
     INT8,
     LIMITED,
@@ -23,9 +23,6 @@ from me2e_compress.study.paper.questions import (
 from me2e_compress.study.paper.route_columns import DC, DE, DS
 from me2e_compress.study.tables import MINUS
 
-if TYPE_CHECKING:
-    from me2e_compress.study.paper.paper_result import PaperResult
-
 IDEAL, TEN, FOUR, ONE = (
     ("float", name) for name in ("ideal", "fps-10", "fps-4", "fps-1")
 )
@@ -34,7 +31,7 @@ HALF_SPREAD_OF_DE = (max(r.de for r in RATES) - min(r.de for r in RATES)) / 2
 """Points: how far the paper's efficiency, "largely constant", lies from its middle."""
 
 
-def findings(result: "PaperResult") -> tuple[Finding, ...]:
+def findings(result: PaperDrives) -> tuple[Finding, ...]:
     """Answer every question, in the paper's order."""
     return tuple(each.answer(result) for each in QUESTIONS)
 

@@ -4,8 +4,6 @@ The paper's own figures are of other stacks, roads and traffic: they have column
 their own.
 """
 
-from typing import TYPE_CHECKING
-
 from me2e_compress.driving.realtime import skipped_decisions
 from me2e_compress.study.drive_record import PERCENTS
 from me2e_compress.study.paper import published
@@ -16,6 +14,7 @@ from me2e_compress.study.paper.energy_columns import (
     ranking_note,
 )
 from me2e_compress.study.paper.paper_counts import partners, table_4
+from me2e_compress.study.paper.paper_drives import PaperDrives
 from me2e_compress.study.paper.score_cells import (
     GIVEN,
     GIVEN_ENERGY,
@@ -29,13 +28,10 @@ from me2e_compress.study.paper.score_cells import (
     score_cells,
     times,
 )
+from me2e_compress.study.study_blocks import StudyBlock
 from me2e_compress.study.tables import MISSING
 from me2e_compress.study.workload import held_frames
 from me2e_compress.workflows.result import Cell, Table
-
-if TYPE_CHECKING:
-    from me2e_compress.study.paper.paper_result import PaperResult
-    from me2e_compress.study.study_blocks import StudyBlock
 
 OURS = (
     "Means with their 95 % intervals over these scenario types. The paper's figures"
@@ -44,7 +40,7 @@ OURS = (
 )
 
 
-def all_paper_tables(result: "PaperResult") -> tuple[Table, ...]:
+def all_paper_tables(result: PaperDrives) -> tuple[Table, ...]:
     """Return every table that the study has a block for, and the collisions."""
     makers = {
         "table-2": table_2,
@@ -63,7 +59,7 @@ def all_paper_tables(result: "PaperResult") -> tuple[Table, ...]:
     return (*found, partners(result))
 
 
-def table_2(result: "PaperResult", block: "StudyBlock") -> Table:
+def table_2(result: PaperDrives, block: StudyBlock) -> Table:
     """Show one driver at the paper's rates, and at latencies of its own."""
     # the condition of each number of held frames
     study, name = result.study, block.variants[0]
@@ -109,7 +105,7 @@ def table_2(result: "PaperResult", block: "StudyBlock") -> Table:
     )
 
 
-def table_3(result: "PaperResult", block: "StudyBlock") -> Table:
+def table_3(result: PaperDrives, block: StudyBlock) -> Table:
     """Show the driver without some modules, each variant at its own latency."""
     # all variants drive under one condition
     condition = block.conditions[0]
@@ -155,7 +151,7 @@ def table_3(result: "PaperResult", block: "StudyBlock") -> Table:
     )
 
 
-def table_5(result: "PaperResult", block: "StudyBlock") -> Table:
+def table_5(result: PaperDrives, block: StudyBlock) -> Table:
     """Show int8 by module, under each condition."""
     # the first variant is the float graph
     base = block.variants[0]
@@ -193,7 +189,7 @@ def table_5(result: "PaperResult", block: "StudyBlock") -> Table:
     )
 
 
-def table_6(result: "PaperResult", block: "StudyBlock") -> Table:
+def table_6(result: PaperDrives, block: StudyBlock) -> Table:
     """Show the driver with its rate limited."""
     # the condition of each number of held frames
     study, name = result.study, block.variants[0]
@@ -237,7 +233,7 @@ def table_6(result: "PaperResult", block: "StudyBlock") -> Table:
     )
 
 
-def tail(result: "PaperResult", block: "StudyBlock") -> Table:
+def tail(result: PaperDrives, block: StudyBlock) -> Table:
     """Compare a host stage in critical frames with its mean at every frame."""
     # one row per variant and condition
     base = result.study.baseline
@@ -270,9 +266,7 @@ def tail(result: "PaperResult", block: "StudyBlock") -> Table:
     )
 
 
-def _latency(
-    result: "PaperResult", name: str, condition: str
-) -> tuple[Cell, Cell, Cell]:
+def _latency(result: PaperDrives, name: str, condition: str) -> tuple[Cell, Cell, Cell]:
     cell = result.cell(name, condition)
     mean_us = None if cell is None else cell.mean_latency_us
     if cell is None or mean_us is None:

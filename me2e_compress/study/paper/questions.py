@@ -6,7 +6,7 @@ No answer is written down: every verdict follows from the drives.
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from me2e_compress.study.paper.energy_columns import (
     joules_by_variant,
     measures_by_variant,
 )
+from me2e_compress.study.paper.paper_drives import PaperDrives
 from me2e_compress.study.paper.route_columns import (
     DS,
     Column,
@@ -28,9 +29,6 @@ from me2e_compress.study.paper.route_columns import (
 )
 from me2e_compress.study.tables import MISSING, estimate_cell
 from me2e_compress.workflows.result import Cell, Table
-
-if TYPE_CHECKING:
-    from me2e_compress.study.paper.paper_result import PaperResult
 
 
 class Verdict(StrEnum):
@@ -124,7 +122,7 @@ def _beyond(found: Estimate, least: float, most: float) -> Verdict:
 class Evidence:
     """The drives of a study, with the statistics that tests need."""
 
-    result: "PaperResult"
+    result: PaperDrives
 
     @property
     def seed(self) -> int:
@@ -226,7 +224,7 @@ class PaperQuestion:
     compute: Callable[[Evidence], Estimate]
     rule: Callable[[Evidence], Rule] = lambda evidence: rises
 
-    def answer(self, result: "PaperResult") -> Finding:
+    def answer(self, result: PaperDrives) -> Finding:
         """Compute and judge."""
         evidence = Evidence(result)
         try:

@@ -1,24 +1,21 @@
 """Table cells that the paper's tables share."""
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 from me2e_compress.driving.realtime import DT_US
 from me2e_compress.metrics.measure import Measure
+from me2e_compress.study.paper.paper_drives import PaperDrives
 from me2e_compress.study.paper.published import PublishedDrive
 from me2e_compress.study.paper.route_columns import COLUMNS, DS, mean_of, paired
 from me2e_compress.study.tables import MISSING, estimate_cell, measure_cell
 from me2e_compress.workflows.result import Cell
-
-if TYPE_CHECKING:
-    from me2e_compress.study.paper.paper_result import PaperResult
 
 SCORES = tuple(each.name for each in COLUMNS)
 GIVEN = ("paper's DS", "paper's DE %", "paper's DC")
 GIVEN_ENERGY = ("paper's J/frame", "paper's EER")
 
 
-def score_cells(result: "PaperResult", name: str, condition: str) -> Iterable[Cell]:
+def score_cells(result: PaperDrives, name: str, condition: str) -> Iterable[Cell]:
     """Show the four scores of a drive, or why there are none."""
     cell = result.cell(name, condition)
     if cell is None:
@@ -28,7 +25,7 @@ def score_cells(result: "PaperResult", name: str, condition: str) -> Iterable[Ce
     return [estimate_cell(mean_of(cell, each, seed)) for each in COLUMNS]
 
 
-def against(result: "PaperResult", name: str, other: str, condition: str) -> Cell:
+def against(result: PaperDrives, name: str, other: str, condition: str) -> Cell:
     """Show the driving score of one minus another, over the same routes."""
     one, reference = result.cell(name, condition), result.cell(other, condition)
     if name == other:

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.study.outcome import StudyResult
+from me2e_compress.study.outcome import StudyOutcome
 from me2e_compress.study.report.figures import WIDTH_IN
 from me2e_compress.study.report.style import ACCENT, BASELINE, MUTED, styled, svg
 
@@ -17,7 +17,7 @@ ENOUGH = 3
 Score = Callable[[Scores], Estimate]
 
 
-def curves(outcome: StudyResult) -> str | None:
+def curves(outcome: StudyOutcome) -> str | None:
     """Draw driving score and success rate as SVG; None below three conditions."""
     if len(outcome.study.conditions) < ENOUGH:
         return None
@@ -42,7 +42,7 @@ def curves(outcome: StudyResult) -> str | None:
 
 
 def _found(
-    outcome: StudyResult, variant: str, pick: Score
+    outcome: StudyOutcome, variant: str, pick: Score
 ) -> Sequence[Estimate | None]:
     """Return one estimate per condition; None if the variant was not driven."""
     return [
@@ -53,7 +53,7 @@ def _found(
 
 
 def _curve(
-    axes: Axes, name: str, found: Sequence[Estimate | None], outcome: StudyResult
+    axes: Axes, name: str, found: Sequence[Estimate | None], outcome: StudyOutcome
 ) -> None:
     # conditions under which the variant was driven
     colour = BASELINE if name == outcome.study.baseline else ACCENT

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.study.condition import Condition
-from me2e_compress.study.outcome import StudyResult
+from me2e_compress.study.outcome import StudyOutcome
 from me2e_compress.study.report.findings import sure
 from me2e_compress.study.report.style import (
     ACCENT,
@@ -58,7 +58,7 @@ def front(points: Sequence[Point]) -> list[Point]:
     return kept
 
 
-def pareto(outcome: StudyResult, condition: Condition) -> str | None:
+def pareto(outcome: StudyOutcome, condition: Condition) -> str | None:
     """Draw driving score against latency and against size; None below two points."""
     # panels with at least two points
     latency = _points(outcome, condition, "latency")
@@ -87,7 +87,7 @@ def pareto(outcome: StudyResult, condition: Condition) -> str | None:
         return svg(figure)
 
 
-def forest(outcome: StudyResult) -> str | None:
+def forest(outcome: StudyOutcome) -> str | None:
     """Draw every difference to the baseline with its interval; None without one."""
     # drives that have a difference to the baseline
     rows = [each for each in outcome.drives if each.difference is not None]
@@ -111,7 +111,7 @@ def forest(outcome: StudyResult) -> str | None:
         return svg(figure)
 
 
-def _points(outcome: StudyResult, condition: Condition, kind: str) -> list[Point]:
+def _points(outcome: StudyOutcome, condition: Condition, kind: str) -> list[Point]:
     found = list[Point]()
     for drive in outcome.under(condition):
         variant = outcome.variant(drive.variant)

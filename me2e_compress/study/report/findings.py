@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study.drives import Drive
-from me2e_compress.study.outcome import StudyResult, VariantOutcome
+from me2e_compress.study.outcome import StudyOutcome, VariantOutcome
 from me2e_compress.study.tables import number
 
 TIMES = "\N{MULTIPLICATION SIGN}"
@@ -18,7 +18,7 @@ class Takeaway:
     text: str
 
 
-def findings(outcome: StudyResult) -> tuple[Takeaway, ...]:
+def findings(outcome: StudyOutcome) -> tuple[Takeaway, ...]:
     """Describe for every variant what it costs and how it drives."""
     baseline = outcome.variant(outcome.study.baseline)
     return tuple(
@@ -29,7 +29,7 @@ def findings(outcome: StudyResult) -> tuple[Takeaway, ...]:
 
 
 def _sentence(
-    outcome: StudyResult, baseline: VariantOutcome, variant: VariantOutcome
+    outcome: StudyOutcome, baseline: VariantOutcome, variant: VariantOutcome
 ) -> str:
     costs = [
         _times(variant.size_mb, baseline.size_mb, "the size"),

@@ -10,12 +10,12 @@ from markupsafe import Markup
 
 from me2e_compress.marks import MARK
 from me2e_compress.study.all_tables import near_misses, route_table
-from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import forest, pareto
 from me2e_compress.study.report.findings import findings
 from me2e_compress.study.route_outcomes import RouteOutcome
 from me2e_compress.study.side_by_side import Contrast
+from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.tables import (
     abilities,
     change_tables,

@@ -1,0 +1,102 @@
+"""Result of a study: what it found, as lines, tables and JSON."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from me2e_compress.runtime.providers import PROVIDERS
+from me2e_compress.study.all_tables import all_tables
+from me2e_compress.study.drives import Drive
+from me2e_compress.study.outcome import StudyOutcome
+from me2e_compress.workflows.result import Result, Table, counted
+
+
+@dataclass(frozen=True, repr=False)
+class StudyResult(StudyOutcome, Result):
+    """All results of a study, and what they were made with."""
+
+    @property
+    def headline(self) -> str:
+        """Title, and numbers of variants, conditions and routes."""
+        study, (driven, whole) = self.study, self.coverage
+        return (
+            f"{study.title}: {counted(len(study.variants), 'variant')} under"
+            f" {counted(len(study.conditions), 'condition')} on {driven} of"
+            f" {counted(whole, 'route')}"
+        )
+
+    def lines(self) -> tuple[str, ...]:
+        """Return nothing: the tables say it all."""
+        return ()
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return the variants that failed, and whether the machine was busy."""
+        failed = [each.prepared for each in self.variants if each.prepared.failure]
+        busy = [str(self.load)] if self.load is not None and self.load.busy else []
+        left_out = (
+            f"variant {each.variant.name} was left out: {each.failure}"
+            for each in failed
+        )
+        broken = (
+            f"{each.variant}, {each.condition}: {each.scores.failed}"
+            for each in self.drives
+            if each.scores is not None and each.scores.failed
+        )
+        return (*left_out, *broken, *busy)
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return every table, in reading order."""
+        return all_tables(self)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return one row per drive."""
+        return [self._record(each) for each in self.drives]
+
+    def _record(self, drive: Drive) -> dict[str, object]:
+        # a drive that was not made has no scores
+        scores, of = drive.scores, self.variant(drive.variant)
+        found = (
+            {}
+            if scores is None
+            else {
+                "driving_score": scores.driving_score.value,
+                "success_rate": scores.success_rate.value,
+                "efficiency": scores.efficiency.value,
+                "comfort": scores.comfort.value,
+            }
+        )
+        return {
+            "variant": drive.variant,
+            "condition": drive.condition,
+            **found,
+            "size_mb": of.size_mb.value,
+            **{f"p{p}_ms": each.value for p, each in of.latency_ms.items()},
+            "plan_mean_m": of.fidelity.mean_m.value,
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a document; the same study and seed give the same bytes but latencies.
+
+        Latencies, and the scale derived from them, are below the keys ``latency``.
+        """
+        study = self.study
+        return {
+            "title": study.title,
+            "baseline": study.baseline,
+            "seed": study.seed,
+            "provider": PROVIDERS.text(study.provider),
+            "evaluator": study.evaluator,
+            "routes": dict(zip(("driven", "set"), self.coverage, strict=True)),
+            "conditions": [each.to_json() for each in study.conditions],
+            "latency": {
+                "device_scale": self.device_scale,
+                "samples": study.timing.samples,
+                "threads": study.timing.threads,
+                **({} if self.load is None else self.load.to_json()),
+            },
+            "schemes": [each.to_json() for each in self.variants],
+            "drives": [each.to_json() for each in self.drives],
+            "changes": [each.to_json() for each in self.changes],
+            "pairs": [each.to_json() for each in self.pairs],
+            "machine": self.machine,
+            "versions": dict(self.versions),
+        }
