@@ -10,6 +10,8 @@ from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import GetCoreSchemaHandler
+from pydantic_core import CoreSchema
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.registry import Registry
@@ -54,6 +56,19 @@ class HostStage(abc.ABC):
         Raises:
             EvaluationError: An output is missing or has another form.
         """
+
+    def __str__(self) -> str:
+        """Return the text that `HOST_STAGES` reads."""
+        return HOST_STAGES.text(self)
+
+    @classmethod
+    def __get_pydantic_core_schema__(
+        cls, source: type, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Let an option that is any host stage take its text."""
+        if cls is not HostStage:
+            return handler(source)
+        return HOST_STAGES.option_schema(HostStage)
 
 
 HOST_STAGES: Registry[HostStage] = Registry(

@@ -207,13 +207,21 @@ def parse_latency(
     Raises:
         EvaluationError: No such source, or an option that it refuses or has not.
     """
+    source = LATENCY_SOURCES.parse(text)
+    return with_draws(source, in_order=in_order, scale=scale, seed=seed)
+
+
+def with_draws(
+    source: LatencySource, *, in_order: bool = False, scale: float = 1.0, seed: int = 0
+) -> LatencySource:
+    """Say how a source draws from its trace; see `parse_latency`."""
     check_positive("scale", scale)
     given = {"in_order": in_order, "scale": scale, "seed": seed}
     default = {"in_order": False, "scale": 1.0, "seed": 0}
     options: dict[str, object] = {
         option: value for option, value in given.items() if value != default[option]
     }
-    return _with_options(LATENCY_SOURCES.parse(text), options)
+    return _with_options(source, options)
 
 
 def _with_options(source: LatencySource, options: dict[str, object]) -> LatencySource:

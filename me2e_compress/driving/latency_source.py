@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 from pydantic import GetCoreSchemaHandler
-from pydantic_core import CoreSchema, core_schema
+from pydantic_core import CoreSchema
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.registry import Registry
@@ -87,13 +87,7 @@ class LatencySource(abc.ABC):
         """Let an option that is any source take its text."""
         if cls is not LatencySource:
             return handler(source)
-        return core_schema.no_info_before_validator_function(
-            _source_of, core_schema.is_instance_schema(LatencySource)
-        )
-
-
-def _source_of(given: object) -> object:
-    return LATENCY_SOURCES.parse(given) if isinstance(given, str) else given
+        return LATENCY_SOURCES.option_schema(LatencySource)
 
 
 _HERE = "me2e_compress.driving.latency"

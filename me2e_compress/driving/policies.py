@@ -94,7 +94,7 @@ _MEMBERS = ("needs_images", "privileged", "reset", "plan")
 _FACTORY = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
-def driver_named(text: str, adapter: Path | None = None) -> Driver:
+def driver_named(text: str, adapter: str | Path | None = None) -> Driver:
     """Build the driver of a text: a policy with its options, or an ONNX file's path.
 
     Args:

@@ -10,6 +10,7 @@ from importlib.metadata import EntryPoint
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import pydantic
+from pydantic_core import CoreSchema, core_schema
 
 from me2e_compress.display import prefixed
 from me2e_compress.errors import Me2eError
@@ -182,6 +183,13 @@ class Registry(Generic[T]):
     def text_all(self, items: Iterable[T]) -> str:
         """Write items so that :meth:`parse_all` makes equal ones."""
         return ",".join(self.text(item) for item in items)
+
+    def option_schema(self, base: type) -> CoreSchema:
+        """Return pydantic's schema of an option that takes any item, or its text."""
+        return core_schema.no_info_before_validator_function(
+            lambda given: self.parse(given) if isinstance(given, str) else given,
+            core_schema.is_instance_schema(base),
+        )
 
     def sources(self, name: str) -> tuple[str, ...]:
         """Name the packages that bring a name, each with its version."""

@@ -12,6 +12,8 @@ import onnxruntime as ort
 from onnxruntime.capi import (
     onnxruntime_pybind11_state as _native,  # pyright: ignore[reportAttributeAccessIssue]
 )
+from pydantic import GetCoreSchemaHandler
+from pydantic_core import CoreSchema
 
 from me2e_compress.errors import ProviderError
 from me2e_compress.registry import Registry
@@ -110,6 +112,19 @@ class Provider(abc.ABC):
                 f"provider {self.name} cannot start here: its driver or libraries are"
                 f" missing; onnxruntime would run on {', '.join(running)}"
             )
+
+    def __str__(self) -> str:
+        """Return the text that `PROVIDERS` reads."""
+        return PROVIDERS.text(self)
+
+    @classmethod
+    def __get_pydantic_core_schema__(
+        cls, source: type, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Let an option that is any provider take its text."""
+        if cls is not Provider:
+            return handler(source)
+        return PROVIDERS.option_schema(Provider)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,19 +1,15 @@
 """A condition of a study: latency of decisions, world step, weather."""
 
+import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from me2e_compress.display import counted
-from me2e_compress.driving.latency import LatencySource, parse_latency
+from me2e_compress.driving.latency import LATENCY_SOURCES, LatencySource, with_draws
 from me2e_compress.driving.layered_latency import LimitedLatency
 from me2e_compress.errors import EvaluationError, StudyError
-from me2e_compress.evaluators.highway.conditions import (
-    Conditions,
-    latency_model_named,
-    step_us,
-)
-from me2e_compress.evaluators.highway.evaluation_options import weather_of
+from me2e_compress.evaluators.highway.conditions import ConditionOptions, Conditions
 from me2e_compress.registry import name_in
 from me2e_compress.study.names import check_name
 
@@ -22,7 +18,7 @@ TRACE = "trace"
 
 
 @dataclass(frozen=True)
-class Condition:
+class Condition(ConditionOptions):
     """The conditions that a variant drives under.
 
     Args:
@@ -32,12 +28,8 @@ class Condition:
             ``agents{source=trace, per_agent_us=3000}``.
         mean_of: Instead of a latency: every decision takes the mean of this drive,
             ``VARIANT.CONDITION``, whose condition comes earlier.
-        latency_model: ``drop`` or ``fifo``, see `LatencyModel`.
-        in_order: Replay traces in their order, which keeps bursts.
         limit_fps: Frame limiter: a decision takes at least one period.
         seed: Seed of draws from traces; None takes the study's.
-        dt_ms: Step of the world; results at different steps are not compared.
-        weather: ``fog_m=80,night=0.5,noise=12,dropped=FRONT``; empty for a clear day.
         against: Another condition that differs from this one in one thing: drives are
             compared with those under it, route by route.
 
@@ -49,12 +41,8 @@ class Condition:
     name: str
     latency: str = ""
     mean_of: str = ""
-    latency_model: str = "drop"
-    in_order: bool = False
     limit_fps: float | None = None
     seed: int | None = None
-    dt_ms: float = 50.0
-    weather: str = ""
     against: str = ""
 
     def __post_init__(self) -> None:
@@ -67,8 +55,7 @@ class Condition:
             )
         try:
             source = None if self.mean_of else self.source(0)
-            latency_model_named(self.latency_model)
-            Conditions(dt_us=step_us(self.dt_ms), weather=weather_of(self.weather))
+            self.settings  # noqa: B018
         except EvaluationError as error:
             raise EvaluationError(f"condition {self.name}: {error}") from error
         if source is not None and source.measures:
@@ -80,10 +67,14 @@ class Condition:
         ``seed`` applies if the condition has none of its own. A trace file is an error:
         it belongs to a variant.
         """
+        own = seed if self.seed is None else self.seed
+        return with_draws(self._parsed, in_order=self.in_order, seed=own)
+
+    @functools.cached_property
+    def _parsed(self) -> LatencySource:
         if self._names_a_file:
             raise StudyError(self._refusal())
-        own = seed if self.seed is None else self.seed
-        source = parse_latency(self.latency, in_order=self.in_order, seed=own)
+        source = LATENCY_SOURCES.parse(self.latency)
         if self.limit_fps is None:
             return source
         return LimitedLatency(source, self.limit_fps)
@@ -91,7 +82,7 @@ class Condition:
     @property
     def traced(self) -> bool:
         """Whether each model is charged its own measured latencies."""
-        return not self.mean_of and self.source(0).lacks_trace
+        return not self.mean_of and self._parsed.lacks_trace
 
     @property
     def mean_cell(self) -> tuple[str, str]:
@@ -101,13 +92,7 @@ class Condition:
 
     def drives(self, latency: LatencySource, image_size: tuple[int, int]) -> Conditions:
         """Return the conditions of a drive; ``image_size`` is rows and columns."""
-        return Conditions(
-            latency,
-            step_us(self.dt_ms),
-            image_size,
-            weather_of(self.weather),
-            latency_model_named(self.latency_model),
-        )
+        return replace(self.settings, latency=latency, image_size=image_size)
 
     def described(self, device: str) -> str:
         """Describe it for the head of a table; ``device`` is that of the traces."""

@@ -1,10 +1,19 @@
 """Read a study from a TOML file."""
 
 from collections.abc import Sequence
+from dataclasses import MISSING
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AliasChoices,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetPydanticSchema,
+    ValidationError,
+    create_model,
+)
 
 from me2e_compress import documents, recipe
 from me2e_compress.driving.policies import driver_named
@@ -12,9 +21,11 @@ from me2e_compress.driving.python_policy import PythonDriver
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
+from me2e_compress.evaluators.highway.evaluation_options import routes_named
 from me2e_compress.passes import Pass
+from me2e_compress.registry.registry import fields_of
 from me2e_compress.runtime.providers import provider_named
-from me2e_compress.simulator.routes import Route, load_routes, pick_routes
+from me2e_compress.simulator.routes import Route
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
 from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
@@ -95,6 +106,20 @@ class _Table(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid")
 
 
+def _table_of(cls: type) -> type[_Table]:
+    """Make the table of a file whose keys are the fields of a dataclass."""
+    types = get_type_hints(cls)
+    keys: dict[str, Any] = {
+        each.name: (types[each.name], ... if each.default is MISSING else each.default)
+        for each in fields_of(cls)
+    }
+    return create_model(cls.__name__, __base__=_Table, **keys)
+
+
+def _read_as(table: type[_Table]) -> GetPydanticSchema:
+    return GetPydanticSchema(lambda source, handler: handler(table))
+
+
 class _Variant(_Table):
     name: str
     policy: str
@@ -104,25 +129,6 @@ class _Variant(_Table):
     adapter: str | None = None
     trace: str | None = None
     host_stage: str = ""
-
-
-class _Condition(_Table):
-    name: str
-    latency: str = ""
-    mean_of: str = ""
-    latency_model: str = "drop"
-    in_order: bool = False
-    limit_fps: float | None = None
-    seed: int | None = None
-    dt_ms: float = 50.0
-    weather: str = ""
-    against: str = ""
-
-
-class _Latency(_Table):
-    samples: int = 200
-    threads: int = 1
-    baseline_median_s: float | None = None
 
 
 class _Block(_Table):
@@ -136,10 +142,9 @@ class _Pair(_Table):
     against: str
 
 
-class _Record(_Table):
-    frames: int
-    held_out: int
-    seed: int = 0
+_CONDITION = _table_of(Condition)
+_LATENCY = _table_of(Timing)
+_RECORD = _table_of(FramesToRecord)
 
 
 class _Study(_Table):
@@ -152,12 +157,12 @@ class _Study(_Table):
     held_out: str | None = None
     provider: str = "cpu"
     plugins: list[str] = Field(default_factory=list)
-    record: _Record | None = None
+    record: Annotated[_Table, _read_as(_RECORD)] | None = None
     report: Literal["comparison", "paper"] = "comparison"
-    latency: _Latency = Field(default_factory=_Latency)
+    latency: Annotated[_Table, _read_as(_LATENCY)] = Field(default_factory=_LATENCY)
     variant: list[_Variant] = Field(validation_alias=AliasChoices("variant", "scheme"))
-    """Files from before variants were called so say ``[[scheme]]``."""
-    condition: list[_Condition]
+    """Files written before variants had their name say ``[[scheme]]``."""
+    condition: list[Annotated[_Table, _read_as(_CONDITION)]]
     block: list[_Block] = Field(default_factory=list)
     pair: list[_Pair] = Field(default_factory=list)
 
@@ -165,11 +170,11 @@ class _Study(_Table):
 _KINDS: dict[object, type[_Table]] = {
     "variant": _Variant,
     "scheme": _Variant,
-    "condition": _Condition,
-    "latency": _Latency,
+    "condition": _CONDITION,
+    "latency": _LATENCY,
     "block": _Block,
     "pair": _Pair,
-    "record": _Record,
+    "record": _RECORD,
 }
 
 
@@ -202,7 +207,6 @@ class _Reader:
         self, table: _Study, routes: str | None, plugins: Sequence[Path]
     ) -> Study:
         # the caller's routes take precedence over the file's
-        timing = table.latency
         libraries = (*map(self._beside, table.plugins), *plugins)
         which = routes if table.routes is None or routes else str(table.routes)
         driven, set_size = self._routes(which, table.evaluator)
@@ -216,7 +220,7 @@ class _Reader:
             set_size=set_size,
             frames=self._file(table.frames),
             held_out=self._file(table.held_out),
-            timing=Timing(timing.samples, timing.threads, timing.baseline_median_s),
+            timing=Timing(**dict(table.latency)),
             seed=table.seed,
             provider=provider_named(table.provider, libraries),
             to_record=self._to_record(table),
@@ -236,7 +240,7 @@ class _Reader:
             raise StudyError(
                 f"{self.path}: give folders of frames, or what to record, not both"
             )
-        return FramesToRecord(asked.frames, asked.held_out, asked.seed)
+        return FramesToRecord(**dict(asked))
 
     def _variant(self, table: _Variant) -> Variant:
         policy, adapter, stage = table.policy, table.adapter, table.host_stage
@@ -248,7 +252,8 @@ class _Reader:
             policy = str(model_path(driver.path, self.path.parent))
             if adapter is None and driver.adapter is not None:
                 adapter = str(driver.adapter)
-            stage = stage or driver.host_stage
+            if not stage and driver.host_stage is not None:
+                stage = str(driver.host_stage)
         return Variant(
             table.name,
             policy,
@@ -286,12 +291,7 @@ class _Reader:
     ) -> tuple[tuple[Route, ...], int]:
         if which is None and not is_highway(evaluator):
             return (), 0
-        which = which or "all"
-        if which.endswith(".json"):
-            found = load_routes(self._beside(which))
-            return found, len(found)
-        shipped = load_routes()
-        return pick_routes(shipped, which), len(shipped)
+        return routes_named(which or "all", self.path.parent)
 
     def _file(self, name: str | None) -> Path | None:
         return None if name is None else self._beside(name)

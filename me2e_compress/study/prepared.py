@@ -9,6 +9,7 @@ from pydantic import BaseModel, ValidationError
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.errors import Me2eError, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
@@ -87,12 +88,8 @@ def prepare_variant(
         raise StudyError(f"variant {variant.name}: {source}: no such model")
     if variant.passes:
         model = _compressed(study, variant, source, workspace, listener)
-    driver = replace(
-        driver,
-        path=model,
-        provider=PROVIDERS.text(study.provider),
-        host_stage=variant.host_stage,
-    )
+    stage = HOST_STAGES.parse(variant.host_stage) if variant.host_stage else None
+    driver = replace(driver, path=model, provider=study.provider, host_stage=stage)
     # fail early on a model that cannot run or drive
     try_file(model, listener, study.provider)
     if not study.elsewhere:  # another evaluator may ask for another interface

@@ -9,7 +9,6 @@ import numpy as np
 
 from me2e_compress.driving.latency_source import DecisionFacts
 from me2e_compress.driving.realtime import LatencyModel, skipped_decisions
-from me2e_compress.evaluators.highway.conditions import step_us
 from me2e_compress.evaluators.highway.durations import EXPERT_S
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study.condition import Condition
@@ -117,7 +116,7 @@ def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
             # frames and decisions of the missing routes
             left = _left(study, place, variant, condition)
             driven_s = sum(EXPERT_S[route.scenario] for route in left)
-            frames = 1e6 * driven_s / step_us(condition.dt_ms)
+            frames = 1e6 * driven_s / condition.settings.dt_us
             hours = frames * (frame_s + decision_s / period) / 3600 / workers
             total = len(study.routes)
             done = total - len(left)
@@ -146,7 +145,7 @@ def held_frames(study: Study, condition: Condition) -> int:
     Frames are the condition's steps. For a trace, or a mean of one, it is based on the
     baseline's median on the device, if the study states it, with no road users in view.
     """
-    if condition.latency_model == LatencyModel.FIFO:
+    if condition.settings.latency_model is LatencyModel.FIFO:
         return 1
     if condition.mean_of:
         under = condition.mean_cell[1]
@@ -158,7 +157,7 @@ def held_frames(study: Study, condition: Condition) -> int:
         source = condition.source(study.seed).with_trace((latency_us,), 1.0)
         nobody = DecisionFacts(latency_us, np.empty((0, 2)))
         latency_us = source.on_route("")(nobody)
-    return skipped_decisions(latency_us, step_us(condition.dt_ms)) + 1
+    return skipped_decisions(latency_us, condition.settings.dt_us) + 1
 
 
 def _logged(folder: Path) -> tuple[float, float] | None:

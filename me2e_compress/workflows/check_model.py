@@ -12,7 +12,7 @@ from me2e_compress.driving.policies import opened
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.any_session import AnySession
-from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack.stack_session import open_session
 from me2e_compress.workflows.evaluate import driver_of
 from me2e_compress.workflows.first_opening import try_file
@@ -122,8 +122,7 @@ def check_model(
     try_file(driver.path, listener, provider)
     read = Adapter() if driver.adapter is None else Adapter.load(driver.adapter)
     try:
-        runs = PROVIDERS.parse(driver.provider)
-        session = open_session(driver.path, threads=1, provider=runs)
+        session = open_session(driver.path, threads=1, provider=driver.provider)
     except (GraphError, FramesError) as error:
         raise EvaluationError(str(error)) from error
     recurrent = recurrent_of(session, read)

@@ -7,17 +7,14 @@ from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import POLICIES, Driver, driver_named
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
-from me2e_compress.evaluators.highway.evaluation_options import (
-    HighwayEvaluation,
-    routes_named,
-)
+from me2e_compress.evaluators.highway.evaluation_options import DrivingOptions
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress
 from me2e_compress.evaluators.highway.results import MANIFEST, log_beside
-from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
+from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.extras import need_extra
 from me2e_compress.metrics.deadlines import charged
 from me2e_compress.metrics.scores import score as score_episodes
-from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.workflows.checks import check_folder, check_number, model_path
 from me2e_compress.workflows.claims import writing
@@ -40,50 +37,20 @@ _FLAGS = {"frame_limit_s": "frame-limit"}
 """Command-line names of options that differ from their Python names."""
 
 
-@dataclasses.dataclass(frozen=True)
-class EvaluateOptions:
-    """Which routes are driven, and under which conditions.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EvaluateOptions(DrivingOptions):
+    """Which routes are driven, under which conditions, and what is made of them.
 
     Attributes:
-        routes: ``all``, a number, ``ID,ID`` or a file of routes.
-        latency: what a decision costs: ``none``, ``fps:F``, ``trace:FILE``,
-            ``measured``.
-        latency_scale: factor on a trace or a measurement.
-        latency_model: ``drop`` the decisions due meanwhile, or ``fifo``: delay every
-            control.
-        in_order: replay a trace in its order.
-        seed: seed of the draws from a trace.
-        workers: routes at a time.
-        dt_ms: time step of the simulation, in milliseconds.
-        adapter: TOML file that adapts the model to the policy contract.
         host_stage: changes the model's plan on the host: ``collision-optimizer``.
-        weather: ``fog_m=80,night=0.5,dropped=BACK+FRONT``; empty is a clear day.
-        frame_limit_s: seconds until a decision counts as hung.
-        engine: ``local`` or ``ray``.
-        address: address of a Ray cluster.
         render: draw these routes as GIF and PNG; chosen as ``routes`` is.
-        provider: what runs the model; policies other than graphs ignore it.
         force: replace outputs that we did not write, too.
         evaluator: ``highway``, whose options are those above; or another by name,
             ``name{option=value}``, which gets the policy as its option ``policy``.
     """
 
-    routes: str = "all"
-    latency: str = "none"
-    latency_scale: float = 1.0
-    latency_model: str = "drop"
-    in_order: bool = False
-    seed: int = 0
-    workers: int = 1
-    dt_ms: float = 50.0
-    adapter: str | Path | None = None
     host_stage: str = ""
-    weather: str = ""
-    frame_limit_s: float = FRAME_LIMIT_S
-    engine: str = "local"
-    address: str | None = None
     render: str | None = None
-    provider: Provider = CPU
     force: bool = False
     evaluator: str = HIGHWAY
 
@@ -157,8 +124,8 @@ def _evaluated(
     policy: str, output: Path, options: EvaluateOptions, listener: Listener
 ) -> EvaluateResult:
     need_extra("highway", "driving")
-    picked, _ = routes_named(options.routes)
-    shown = () if options.render is None else pick_routes(picked, options.render)
+    routes, set_size = options.picked
+    shown = () if options.render is None else pick_routes(routes, options.render)
     # find the driver, and open its graph in a process of its own first
     driver = driver_of(policy, options.adapter, options.provider)
     if options.host_stage:
@@ -172,40 +139,23 @@ def _evaluated(
         listener.on_progress("evaluate", now.done, now.total, running)
 
     # drive, or go on where an earlier run stopped
-    asked = HighwayEvaluation(
-        policy,
-        output,
-        routes=options.routes,
-        latency=options.latency,
-        latency_scale=options.latency_scale,
-        in_order=options.in_order,
-        latency_model=options.latency_model,
-        seed=options.seed,
-        dt_ms=options.dt_ms,
-        weather=options.weather,
-        frame_limit_s=options.frame_limit_s,
-        workers=options.workers,
-        engine=options.engine,
-        address=options.address,
-    )
-    evaluator = asked.evaluator(on_progress, listener.on_warning, driver)
+    evaluator = options.driven_by(driver, output, on_progress, listener.on_warning)
     episodes = tuple(evaluator.episodes())
     # score over the whole set, though only a part of it was asked for
-    scores = score_episodes(episodes, evaluator.set_size)
+    scores = score_episodes(episodes, set_size)
     pictures = _pictures(evaluator.job, shown, output)
-    measured = evaluator.job.conditions.latency.measured
-    late = charged(episodes, measured=measured)
+    late = charged(episodes, measured=options.source.measured)
     return EvaluateResult(policy, output, scores, pictures, late)
 
 
 def with_stage(driver: Driver, host_stage: str) -> Driver:
     """Return a driver whose plan a host stage changes; it must have a network."""
-    HOST_STAGES.parse(host_stage)
+    stage = HOST_STAGES.parse(host_stage)
     if not isinstance(driver, OnnxDriver):
         raise EvaluationError(
             f"{driver.name} has no network: there are no outputs for a host stage"
         )
-    return dataclasses.replace(driver, host_stage=host_stage)
+    return dataclasses.replace(driver, host_stage=stage)
 
 
 def _pictures(job: Job, routes: tuple[Route, ...], folder: Path) -> tuple[Path, ...]:
@@ -225,12 +175,12 @@ def driver_of(
     """
     if text in SHIPPED:  # by its path, which a file of that name may be instead
         text = str(model_path(text))
-    driver = driver_named(text, None if adapter is None else Path(adapter))
+    driver = driver_named(text, adapter)
     if not isinstance(driver, OnnxDriver):
         return driver
     try:
-        path, runs = model_path(driver.path), PROVIDERS.text(provider)
-        return dataclasses.replace(driver, path=path, provider=runs)
+        path = model_path(driver.path)
+        return dataclasses.replace(driver, path=path, provider=provider)
     except GraphError as error:
         policies = ", ".join(POLICIES.names())
         raise EvaluationError(f"{error}; policies: {policies}") from error

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from me2e_compress.driving.contract import Policy
+from me2e_compress.driving.host_stage import HostStage
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.zoo.shipped import shipped
@@ -14,12 +15,12 @@ class ShippedDriver(Driver):
     """The trained driver that comes with the package.
 
     Attributes:
-        host_stage: changes the plan on the host, as a text: ``collision-optimizer``;
-            empty leaves it as the network has it.
+        host_stage: changes the plan on the host, as a text ``collision-optimizer``;
+            None leaves it as the network has it.
     """
 
     name: ClassVar[str] = "highway"
-    host_stage: str = ""
+    host_stage: HostStage | None = None
 
     def resolved(self) -> Driver:
         """Return the driver of the shipped ONNX file."""

@@ -102,7 +102,7 @@ def test_a_model_without_the_output_is_refused_when_it_is_opened(
     model = straight_on(tmp_path / "m.onnx")
 
     with pytest.raises(EvaluationError, match=r"m.onnx: .* no output occupancy; there"):
-        OnnxDriver(model, host_stage="collision-optimizer").open()
+        OnnxDriver(model, host_stage=CollisionOptimizer()).open()
 
 
 @pytest.mark.parametrize(
@@ -126,13 +126,13 @@ def test_a_stage_that_answers_no_host_work_is_named(
     model = straight_on(tmp_path / "m.onnx")
 
     with pytest.raises(EvaluationError, match="work returned ndarray: it must be a Ho"):
-        OnnxDriver(model, host_stage="collision-optimizer").open()
+        OnnxDriver(model, host_stage=CollisionOptimizer()).open()
 
 
 def test_a_host_stage_is_part_of_what_identifies_a_driver(tmp_path: Path) -> None:
     model = straight_on(tmp_path / "m.onnx")
     plain = OnnxDriver(model).fingerprint()
-    staged = OnnxDriver(model, host_stage="collision-optimizer").fingerprint()
+    staged = OnnxDriver(model, host_stage=CollisionOptimizer()).fingerprint()
 
     assert staged.startswith(f"{plain}+collision-optimizer{{")
     assert "radius_m=5.0" in staged
@@ -151,7 +151,7 @@ def test_what_it_does_is_charged_where_it_has_something_to_do(tmp_path: Path) ->
         plan = Identity (ahead)""",
         outputs="float[1, 6, 2] plan, float[1, 1, 64, 48] occupancy",
     )
-    policy = OnnxDriver(model, host_stage="collision-optimizer").open()
+    policy = OnnxDriver(model, host_stage=CollisionOptimizer()).open()
     source = parse_latency("host-stage{source=fps:10, per_iteration_us=1000}")
 
     decisions = drive(PARKED, policy, Conditions(source)).decisions

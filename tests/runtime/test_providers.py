@@ -21,6 +21,7 @@ from me2e_compress.runtime.providers import (
     CPU,
     PROVIDERS,
     CpuProvider,
+    CudaProvider,
     TensorRtProvider,
     TensorRtRtxProvider,
     provider_named,
@@ -168,7 +169,7 @@ def test_a_driver_opens_its_model_on_its_provider(tmp_path: Path) -> None:
     ir.save(ir.from_onnx_text(NEGATE + "y = Neg(x) }"), path)
 
     with pytest.raises(ProviderError, match="provider cuda: "):
-        OnnxDriver(path, provider="cuda{device=1}").open()
+        OnnxDriver(path, provider=CudaProvider(device=1)).open()
 
 
 @dataclasses.dataclass(frozen=True)

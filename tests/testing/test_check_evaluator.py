@@ -70,7 +70,9 @@ def test_a_wrong_evaluator_is_caught(way: str, message: str) -> None:
 def test_ours_holds(tmp_path: Path) -> None:
     save_routes([EXIT], tmp_path / "routes.json")
     first, again = (
-        HighwayEvaluation("blind", tmp_path / folder, str(tmp_path / "routes.json"))
+        HighwayEvaluation(
+            "blind", tmp_path / folder, routes=str(tmp_path / "routes.json")
+        )
         for folder in ("first", "again")
     )
 

@@ -3,7 +3,10 @@
 They are separate from the runner, so that naming them does not import highway-env.
 """
 
+import functools
 from dataclasses import dataclass, field
+
+from pydantic import TypeAdapter, ValidationError
 
 from me2e_compress.driving.latency import FixedLatency, LatencySource
 from me2e_compress.driving.realtime import DT_US, LatencyModel
@@ -42,18 +45,70 @@ class Conditions:
             )
 
 
-def latency_model_named(name: str) -> LatencyModel:
-    """Return the latency model of a name."""
+@dataclass(frozen=True, kw_only=True)
+class ConditionOptions:
+    """What the command, a study's file and Python say alike of conditions, in words.
+
+    Attributes:
+        latency_model: ``drop`` the decisions due meanwhile, or ``fifo``: delay every
+            control.
+        in_order: replay a trace in its order, which keeps bursts.
+        dt_ms: time step of the simulation, in milliseconds; results at different steps
+            are not compared.
+        weather: ``fog_m=80,night=0.5,dropped=BACK+FRONT``; empty is a clear day.
+    """
+
+    latency_model: str = "drop"
+    in_order: bool = False
+    dt_ms: float = 50.0
+    weather: str = ""
+
+    @functools.cached_property
+    def settings(self) -> Conditions:
+        """Conditions with neither a latency nor the size of a policy's images.
+
+        Raises:
+            EvaluationError: An option is invalid.
+        """
+        return Conditions(
+            dt_us=_step_us(self.dt_ms),
+            weather=_weather_of(self.weather),
+            latency_model=_latency_model_named(self.latency_model),
+        )
+
+
+def _latency_model_named(name: str) -> LatencyModel:
     if name not in list(LatencyModel):
         there = ", ".join(LatencyModel)
         raise EvaluationError(f"no latency model {name!r}; there are {there}")
     return LatencyModel(name)
 
 
-def step_us(dt_ms: float) -> int:
-    """Return a step of the world, at most one frame, in whole microseconds."""
+def _step_us(dt_ms: float) -> int:
+    """Return a step of the world in whole microseconds."""
     if not 0 < dt_ms <= FRAME_US / 1000:
         raise EvaluationError(
             f"a step of {dt_ms:g} ms: it must divide {FRAME_US // 1000} ms"
         )
     return round(dt_ms * 1000)
+
+
+def _weather_of(text: str) -> Weather:
+    """Read ``option=value`` pairs; dropped cameras are joined by ``+``."""
+    options: dict[str, object] = {}
+    for pair in filter(None, text.split(",")):
+        name, _, value = pair.partition("=")
+        options[name.strip()] = value.split("+") if name == "dropped" else value
+    unknown = [name for name in options if name not in Weather.__dataclass_fields__]
+    if unknown:
+        raise EvaluationError(
+            f"weather option {unknown[0]!r}: there are "
+            f"{', '.join(Weather.__dataclass_fields__)}"
+        )
+    try:
+        return TypeAdapter(Weather).validate_python(options)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise EvaluationError(
+            f"weather option {first['loc'][0]}: {first['msg']}"
+        ) from error

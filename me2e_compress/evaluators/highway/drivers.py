@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import ClassVar
 
 from me2e_compress.driving.contract import Policy
-from me2e_compress.driving.host_stage import HOST_STAGES
+from me2e_compress.driving.host_stage import HOST_STAGES, HostStage
 from me2e_compress.driving.policies import POLICIES, Driver, SizedPolicy
 from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack.split_stack import digest_of_files
 
 
@@ -62,16 +63,16 @@ class OnnxDriver(Driver):
         path: The file, or the TOML of the stack.
         adapter: TOML file that adapts the model to the contract, or the name of one
             that ships; None where the model keeps it as it is.
-        provider: What runs it, as a text: ``cpu``, ``tensorrt{cache=engines}``.
-        host_stage: Changes the plan on the host, as a text: ``collision-optimizer``;
-            empty leaves it as the network has it.
+        provider: What runs it; as a text ``cpu``, ``tensorrt{cache=engines}``.
+        host_stage: Changes the plan on the host, as a text ``collision-optimizer``;
+            None leaves it as the network has it.
     """
 
     name: ClassVar[str] = "onnx"
     path: Path
     adapter: Path | None = None
-    provider: str = "cpu"
-    host_stage: str = ""
+    provider: Provider = CPU
+    host_stage: HostStage | None = None
 
     def __post_init__(self) -> None:
         if self.adapter is not None and str(self.adapter) in shipped_adapters():
@@ -81,7 +82,6 @@ class OnnxDriver(Driver):
         """Return the policy; open files and provider."""
         from me2e_compress.driving.adapter import Adapter
         from me2e_compress.driving.onnx_policy import OnnxPolicy
-        from me2e_compress.runtime.providers import PROVIDERS
 
         if not self.path.is_file():
             raise EvaluationError(
@@ -89,9 +89,7 @@ class OnnxDriver(Driver):
                 f" are {', '.join(POLICIES.names())}"
             )
         adapter = None if self.adapter is None else Adapter.load(self.adapter)
-        stage = HOST_STAGES.parse(self.host_stage) if self.host_stage else None
-        provider = PROVIDERS.parse(self.provider)
-        return OnnxPolicy.open(self.path, adapter, provider, stage)
+        return OnnxPolicy.open(self.path, adapter, self.provider, self.host_stage)
 
     @property
     def label(self) -> str:
@@ -105,11 +103,10 @@ class OnnxDriver(Driver):
             from me2e_compress.driving.adapter import Adapter
 
             digests.append(Adapter.digest(self.adapter))
-        if self.provider != "cpu":
-            digests.append(self.provider)
-        if self.host_stage:
-            stage = HOST_STAGES.parse(self.host_stage)
-            digests.append(HOST_STAGES.text(stage, defaults=True))
+        if self.provider != CPU:
+            digests.append(str(self.provider))
+        if self.host_stage is not None:
+            digests.append(HOST_STAGES.text(self.host_stage, defaults=True))
         return "+".join(digests)
 
 

@@ -43,7 +43,9 @@ def test_the_model_runs_on_its_provider(tmp_path: Path) -> None:
     model.touch()
 
     with pytest.raises(ProviderError, match="no provider 'npu'; there are cpu, cuda"):
-        HighwayEvaluation(str(model), tmp_path, provider="npu").evaluator()
+        EVALUATORS.parse(
+            f'highway{{policy="{model}", folder="{tmp_path}", provider=npu}}'
+        )
 
 
 @pytest.mark.parametrize(

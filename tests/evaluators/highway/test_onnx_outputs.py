@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from me2e_compress.driving.adapter import Adapter
+from me2e_compress.driving.collision_optimizer import CollisionOptimizer
 from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
 from me2e_compress.driving.host_stage import HostStage, HostWork
 from me2e_compress.driving.onnx_policy import OnnxPolicy
@@ -24,7 +25,7 @@ from tests.evaluators.highway.drivers import EXIT, straight_on
 from tests.evaluators.highway.test_onnx_policy import observation
 
 
-def adapted(model: Path, toml: str, stage: str = "") -> OnnxDriver:
+def adapted(model: Path, toml: str, stage: HostStage | None = None) -> OnnxDriver:
     adapter = model.with_suffix(".toml")
     adapter.write_text(toml)
     return OnnxDriver(model, adapter, host_stage=stage)
@@ -130,7 +131,7 @@ def test_what_does_not_fit_is_one_line(tmp_path: Path, toml: str, message: str) 
 
 
 def test_a_host_stage_needs_a_plan(tmp_path: Path) -> None:
-    driver = adapted(controlled(tmp_path), VECTOR, "collision-optimizer")
+    driver = adapted(controlled(tmp_path), VECTOR, CollisionOptimizer())
 
     with pytest.raises(EvaluationError, match="changes a plan, and this model answers"):
         driver.open()
