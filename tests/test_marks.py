@@ -12,7 +12,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.recording import write_recording
-from me2e_compress.calibration.resume import CalibrationState, CalibrationCheckpoint
+from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
 from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.marks import BYTES, MARK, is_marked
 from me2e_compress.runtime.atomic import write_document
@@ -64,7 +64,9 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "e.onnx": export,
     "r.toml": recipe,
     "s.npz": SEEN.save,
-    "c.checkpoint": lambda path: CalibrationCheckpoint(path, {}).write(CalibrationState()),
+    "c.checkpoint": lambda path: CalibrationCheckpoint(path, {}).write(
+        CalibrationState()
+    ),
     "frames": record,
     "routes.json": lambda path: save_routes(load_routes(), path),
     "f.png": lambda path: draw_modules(trace_of(9), "m", path),

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.errors import StudyError
+from me2e_compress.marks import IN_JSON, IN_MARKDOWN
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.runtime.others_load import Load
 from me2e_compress.study import Condition, StudyResult
 from me2e_compress.study.all_tables import MOST_ROUTES, route_table
-from me2e_compress.marks import IN_JSON, IN_MARKDOWN
 from me2e_compress.study.report import html
 from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import Point, forest, front, pareto

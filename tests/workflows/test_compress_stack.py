@@ -8,7 +8,6 @@ import onnx_ir as ir
 import pytest
 
 import me2e_compress as me2e
-from me2e_compress import graph
 from me2e_compress.errors import (
     FramesError,
     GraphError,
