@@ -195,7 +195,8 @@ def compress(
     ):
         loaded = read_graph(source, listener, options.adapter)
         modules = load_map(options.module_map, loaded)
-        most, shipped = options.measure_frames, sample_frames(source)
+        shipped = sample_frames(source) if frames is None else None
+        most = options.measure_frames
         split = SplitFrames.read(frames, loaded, passes, most, shipped)
         files = source, output, output.parent
         return compress_graph(loaded, files, passes, modules, split, options, listener)
