@@ -1,6 +1,8 @@
 """Quantize to int8 where a plan says so."""
 
 import dataclasses
+import functools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -24,7 +26,7 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.targets import TARGETS
+from me2e_compress.targets import TARGETS, LintFinding, Target
 from me2e_compress.targets.onnxruntime.writer import BY, Writer
 from me2e_compress.targets.quantized import describe_quantized
 from me2e_compress.targets.weights import QuantizedWeight, weights_of
@@ -99,8 +101,7 @@ class QuantizeInt8(Pass):
                 " this one for onnxruntime"
             )
         # Plan, and stop if there is nothing to do
-        target = TARGETS.parse(self.target)
-        plan = self._placeable(model, context)
+        target, plan = self._runtime, self._placeable(model, context)
         target.check_types(plan, model)
         tensors = target.tensors(plan, model)
         advice = self._advice(plan, model)
@@ -125,7 +126,7 @@ class QuantizeInt8(Pass):
             *_notes(plan, self.target),
             *_findings(plan, ranges),
             *advice,
-            _lint(placed, self.target),
+            _linted(target.lint(placed), self.target),
         )
         return PassResult(placed, len(plan.placed) + len(plan.weight_only), notes)
 
@@ -145,22 +146,24 @@ class QuantizeInt8(Pass):
         overrides = Overrides()
         if self.overrides is not None:
             overrides = Overrides.load(self.overrides)
-        target = TARGETS.parse(self.target)
         rules, scheme = self._rules(), self._scheme(context)
-        plan = make_plan(
-            model, scheme, rules, overrides, target.costs, target.fused_objection
-        )
+        costs, objection = self._runtime.costs, self._runtime.fused_objection
+        plan = make_plan(model, scheme, rules, overrides, costs, objection)
         return with_weight_only(plan, model) if self.weight_only_gemv else plan
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
         """Return the names of the tensors that its target reads in int8."""
         plan = self._placeable(model, context)
-        return TARGETS.parse(self.target).tensors(plan, model)
+        return self._runtime.tensors(plan, model)
 
     def _placeable(self, model: ir.Model, context: Context) -> QuantPlan:
         plan = self.plan(model, context)
-        kept_float = TARGETS.parse(self.target).kept_float(plan, model)
+        kept_float = self._runtime.kept_float(plan, model)
         return dataclasses.replace(plan, kept_float=kept_float)
+
+    @functools.cached_property
+    def _runtime(self) -> Target:
+        return TARGETS.parse(self.target)
 
     def _rules(self) -> RuleSet:
         rules = self.rules
@@ -230,8 +233,7 @@ def _findings(plan: QuantPlan, ranges: Ranges) -> tuple[str, ...]:
     )
 
 
-def _lint(model: ir.Model, target: str) -> str:
-    found = TARGETS.parse(target).lint(model)
+def _linted(found: Sequence[LintFinding], target: str) -> str:
     if not found:
         return f"lint for {target}: nothing found"
     first = found[0]

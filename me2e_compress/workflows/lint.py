@@ -1,6 +1,7 @@
 """Check whether the runtime that is to run a graph would accept it."""
 
 import dataclasses
+import functools
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +13,7 @@ from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.targets import TARGETS, LintFinding
+from me2e_compress.targets import TARGETS, LintFinding, Target
 from me2e_compress.targets.tensorrt.rtx import BuildResult, check
 from me2e_compress.workflows.checks import load_map, model_path
 from me2e_compress.workflows.first_opening import try_first
@@ -44,11 +45,16 @@ class LintOptions:
     def __post_init__(self) -> None:
         if self.trt_check and self.target != "tensorrt":
             raise RecipeError(f"--trt-check is for tensorrt, not for {self.target}")
-        if self.provider != CPU and not TARGETS.parse(self.target).opens:
+        if self.provider != CPU and not self.judge.opens:
             raise RecipeError(
                 f"--provider and --plugins are onnxruntime's: lint for {self.target}"
                 " opens no session"
             )
+
+    @functools.cached_property
+    def judge(self) -> Target:
+        """The target, whose rules judge the graph."""
+        return TARGETS.parse(self.target)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -163,7 +169,7 @@ def _found(
     model: ir.Model, name: str, options: LintOptions, listener: Listener
 ) -> tuple[LintFinding, ...]:
     """Return the rules' findings and, if none is an error, those of opening it."""
-    judge, provider = TARGETS.parse(options.target), options.provider
+    judge, provider = options.judge, options.provider
     found = judge.lint(model)
     if any(each.severity == "error" for each in found):
         return found
