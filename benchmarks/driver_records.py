@@ -10,7 +10,7 @@ from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study import Condition, StudyResult, Variant
-from me2e_compress.study.drives import Drive
+from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.tables import estimate_cell
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import Cell, Table
@@ -38,7 +38,7 @@ def routes_csv(outcome: StudyResult) -> str:
                 "driving_score_percent": each.driving_score,
                 "succeeded": int(each.succeeded),
                 "ending": each.ending,
-                "infractions": " ".join(kind for kind, _ in each.infractions),
+                "infractions": " ".join(kind for kind, _ in each.moments),
             }
             for drive in outcome.drives
             for each in drive.routes
@@ -136,7 +136,7 @@ def _driven(
     return _episodes(workspace, variant, condition)
 
 
-def _scores(outcome: StudyResult, drive: Drive) -> Row:
+def _scores(outcome: StudyResult, drive: DriveRecord) -> Row:
     variant = outcome.variant(drive.variant)
     return {
         "scheme": drive.variant,

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from me2e_compress.study.drives import Drive
+from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome
 from me2e_compress.study.tables import (
     MISSING,
@@ -77,7 +77,7 @@ def near_misses(outcome: StudyOutcome) -> Table:
     )
 
 
-def _cells(drive: Drive) -> tuple[Cell, ...]:
+def _cells(drive: DriveRecord) -> tuple[Cell, ...]:
     if drive.scores is None:
         return (Cell(MISSING, reason=drive.reason),) * len(COLUMNS)
     found = drive.scores.safety

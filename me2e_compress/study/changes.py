@@ -10,14 +10,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.metrics.route_values import RouteColumn
 from me2e_compress.study.condition import Condition
-from me2e_compress.study.drives import Drive
-from me2e_compress.study.route_outcomes import RouteOutcome
-
-PERCENT = (0.0, 100.0)
-DS = RouteColumn[RouteOutcome]("DS", "%", lambda one: one.driving_score, PERCENT)
-SR = RouteColumn[RouteOutcome]("SR %", "%", lambda one: 100.0 * one.succeeded, PERCENT)
+from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.route_columns import DS, SR, Column
+from me2e_compress.study.route_summary import RouteSummary
 
 
 @dataclass(frozen=True)
@@ -49,7 +45,10 @@ class Change:
 
 
 def changes(
-    conditions: Sequence[Condition], drives: Sequence[Drive], baseline: str, seed: int
+    conditions: Sequence[Condition],
+    drives: Sequence[DriveRecord],
+    baseline: str,
+    seed: int,
 ) -> tuple[Change, ...]:
     """Compare every drive with the one that its condition changes, if there is one."""
     there = _by_cell(drives)
@@ -78,7 +77,7 @@ def changes(
 
 
 def held_against(
-    pairs: Sequence[tuple[str, str]], drives: Sequence[Drive], seed: int
+    pairs: Sequence[tuple[str, str]], drives: Sequence[DriveRecord], seed: int
 ) -> tuple[Change, ...]:
     """Compare pairs of drives (``VARIANT.CONDITION``) if both were driven."""
     there = _by_cell(drives)
@@ -91,8 +90,8 @@ def held_against(
 
 
 def _by_cell(
-    drives: Sequence[Drive],
-) -> Mapping[tuple[str, str], tuple[RouteOutcome, ...]]:
+    drives: Sequence[DriveRecord],
+) -> Mapping[tuple[str, str], tuple[RouteSummary, ...]]:
     return {
         (each.variant, each.condition): each.routes for each in drives if each.routes
     }
@@ -106,8 +105,8 @@ def _cell(name: str) -> tuple[str, str]:
 def _change(
     cell: tuple[str, str],
     other: tuple[str, str],
-    ours: Sequence[RouteOutcome],
-    others: Sequence[RouteOutcome],
+    ours: Sequence[RouteSummary],
+    others: Sequence[RouteSummary],
     seed: int,
 ) -> Change:
     score, rate = (
@@ -117,11 +116,11 @@ def _change(
 
 
 def _beyond(
-    column: RouteColumn[RouteOutcome],
-    ours: Sequence[RouteOutcome],
-    before: Sequence[RouteOutcome],
-    theirs: Sequence[RouteOutcome],
-    theirs_before: Sequence[RouteOutcome],
+    column: Column,
+    ours: Sequence[RouteSummary],
+    before: Sequence[RouteSummary],
+    theirs: Sequence[RouteSummary],
+    theirs_before: Sequence[RouteSummary],
     seed: int,
 ) -> Estimate:
     """Return how much more ours changed than theirs."""

@@ -1,118 +1,58 @@
-"""The part of a drive that tables need: one line per route, without frames.
+"""One drive: a line per route, without frames, and how it compares with the baseline.
 
 A drive of 220 routes takes 30 MB of episodes and 0.1 MB of these lines.
 """
 
 import json
-import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from pydantic import ConfigDict, TypeAdapter, with_config
+from pydantic import TypeAdapter
 
 from me2e_compress import documents
 from me2e_compress.errors import StudyError
-from me2e_compress.metrics import surrogate_safety as near
-from me2e_compress.metrics.comfort import comfort
-from me2e_compress.metrics.driving_score import route_score
-from me2e_compress.metrics.efficiency import efficiency
+from me2e_compress.metrics.differences import PairedDifference
 from me2e_compress.metrics.episode import Episode
-from me2e_compress.metrics.infraction import COLLISIONS
+from me2e_compress.metrics.scores import Scores
 from me2e_compress.runtime.atomic import write_bytes
-
-PERCENTS = (50, 90, 99, 100)
-"""Percentiles of the latencies of a route's decisions."""
-DIGITS = 6
-
-_STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
-
-
-@with_config(_STRICT)
-@dataclass(frozen=True)
-class RouteSummary:
-    """One route of one drive; unrecorded values are None.
-
-    Attributes:
-        driving_score: Percent, as are completion, efficiency and ttc_exposure.
-        succeeded: Whether the whole route was driven without an infraction.
-        infractions: Kind, microseconds if known, and the other party or obstacle.
-        efficiency: None if no traffic moved, or the ego did not.
-        comfort: Share of smooth segments; None if there was no whole one.
-        duration_us: Time of the last frame.
-        latency_us: `PERCENTS` of the decisions' latencies on the vehicle.
-        ttc_exposure: Share of the frames with a time to collision below 1.5 s.
-        smallest_pet: Post-encroachment time of crossing paths, seconds.
-    """
-
-    route: str
-    scenario: str
-    driving_score: float
-    completion: float
-    succeeded: bool
-    ending: str
-    infractions: tuple[tuple[str, int | None, str], ...]
-    efficiency: float | None
-    comfort: float | None
-    duration_us: int
-    decisions: int
-    latency_us: tuple[int, ...]
-    latency_sum_us: int
-    ttc_exposure: float | None = None
-    smallest_ttc: float | None = None
-    smallest_pet: float | None = None
-    smallest_distance: float | None = None
-    at_fault: bool | None = None
-
-    @property
-    def collisions(self) -> tuple[tuple[str, str], ...]:
-        """Kind and other party of each collision."""
-        return tuple(
-            (kind, detail) for kind, _, detail in self.infractions if kind in COLLISIONS
-        )
-
-    @classmethod
-    def of(cls, episode: Episode) -> Self:
-        """Summarize an episode."""
-        # percentiles of the latency that the drive was charged
-        charged = [each.latency_us for each in episode.decisions]
-        latency_us = np.percentile(charged or [0], PERCENTS, method="higher")
-        return cls(
-            episode.route,
-            episode.scenario,
-            route_score(episode).composed,
-            episode.completion_percent,
-            episode.succeeded,
-            episode.ending.value,
-            tuple((e.kind.value, e.time_us, e.detail) for e in episode.infractions),
-            _rounded(efficiency(episode).value),
-            _rounded(comfort(episode).value),
-            episode.frames[-1].time_us if episode.frames else 0,
-            len(charged),
-            tuple(int(each) for each in latency_us) if charged else (),
-            sum(charged),
-            _rounded(near.ttc_exposure(episode).value),
-            _rounded(near.smallest_ttc(episode).value),
-            _rounded(near.smallest_pet(episode).value),
-            _rounded(near.smallest_distance(episode).value),
-            near.at_fault_collision(episode),
-        )
-
+from me2e_compress.study.route_summary import RouteSummary
 
 _ROUTE = TypeAdapter(RouteSummary)
 
 
 @dataclass(frozen=True)
+class Apart:
+    """Greatest distance to the baseline's ego at the same time, and that time."""
+
+    distance_m: float
+    time_us: int
+
+
+@dataclass(frozen=True)
 class DriveRecord:
-    """One drive over routes; ``made_by`` is its fingerprint without the routes."""
+    """One variant under one condition, or the reason why it was not driven.
+
+    Files hold names, ``made_by`` and the routes; the rest follows from episodes.
+
+    Attributes:
+        made_by: Its fingerprint without the routes.
+        difference: Paired by route with the baseline under the same condition; None for
+            the baseline itself.
+        apart: By route, how far it was from the baseline; without routes that have no
+            frames.
+    """
 
     variant: str
     condition: str
-    set_size: int
-    made_by: Mapping[str, Any]
-    routes: tuple[RouteSummary, ...]
+    routes: tuple[RouteSummary, ...] = ()
+    made_by: Mapping[str, Any] = field(default_factory=dict)
+    scores: Scores | None = None
+    difference: PairedDifference | None = None
+    apart: Mapping[str, Apart] = field(default_factory=dict)
+    reason: str = ""
 
     @classmethod
     def of(
@@ -124,8 +64,12 @@ class DriveRecord:
     ) -> Self:
         """Summarize episodes; ``made_by`` loses its redundant list of routes."""
         kept = {key: value for key, value in made_by.items() if key != "routes"}
-        routes = tuple(map(RouteSummary.of, episodes))
-        return cls(variant, condition, int(made_by["set_size"]), kept, routes)
+        return cls(variant, condition, tuple(map(RouteSummary.of, episodes)), kept)
+
+    @property
+    def set_size(self) -> int:
+        """Number of routes of the whole set."""
+        return int(self.made_by["set_size"])
 
     @property
     def mean_latency_us(self) -> int | None:
@@ -139,6 +83,30 @@ class DriveRecord:
         """Decisions over the time driven; 0 if no time passed."""
         time_us = sum(each.duration_us for each in self.routes)
         return 1e6 * sum(each.decisions for each in self.routes) / max(time_us, 1)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return scores, difference and routes, as they stand in the study's JSON."""
+        return {
+            "scheme": self.variant,
+            "condition": self.condition,
+            "reason": self.reason or None,
+            "scores": self.scores.to_json() if self.scores else None,
+            "difference": self.difference.to_json() if self.difference else None,
+            "routes": [self._route_json(each) for each in self.routes],
+        }
+
+    def _route_json(self, route: RouteSummary) -> dict[str, Any]:
+        apart = self.apart.get(route.route)
+        return {
+            "route": route.route,
+            "driving_score": route.driving_score,
+            "succeeded": route.succeeded,
+            "ending": route.ending,
+            "infractions": [
+                {"kind": kind, "time_us": time_us} for kind, time_us in route.moments
+            ],
+            "apart_m": None if apart is None else apart.distance_m,
+        }
 
     def save(self, path: Path) -> None:
         """Write it as JSON lines: the fingerprint, then one line per route."""
@@ -161,8 +129,8 @@ class DriveRecord:
         try:
             head, *rows = map(documents.from_json, _lines(path))
             routes = tuple(_ROUTE.validate_python(row) for row in rows)
-            made_by, set_size = head["made_by"], int(head["made_by"]["set_size"])
-            record = cls(head["variant"], head["condition"], set_size, made_by, routes)
+            record = cls(head["variant"], head["condition"], routes, head["made_by"])
+            int(record.set_size)  # a head without one is spoilt
         except OSError as error:
             raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
         except (ValueError, KeyError, TypeError) as error:
@@ -190,5 +158,24 @@ def _lines(path: Path) -> list[str]:
     return text.splitlines()
 
 
-def _rounded(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else round(value, DIGITS)
+def apart(
+    episodes: Sequence[Episode], reference: Sequence[Episode]
+) -> dict[str, Apart]:
+    """Return how far two drives of the same routes part, by route."""
+    both = zip(episodes, reference, strict=True)
+    return {
+        one.route: _apart(one, other)
+        for one, other in both
+        if one.frames and other.frames
+    }
+
+
+def _apart(one: Episode, other: Episode) -> Apart:
+    count = min(len(one.frames), len(other.frames))
+    here, there = (
+        np.array([(frame.x, frame.y) for frame in each.frames[:count]])
+        for each in (one, other)
+    )
+    gaps = np.hypot(*(here - there).T)
+    at = int(gaps.argmax())
+    return Apart(float(gaps[at]), one.frames[at].time_us)

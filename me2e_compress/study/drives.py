@@ -1,10 +1,9 @@
 """Drive and score every variant under every condition."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 from me2e_compress.driving.latency import FixedLatency, LatencySource
 from me2e_compress.errors import StudyError
@@ -13,46 +12,23 @@ from me2e_compress.evaluators.highway.engine import Engine
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
 from me2e_compress.evaluators.highway.worker import Job
-from me2e_compress.metrics.differences import PairedDifference, difference
+from me2e_compress.metrics.differences import difference
 from me2e_compress.metrics.episode import Episode
-from me2e_compress.metrics.scores import Scores, score
+from me2e_compress.metrics.scores import score
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
-from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.elsewhere import episodes_elsewhere
+from me2e_compress.study.drive_record import DriveRecord, apart
 from me2e_compress.study.prepared import PreparedVariant
-from me2e_compress.study.route_outcomes import RouteOutcome, outcomes
 from me2e_compress.study.timing import Clock
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.listener import Listener
-
-
-@dataclass(frozen=True)
-class Drive:
-    """One variant under one condition, or the reason why it was not driven.
-
-    ``difference`` is paired by route with the baseline under the same condition; it is
-    None for the baseline itself.
-    """
-
-    variant: str
-    condition: str
-    scores: Scores | None
-    difference: PairedDifference | None = None
-    routes: tuple[RouteOutcome, ...] = ()
-    reason: str = ""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return scores, difference and routes."""
-        return {
-            "scheme": self.variant,
-            "condition": self.condition,
-            "reason": self.reason or None,
-            "scores": self.scores.to_json() if self.scores else None,
-            "difference": self.difference.to_json() if self.difference else None,
-            "routes": [each.to_json() for each in self.routes],
-        }
+from me2e_compress.workflows.other_evaluators import (
+    driven_episodes,
+    evaluator_named,
+    keep,
+    kept,
+)
 
 
 @dataclass(frozen=True)
@@ -69,7 +45,7 @@ class DriveSetup:
 
     def under(
         self, condition: Condition, prepared: Sequence[PreparedVariant]
-    ) -> tuple[Drive, ...]:
+    ) -> tuple[DriveRecord, ...]:
         """Drive the variants of one condition, the baseline first."""
         driven = self.study.driven_under(condition)
         prepared = [each for each in prepared if each.variant in driven]
@@ -198,10 +174,20 @@ class DriveSetup:
     ) -> tuple[Episode, ...] | None:
         if prepared.failure:
             return None
-        place, evaluator = self.workspace, self.study.evaluator
-        stage = f"{prepared.variant.name}, {condition.name}"
+        # the policy becomes the evaluator's option of that name
+        evaluator, variant = self.study.evaluator, prepared.variant
+        stage = f"{variant.name}, {condition.name}"
         self.listener.on_progress(stage, 0, 1, evaluator)
-        return episodes_elsewhere(evaluator, prepared, condition, place)
+        policy = variant.policy if prepared.model is None else str(prepared.model)
+        found = evaluator_named(evaluator, policy)
+        # from its folder if they were kept
+        folder = self.workspace.results(variant, condition)
+        driver = prepared.sha256 or prepared.driver.fingerprint()
+        if (again := kept(found, folder, driver)) is not None:
+            return again
+        episodes = driven_episodes(found)
+        keep(found, episodes, folder, driver)
+        return episodes
 
     def _drive(
         self,
@@ -209,17 +195,21 @@ class DriveSetup:
         condition: Condition,
         episodes: tuple[Episode, ...] | None,
         reference: tuple[Episode, ...] | None,
-    ) -> Drive:
+    ) -> DriveRecord:
         name, seed = prepared.variant.name, self.study.seed
         if episodes is None:
             why = self._why_not(prepared)
-            return Drive(name, condition.name, None, reason=why)
-        return Drive(
-            name,
-            condition.name,
-            score(episodes, self.study.set_size or len(episodes), seed),
-            None if reference is None else difference(episodes, reference, seed),
-            outcomes(episodes, reference),
+            return DriveRecord(name, condition.name, reason=why)
+        record = replace(
+            DriveRecord.of(name, condition.name, {}, episodes),
+            scores=score(episodes, self.study.set_size or len(episodes), seed),
+        )
+        if reference is None:
+            return record
+        return replace(
+            record,
+            difference=difference(episodes, reference, seed),
+            apart=apart(episodes, reference),
         )
 
     def _teller(self, stage: str) -> Callable[[DrivingProgress], None]:

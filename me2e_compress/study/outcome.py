@@ -12,7 +12,7 @@ from me2e_compress.runtime.profile import processor
 from me2e_compress.study.changes import Change, changes, held_against
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
-from me2e_compress.study.drives import Drive
+from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.plan_fidelity import PlanFidelity, measure_json
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.side_by_side import Contrast
@@ -88,7 +88,7 @@ class StudyOutcome:
 
     study: Study
     variants: tuple[VariantOutcome, ...]
-    drives: tuple[Drive, ...]
+    drives: tuple[DriveRecord, ...]
     contrasts: tuple[Contrast, ...]
     device_scale: float
     machine: str
@@ -108,7 +108,7 @@ class StudyOutcome:
         scores = [each.scores for each in self.drives if each.scores is not None]
         return (scores[0].routes, scores[0].expected) if scores else (0, 0)
 
-    def under(self, condition: Condition) -> tuple[Drive, ...]:
+    def under(self, condition: Condition) -> tuple[DriveRecord, ...]:
         """Return the drives under one condition."""
         return tuple(each for each in self.drives if each.condition == condition.name)
 

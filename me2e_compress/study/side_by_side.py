@@ -11,9 +11,10 @@ from me2e_compress.simulator.pictures import Moment, RoutePicture, overlay, writ
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.world import World
 from me2e_compress.study.condition import Condition
-from me2e_compress.study.drives import Drive, DriveSetup
+from me2e_compress.study.drive_record import Apart, DriveRecord
+from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.prepared import PreparedVariant
-from me2e_compress.study.route_outcomes import RouteOutcome
+from me2e_compress.study.route_summary import RouteSummary
 
 SCORED, MOVED_M = 1.0, 0.5
 """Two drives whose scores are closer, and that were never farther apart, look alike."""
@@ -23,11 +24,12 @@ SCORED, MOVED_M = 1.0, 0.5
 class Contrast:
     """A PNG of one moment of two drives: the baseline in grey under the variant."""
 
-    route: RouteOutcome
-    other: RouteOutcome
+    route: RouteSummary
+    other: RouteSummary
     variant: str
     condition: str
     time_us: int
+    apart_m: float
     picture: Path
 
 
@@ -35,9 +37,14 @@ class Contrast:
 class _Pair:
     """A candidate: one route of two drives."""
 
-    drive: Drive
-    route: RouteOutcome
-    other: RouteOutcome
+    drive: DriveRecord
+    route: RouteSummary
+    other: RouteSummary
+
+    @property
+    def apart(self) -> Apart:
+        """How far the two were from each other at most."""
+        return self.drive.apart.get(self.other.route, Apart(0.0, 0))
 
     @property
     def gap(self) -> float:
@@ -50,22 +57,22 @@ class _Pair:
 
     @property
     def differs(self) -> bool:
-        return self.gap >= SCORED or (self.other.apart_m or 0.0) > MOVED_M
+        return self.gap >= SCORED or self.apart.distance_m > MOVED_M
 
     @property
     def rank(self) -> tuple[float, float]:
-        return -self.gap, -(self.other.apart_m or 0.0)
+        return -self.gap, -self.apart.distance_m
 
     @property
     def moment_us(self) -> int:
         """Time of the worse drive's infraction, else of the greatest distance."""
-        if self.gap < SCORED and self.other.apart_us is not None:
-            return self.other.apart_us
+        if self.gap < SCORED:
+            return self.apart.time_us
         worse, better = self.route, self.other
         if worse.driving_score > better.driving_score:
             worse, better = better, worse
-        kinds = [kind for kind, _ in better.infractions]
-        timed = [(kind, us) for kind, us in worse.infractions if us is not None]
+        kinds = [kind for kind, _ in better.moments]
+        timed = [(kind, us) for kind, us in worse.moments if us is not None]
         alone = [us for kind, us in timed if kind not in kinds]
         times = alone or [us for _, us in timed]
         return times[0] if times else min(worse.duration_us, better.duration_us)
@@ -74,7 +81,7 @@ class _Pair:
 def take_pictures(
     setup: DriveSetup,
     prepared: Sequence[PreparedVariant],
-    drives: Sequence[Drive],
+    drives: Sequence[DriveRecord],
     limit: int,
 ) -> tuple[Contrast, ...]:
     """Drive the routes on which variants diverge the most again, up to the moment.
@@ -97,13 +104,13 @@ def take_pictures(
         found.append(
             Contrast(
                 *(pair.route, pair.other, pair.drive.variant, condition.name),
-                *(pair.moment_us, picture),
+                *(pair.moment_us, pair.apart.distance_m, picture),
             )
         )
     return tuple(found)
 
 
-def _chosen(baseline: str, drives: Sequence[Drive], limit: int) -> list[_Pair]:
+def _chosen(baseline: str, drives: Sequence[DriveRecord], limit: int) -> list[_Pair]:
     """Choose the widest gaps: one of each variant first, and no route twice."""
     references = {each.condition: each for each in drives if each.variant == baseline}
     pairs = [

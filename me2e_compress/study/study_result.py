@@ -5,7 +5,7 @@ from typing import Any
 
 from me2e_compress.runtime.providers import PROVIDERS
 from me2e_compress.study.all_tables import all_tables
-from me2e_compress.study.drives import Drive
+from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome
 from me2e_compress.workflows.result import Result, Table, counted
 
@@ -51,7 +51,7 @@ class StudyResult(StudyOutcome, Result):
         """Return one row per drive."""
         return [self._record(each) for each in self.drives]
 
-    def _record(self, drive: Drive) -> dict[str, object]:
+    def _record(self, drive: DriveRecord) -> dict[str, object]:
         # a drive that was not made has no scores
         scores, of = drive.scores, self.variant(drive.variant)
         found = (

@@ -8,7 +8,7 @@ from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.changes import Change
 from me2e_compress.study.condition import Condition
-from me2e_compress.study.drives import Drive
+from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome, VariantOutcome
 from me2e_compress.study.plan_fidelity import EXACT
 from me2e_compress.workflows.result import Cell, Table, counted
@@ -189,7 +189,7 @@ def _change(change: Change, *, beyond: bool) -> tuple[Cell, ...]:
     return (*cells, *shown) if beyond else cells
 
 
-def _scores(drive: Drive) -> tuple[Cell, ...]:
+def _scores(drive: DriveRecord) -> tuple[Cell, ...]:
     if drive.scores is None:
         return (Cell(MISSING, reason=drive.reason),) * 4
     scores = drive.scores

@@ -2,7 +2,7 @@
 
 from me2e_compress.metrics.differences import PairedDifference, shown_by
 from me2e_compress.metrics.measure import Measure
-from me2e_compress.study.drives import Drive
+from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome
 from me2e_compress.study.tables import MISSING, number
 from me2e_compress.workflows.result import Cell, Table
@@ -58,7 +58,7 @@ def _road(found: PairedDifference, outcome: StudyOutcome) -> str:
     return said
 
 
-def _drive(outcome: StudyOutcome, name: str) -> Drive:
+def _drive(outcome: StudyOutcome, name: str) -> DriveRecord:
     (drive,) = (each for each in outcome.drives if each.variant == name)
     return drive
 
@@ -81,13 +81,13 @@ def _cell(measure: Measure, form: str) -> Cell:
     return Cell(number(measure.value, form))
 
 
-def _score(drive: Drive) -> Cell:
+def _score(drive: DriveRecord) -> Cell:
     if drive.scores is None:
         return Cell(MISSING, reason=drive.reason)
     return _cell(drive.scores.driving_score.measure, ".1f")
 
 
-def _difference(drive: Drive) -> str:
+def _difference(drive: DriveRecord) -> str:
     """Return the difference in points, with its 95 % interval."""
     if drive.difference is None:
         return ""

@@ -8,7 +8,8 @@ from me2e_compress import drafts, marks
 from me2e_compress.display import in_markdown
 from me2e_compress.errors import StudyError
 from me2e_compress.runtime.atomic import write_bytes, write_document
-from me2e_compress.study.all_tables import all_tables
+from me2e_compress.study.paper.paper_page import paper_html
+from me2e_compress.study.paper.paper_result import PaperResult
 from me2e_compress.study.report import Section, html
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
@@ -25,7 +26,7 @@ class StudyFiles:
 
 
 def write_study(
-    outcome: StudyResult,
+    outcome: StudyResult | PaperResult,
     folder: str | Path,
     command: Sequence[str] = (),
     sections: Sequence[Section] = (),
@@ -38,7 +39,7 @@ def write_study(
         outcome: Results to write.
         folder: Created if needed.
         command: The command line that reproduces the study, word by word.
-        sections: Additional sections of the page.
+        sections: Additional sections of the page; the paper's has its own.
         force: Also replace files that we did not write.
 
     Raises:
@@ -50,7 +51,11 @@ def write_study(
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
     title = f"{outcome.study.title}{outcome.study.preview}"
     heading = f"{marks.IN_MARKDOWN}# {in_markdown(title)}\n\n"
-    text = heading + "\n".join(table.markdown() for table in all_tables(outcome))
+    text = heading + "\n".join(table.markdown() for table in outcome.tables())
+    if isinstance(outcome, PaperResult):
+        page = paper_html(outcome, command)
+    else:
+        page = html(outcome, command, sections)
     # all files are written, or none
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -60,7 +65,7 @@ def write_study(
         ):
             write_document(written.record, outcome.to_json(), indent=1)
             write_bytes(written.tables, text.encode())
-            write_bytes(written.report, html(outcome, command, sections).encode())
+            write_bytes(written.report, page.encode())
     except OSError as error:
         raise StudyError(f"{folder}: cannot be written: {error.strerror}") from error
     return written

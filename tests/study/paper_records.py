@@ -6,13 +6,14 @@ import numpy as np
 
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.study import Study
-from me2e_compress.study.drive_record import DriveRecord, RouteSummary
+from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.paper.model_facts import (
     FILE,
     Int8Counts,
     ModelFacts,
     save_facts,
 )
+from me2e_compress.study.route_summary import RouteSummary
 from me2e_compress.study.workload import held_frames
 
 LOST = {"minus-map": 60.0, "minus-motion": 10.0, "full": 6.0, "prediction": 3.0}
@@ -28,7 +29,7 @@ def write_records(study: Study, folder: Path) -> Path:
             lost = 0.2 * late**2 + sum(LOST[k] for k in LOST if k in name)
             routes = _routes(study, lost, late, name)
             made_by = {"set_size": study.set_size, "routes_sha256": "0", "of": name}
-            record = DriveRecord(name, condition.name, study.set_size, made_by, routes)
+            record = DriveRecord(name, condition.name, routes, made_by)
             record.save(folder / f"{name}.{condition.name}.jsonl")
     about = {"machine": "none", "device_scale": 20.0}
     save_facts(folder / FILE, [_fact(each.name) for each in study.variants], about)

@@ -6,9 +6,9 @@ import pytest
 from me2e_compress.errors import StudyError
 from me2e_compress.study import Condition, Study, load_study
 from me2e_compress.study.changes import changes, held_against
-from me2e_compress.study.drives import Drive
+from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.file import STUDIES
-from me2e_compress.study.route_outcomes import RouteOutcome
+from me2e_compress.study.route_summary import RouteSummary
 from me2e_compress.study.tables import change_tables
 from tests.study.conftest import IDEAL, Make
 
@@ -16,12 +16,16 @@ FOG = Condition("fog", "none", against="ideal")
 CONDITIONS = (IDEAL, FOG)
 
 
-def drive(variant: str, condition: str, scores: Sequence[float]) -> Drive:
+def summary(route: str, scenario: str, score: float) -> RouteSummary:
+    ended = (100.0, score == 100.0, "", (), None, None)
+    return RouteSummary(route, scenario, score, *ended, 1, 0, (), 0)
+
+
+def drive(variant: str, condition: str, scores: Sequence[float]) -> DriveRecord:
     routes = tuple(
-        RouteOutcome(f"r{n}", f"type{n // 2}", score, score == 100.0, "", (), 1)
-        for n, score in enumerate(scores)
+        summary(f"r{n}", f"type{n // 2}", score) for n, score in enumerate(scores)
     )
-    return Drive(variant, condition, None, routes=routes)
+    return DriveRecord(variant, condition, routes)
 
 
 DRIVES = (
@@ -55,7 +59,7 @@ def test_int8_loses_more_is_a_difference_of_differences() -> None:
 
 
 def test_what_was_not_driven_is_left_out() -> None:
-    missing = Drive("int8", "fog", None, reason="it failed")
+    missing = DriveRecord("int8", "fog", reason="it failed")
 
     assert len(changes(CONDITIONS, (*DRIVES[:3], missing), "float", 0)) == 1
     assert held_against([("int8.fog", "float.ideal")], DRIVES[:3], 0) == ()

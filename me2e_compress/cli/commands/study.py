@@ -95,5 +95,4 @@ def study(
         )
     show(found, as_json)
     if not as_json:
-        *first, last = map(str, files)
-        say(f"wrote {', '.join(first)} and {last}")
+        say(f"wrote {files.report}, {files.tables} and {files.record}")

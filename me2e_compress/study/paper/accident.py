@@ -17,7 +17,8 @@ from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Actor, Ego
 from me2e_compress.simulator.world import World
-from me2e_compress.study.drive_record import DriveRecord, RouteSummary
+from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.route_summary import RouteSummary
 
 FILE = "accident.json"
 BEFORE_US, EVERY_US = 3_000_000, 500_000

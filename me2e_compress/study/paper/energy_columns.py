@@ -12,8 +12,8 @@ from me2e_compress.metrics.route_measures import (
     RouteMeasures,
     route_measures,
 )
-from me2e_compress.study.drive_record import RouteSummary
 from me2e_compress.study.paper.paper_drives import PaperDrives
+from me2e_compress.study.route_summary import RouteSummary
 from me2e_compress.study.tables import estimate_cell, measure_cell
 from me2e_compress.workflows.result import Cell
 

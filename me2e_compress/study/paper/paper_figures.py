@@ -13,7 +13,6 @@ from me2e_compress.driving.realtime import skipped_decisions
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.study.paper.paper_drives import PaperDrives
 from me2e_compress.study.paper.published import RATES, PublishedDrive
-from me2e_compress.study.paper.route_columns import DC, DE, DS, Column, mean_of
 from me2e_compress.study.report.figures import WIDTH_IN
 from me2e_compress.study.report.style import (
     ACCENT,
@@ -23,6 +22,7 @@ from me2e_compress.study.report.style import (
     RULE,
     styled,
 )
+from me2e_compress.study.route_columns import DC, DE, DS, Column, mean_of
 from me2e_compress.study.workload import held_frames
 
 RATE_TICKS = (1, 2, 3, 5, 10, 20, 30)

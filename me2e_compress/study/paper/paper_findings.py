@@ -20,7 +20,7 @@ from me2e_compress.study.paper.questions import (
     not_lower_by,
     within,
 )
-from me2e_compress.study.paper.route_columns import DC, DE, DS
+from me2e_compress.study.route_columns import DC, DE, DS
 from me2e_compress.study.tables import MINUS
 
 IDEAL, TEN, FOUR, ONE = (

@@ -8,7 +8,7 @@ from me2e_compress.study.paper.paper_drives import PaperDrives
 from me2e_compress.study.paper.paper_findings import findings
 from me2e_compress.study.paper.paper_tables import all_paper_tables
 from me2e_compress.study.paper.questions import Finding, findings_table
-from me2e_compress.study.paper.route_columns import COLUMNS, mean_of
+from me2e_compress.study.route_columns import COLUMNS, mean_of
 from me2e_compress.workflows.result import Result, Table
 
 

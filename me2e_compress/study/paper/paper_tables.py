@@ -5,7 +5,6 @@ their own.
 """
 
 from me2e_compress.driving.realtime import skipped_decisions
-from me2e_compress.study.drive_record import PERCENTS
 from me2e_compress.study.paper import published
 from me2e_compress.study.paper.energy_columns import (
     EER,
@@ -28,6 +27,7 @@ from me2e_compress.study.paper.score_cells import (
     score_cells,
     times,
 )
+from me2e_compress.study.route_summary import PERCENTS
 from me2e_compress.study.study_blocks import StudyBlock
 from me2e_compress.study.tables import MISSING
 from me2e_compress.study.workload import held_frames

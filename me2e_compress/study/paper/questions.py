@@ -21,7 +21,7 @@ from me2e_compress.study.paper.energy_columns import (
     measures_by_variant,
 )
 from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.study.paper.route_columns import (
+from me2e_compress.study.route_columns import (
     DS,
     Column,
     mean_of,

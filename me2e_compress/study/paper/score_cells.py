@@ -6,7 +6,7 @@ from me2e_compress.driving.realtime import DT_US
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.study.paper.paper_drives import PaperDrives
 from me2e_compress.study.paper.published import PublishedDrive
-from me2e_compress.study.paper.route_columns import COLUMNS, DS, mean_of, paired
+from me2e_compress.study.route_columns import COLUMNS, DS, mean_of, paired
 from me2e_compress.study.tables import MISSING, estimate_cell, measure_cell
 from me2e_compress.workflows.result import Cell
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.study.drives import Drive
+from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome, VariantOutcome
 from me2e_compress.study.tables import number
 
@@ -48,7 +48,7 @@ def _times(one: Measure, other: Measure, what: str) -> str:
     return f"{one.value / other.value:.2f} {TIMES} {what}"
 
 
-def _road(drive: Drive, several: bool) -> str:
+def _road(drive: DriveRecord, several: bool) -> str:
     where = f"{drive.condition}: " if several else ""
     if drive.difference is None:
         return ""

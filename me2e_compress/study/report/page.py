@@ -13,7 +13,7 @@ from me2e_compress.study.all_tables import near_misses, route_table
 from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import forest, pareto
 from me2e_compress.study.report.findings import findings
-from me2e_compress.study.route_outcomes import RouteOutcome
+from me2e_compress.study.route_summary import RouteSummary
 from me2e_compress.study.side_by_side import Contrast
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.tables import (
@@ -121,14 +121,14 @@ def _shown(contrast: Contrast, baseline: str) -> Shown:
     return Shown(
         f"{route.scenario}, {contrast.condition}, "
         f"{contrast.time_us / 1e6:.1f} s into the route {route.route}; "
-        f"at most {contrast.other.apart_m or 0.0:.1f} m apart",
+        f"at most {contrast.apart_m:.1f} m apart",
         f"{baseline}, in grey: {_ended(route)}; {contrast.variant}, in colour:"
         f" {_ended(contrast.other)}",
         _data_uri(contrast.picture),
     )
 
 
-def _ended(route: RouteOutcome) -> str:
+def _ended(route: RouteSummary) -> str:
     return f"driving score {route.driving_score:.1f}, {route.fate}"
 
 

@@ -2,7 +2,8 @@
 
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_values import RouteColumn
-from me2e_compress.study.drive_record import DriveRecord, RouteSummary
+from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.route_summary import RouteSummary
 
 Column = RouteColumn[RouteSummary]
 

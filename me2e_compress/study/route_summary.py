@@ -1,0 +1,127 @@
+"""What tables need of one driven route: a line of numbers, without frames."""
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from pydantic import ConfigDict, with_config
+
+from me2e_compress.metrics import surrogate_safety as near
+from me2e_compress.metrics.comfort import comfort
+from me2e_compress.metrics.driving_score import route_score
+from me2e_compress.metrics.efficiency import efficiency
+from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.infraction import COLLISIONS, InfractionKind
+
+PERCENTS = (50, 90, 99, 100)
+"""Percentiles of the latencies of a route's decisions."""
+DIGITS = 6
+
+WORDS = {
+    InfractionKind.COLLISION_PEDESTRIAN: "collision with a pedestrian",
+    InfractionKind.COLLISION_VEHICLE: "collision with a vehicle",
+    InfractionKind.COLLISION_LAYOUT: "collision with an obstacle",
+    InfractionKind.RED_LIGHT: "red light",
+    InfractionKind.STOP: "stop sign",
+    InfractionKind.GIVE_WAY: "give-way sign",
+    InfractionKind.OUTSIDE_ROUTE_LANES: "outside its lanes",
+    InfractionKind.MIN_SPEED: "too slow",
+    InfractionKind.YIELD_TO_EMERGENCY_VEHICLE: "no way for an emergency vehicle",
+    InfractionKind.SCENARIO_TIMEOUT: "scenario timed out",
+    InfractionKind.ROUTE_DEVIATION: "left the route",
+    InfractionKind.VEHICLE_BLOCKED: "blocked",
+    InfractionKind.ROUTE_TIMEOUT: "timed out",
+}
+
+_STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True)
+class RouteSummary:
+    """One route of one drive; unrecorded values are None.
+
+    Attributes:
+        driving_score: Percent, as are completion, efficiency and ttc_exposure.
+        succeeded: Whether the whole route was driven without an infraction.
+        infractions: Kind, microseconds if known, and the other party or obstacle.
+        efficiency: None if no traffic moved, or the ego did not.
+        comfort: Share of smooth segments; None if there was no whole one.
+        duration_us: Time of the last frame.
+        latency_us: `PERCENTS` of the decisions' latencies on the vehicle.
+        ttc_exposure: Share of the frames with a time to collision below 1.5 s.
+        smallest_pet: Post-encroachment time of crossing paths, seconds.
+    """
+
+    route: str
+    scenario: str
+    driving_score: float
+    completion: float
+    succeeded: bool
+    ending: str
+    infractions: tuple[tuple[str, int | None, str], ...]
+    efficiency: float | None
+    comfort: float | None
+    duration_us: int
+    decisions: int
+    latency_us: tuple[int, ...]
+    latency_sum_us: int
+    ttc_exposure: float | None = None
+    smallest_ttc: float | None = None
+    smallest_pet: float | None = None
+    smallest_distance: float | None = None
+    at_fault: bool | None = None
+
+    @property
+    def moments(self) -> tuple[tuple[str, int | None], ...]:
+        """Kind and time of each infraction but being too slow, which has no moment."""
+        return tuple(
+            (kind, time_us)
+            for kind, time_us, _ in self.infractions
+            if kind != InfractionKind.MIN_SPEED
+        )
+
+    @property
+    def fate(self) -> str:
+        """The infractions in words, or how the route ended."""
+        kinds = [WORDS[InfractionKind(kind)] for kind, _ in self.moments]
+        return ", ".join(dict.fromkeys(kinds)) or self.ending
+
+    @property
+    def collisions(self) -> tuple[tuple[str, str], ...]:
+        """Kind and other party of each collision."""
+        return tuple(
+            (kind, detail) for kind, _, detail in self.infractions if kind in COLLISIONS
+        )
+
+    @classmethod
+    def of(cls, episode: Episode) -> Self:
+        """Summarize an episode."""
+        # percentiles of the latency that the drive was charged
+        charged = [each.latency_us for each in episode.decisions]
+        latency_us = np.percentile(charged or [0], PERCENTS, method="higher")
+        return cls(
+            episode.route,
+            episode.scenario,
+            route_score(episode).composed,
+            episode.completion_percent,
+            episode.succeeded,
+            episode.ending.value,
+            tuple((e.kind.value, e.time_us, e.detail) for e in episode.infractions),
+            _rounded(efficiency(episode).value),
+            _rounded(comfort(episode).value),
+            episode.frames[-1].time_us if episode.frames else 0,
+            len(charged),
+            tuple(int(each) for each in latency_us) if charged else (),
+            sum(charged),
+            _rounded(near.ttc_exposure(episode).value),
+            _rounded(near.smallest_ttc(episode).value),
+            _rounded(near.smallest_pet(episode).value),
+            _rounded(near.smallest_distance(episode).value),
+            near.at_fault_collision(episode),
+        )
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else round(value, DIGITS)
