@@ -4,15 +4,7 @@ from collections.abc import Iterator
 
 import onnx_ir as ir
 
-from me2e_compress.graph.nodes import bodies_of, nodes_in
-
-DRAWS = frozenset(
-    {
-        *("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike"),
-        *("RandomUniform", "RandomUniformLike"),
-    }
-)
-"""ONNX's operators that draw; those that name a seed draw the same in every session."""
+from me2e_compress.graph.nodes import DRAWS, bodies_of, nodes_in
 
 
 def random_outputs(model: ir.Model) -> tuple[str, ...]:
