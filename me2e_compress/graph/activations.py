@@ -4,14 +4,10 @@ import math
 
 import onnx_ir as ir
 
+from me2e_compress.graph.nodes import VIEWS
 from me2e_compress.graph.shapes import static_shape
 
-VIEWS = frozenset(
-    {"Identity", "Reshape", "Flatten", "Squeeze", "Transpose", "Unsqueeze"}
-)
-"""Operators between a DequantizeLinear and a product that runtimes look through."""
-
-_WRITE_NOTHING = VIEWS - {"Transpose"} | {"Constant", "DequantizeLinear"}
+_WRITE_NOTHING = VIEWS | {"Constant", "DequantizeLinear"}
 """They hand on what lies there, or are part of what reads them."""
 
 

@@ -13,6 +13,21 @@ STANDARD = ("", "ai.onnx")
 """The two spellings of the domain of ONNX's own operators."""
 
 
+VIEWS = frozenset({"Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"})
+"""Operators that move nothing and equal a Reshape."""
+
+LAYOUT_OPERATORS = VIEWS | {"Transpose"}
+"""Operators that move elements and do nothing else to them."""
+
+DRAWS = frozenset(
+    {
+        *("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike"),
+        *("RandomUniform", "RandomUniformLike"),
+    }
+)
+"""Operators that draw; those that name a seed draw the same in every session."""
+
+
 def is_standard(node: ir.Node) -> bool:
     """Return whether a node is one of ONNX's own operators."""
     return node.domain in STANDARD
@@ -168,6 +183,29 @@ def scalar_of(value: ir.Value | None) -> float | None:
     return float(array.item()) if array is not None and array.size == 1 else None
 
 
+def integers_of(value: ir.Value | None) -> list[int] | None:
+    """Return the elements of a constant array of integers, in order."""
+    array = array_of(value)
+    if array is None or array.dtype.kind not in "iu":
+        return None
+    return [int(number) for number in array.reshape(-1)]
+
+
+def integers_at(node: ir.Node, name: str, index: int) -> list[int] | None:
+    """Return a list that newer opsets moved from an attribute to a constant input."""
+    written = node.attributes.get_ints(name)
+    return integers_of(input_at(node, index)) if written is None else list(written)
+
+
+def permutation_of(node: ir.Node) -> list[int] | None:
+    """Return the order of a Transpose; None if its rank decides and is not known."""
+    written, data = node.attributes.get_ints("perm"), node.inputs[0]
+    if written is not None:
+        return list(written)
+    rank = None if data is None or data.shape is None else len(data.shape)
+    return None if rank is None else list(reversed(range(rank)))
+
+
 def overflow(numbers: Numbers, stored: Array) -> bool:
     """Return whether numbers are too large for the type of a stored array."""
     limit = np.finfo(stored.dtype.name).max
@@ -177,14 +215,6 @@ def overflow(numbers: Numbers, stored: Array) -> bool:
 def is_close(value: float | None, expected: float) -> bool:
     """Return whether a constant is the textbook's, within :data:`CLOSE`."""
     return value is not None and abs(value - expected) <= CLOSE * abs(expected)
-
-
-_UNSTEADY = frozenset(
-    {
-        "Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike",
-        "RandomUniform", "RandomUniformLike",
-    }
-)  # fmt: skip
 
 
 def constant_values(model: ir.Model) -> frozenset[ir.Value]:
@@ -198,7 +228,7 @@ def constant_values(model: ir.Model) -> frozenset[ir.Value]:
     for node in model.graph:
         if (
             is_standard(node)
-            and node.op_type not in _UNSTEADY
+            and node.op_type not in DRAWS
             and not has_subgraph(node)
             and all(each is None or each in found for each in node.inputs)
         ):

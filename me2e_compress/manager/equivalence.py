@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.nodes import bodies_of, nodes_in
+from me2e_compress.graph.nodes import DRAWS, bodies_of, nodes_in
 from me2e_compress.manager import runtime_levels
 from me2e_compress.manager.output_errors import errors, tolerances
 from me2e_compress.manager.report import Verification
@@ -108,14 +108,6 @@ def passed(result: Verification) -> bool:
     """Say whether every output that is judged stayed within its tolerance."""
     return all(result.errors[n] <= result.tolerances[n] for n in result.judged)
 
-
-DRAWS = frozenset(
-    {
-        *("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike"),
-        *("RandomUniform", "RandomUniformLike"),
-    }
-)
-"""ONNX's operators that draw; those that name a seed draw the same in every session."""
 
 
 def random_outputs(model: ir.Model) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ import math
 
 import onnx_ir as ir
 
-from me2e_compress.graph.nodes import maker
+from me2e_compress.graph.nodes import maker, permutation_of
 from me2e_compress.graph.shapes import static_shape
 from me2e_compress.operators.call import FusedCall
 
@@ -57,5 +57,5 @@ def _keeps_rows(node: ir.Node, row: int) -> bool:
         return False
     if node.op_type == "Expand":
         return read[len(read) - kept :] == made[len(made) - kept :]
-    order = node.attributes.get_ints("perm", tuple(reversed(range(len(read)))))
-    return list(order[len(read) - kept :]) == list(range(len(read) - kept, len(read)))
+    order = permutation_of(node) or []
+    return order[len(read) - kept :] == list(range(len(read) - kept, len(read)))

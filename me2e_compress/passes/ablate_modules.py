@@ -11,6 +11,7 @@ from me2e_compress import graph, rewrite
 from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance
+from me2e_compress.graph.nodes import LAYOUT_OPERATORS
 from me2e_compress.modules import ModuleMap, Substitute
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.edges import Edge, add_edge
@@ -27,9 +28,7 @@ from me2e_compress.passes.substitutes import (
     zeros_like,
 )
 
-_LAYOUT = frozenset(
-    {"Cast", "Flatten", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze"}
-)
+_LAYOUT = LAYOUT_OPERATORS | {"Cast"}
 """Operators that only change the layout or type of another node's result."""
 
 

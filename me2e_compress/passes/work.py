@@ -5,6 +5,7 @@ import math
 import onnx_ir as ir
 
 from me2e_compress.graph import macs, static_shape
+from me2e_compress.graph.nodes import VIEWS
 
 BYTES_PER_NODE = 2048
 """File bytes that a removed node may cost: at 2 us a node, 1 MB for 1 ms."""
@@ -20,18 +21,13 @@ benchmarks.bench_folding --price`` measures a machine). The constants move littl
 is folded on VAD-tiny is the same from 1 to 4 KB a node.
 """
 
-VIEWS = frozenset(
-    {"Flatten", "Identity", "Reshape", "Shape", "Size", "Squeeze", "Unsqueeze"}
-)
-"""Operators that move no data."""
-
 
 def work(node: ir.Node) -> float:
     """Return the cost of a node per frame in node starts: 1 plus its work.
 
     Unknown sizes count as 0.
     """
-    if node.op_type in VIEWS:
+    if node.op_type in VIEWS or node.op_type in ("Shape", "Size"):  # move no data
         return 1.0
     values = [*node.inputs, *node.outputs]
     moved = sum(_bytes(value) for value in values if value is not None)

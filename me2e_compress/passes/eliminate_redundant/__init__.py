@@ -10,6 +10,7 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 
 from me2e_compress.graph import array_of, infer_shapes, provenance
+from me2e_compress.graph.nodes import DRAWS
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.eliminate_redundant.identities import identity_of
 from me2e_compress.passes.eliminate_redundant.merges import MergeSite, merge
@@ -30,17 +31,7 @@ from me2e_compress.rewrite import (
 
 COMMUTATIVE = frozenset({"Add", "And", "Equal", "Mul", "Or", "Xor"})
 
-RANDOM = frozenset(
-    {
-        "Bernoulli",
-        "Dropout",
-        "Multinomial",
-        "RandomNormal",
-        "RandomNormalLike",
-        "RandomUniform",
-        "RandomUniformLike",
-    }
-)
+RANDOM = DRAWS | {"Dropout"}
 
 EDGE_BYTES = 64
 """How much of each end of a weight is compared before all of it is hashed."""

@@ -11,6 +11,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, static_shape
+from me2e_compress.graph.nodes import input_at, integers_at, integers_of, permutation_of
 from me2e_compress.rewrite import Array, is_read, is_standard
 
 Rule = Callable[[ir.Node, int], ir.Value | None]
@@ -73,8 +74,7 @@ def _cast_like(node: ir.Node, opset: int) -> ir.Value | None:
 
 
 def _transpose(node: ir.Node, opset: int) -> ir.Value | None:
-    perm = node.attributes.get("perm")
-    order = list(perm.as_ints()) if perm is not None else None
+    order = permutation_of(node)
     if order is not None and order == sorted(order):
         return node.inputs[0]
     if moves_nothing(node) and same_shape(node.inputs[0], node.outputs[0]):
@@ -84,28 +84,24 @@ def _transpose(node: ir.Node, opset: int) -> ir.Value | None:
 
 def moves_nothing(node: ir.Node) -> bool:
     """Return whether a Transpose only moves axes of size 1, as a Reshape would."""
-    shape = static_shape(node.inputs[0])
-    if shape is None:
+    shape, order = static_shape(node.inputs[0]), permutation_of(node)
+    if shape is None or order is None:
         return False
-    perm = node.attributes.get("perm")
-    order = list(perm.as_ints()) if perm is not None else range(len(shape))[::-1]
     real = [axis for axis in order if shape[axis] != 1]
     return real == sorted(real)
 
 
 def _slice(node: ir.Node, opset: int) -> ir.Value | None:
-    if len(node.inputs) > 4 and node.inputs[4] is not None:
-        steps = array_of(node.inputs[4])
-        if steps is None or not np.all(steps == 1):
+    if input_at(node, 4) is not None:
+        steps = integers_of(input_at(node, 4))
+        if steps is None or any(step != 1 for step in steps):
             return None
     return _if_same_shape(node, opset)
 
 
 def _pad(node: ir.Node, opset: int) -> ir.Value | None:
-    if "pads" in node.attributes:
-        return None if any(node.attributes["pads"].as_ints()) else node.inputs[0]
-    pads = array_of(node.inputs[1]) if len(node.inputs) > 1 else None
-    return node.inputs[0] if pads is not None and not pads.any() else None
+    pads = integers_at(node, "pads", 1)
+    return node.inputs[0] if pads is not None and not any(pads) else None
 
 
 def _clip(node: ir.Node, opset: int) -> ir.Value | None:

@@ -10,7 +10,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, provenance, static_shape
+from me2e_compress.graph import provenance, static_shape
+from me2e_compress.graph.nodes import VIEWS, integers_of, permutation_of
 from me2e_compress.passes.eliminate_redundant.identities import moves_nothing
 from me2e_compress.rewrite import (
     add_constant,
@@ -21,7 +22,7 @@ from me2e_compress.rewrite import (
     value_names,
 )
 
-VIEWS = frozenset({"Flatten", "Reshape", "Squeeze", "Unsqueeze"})
+_RESHAPING = VIEWS - {"Identity"}
 
 BROADCASTING = frozenset(
     {
@@ -92,7 +93,7 @@ def merge(node: ir.Node, site: MergeSite) -> ir.Node | None:
         return None
     if node.op_type in BROADCASTING:
         return _drop_expand(node, site)
-    if node.op_type in VIEWS or node.op_type == "Transpose":
+    if node.op_type in _RESHAPING or node.op_type == "Transpose":
         return _views(node, site) or (
             _transposes(node, site) if node.op_type == "Transpose" else None
         )
@@ -111,7 +112,7 @@ def _before(node: ir.Node, index: int = 0) -> ir.Node | None:
 def _is_view(node: ir.Node) -> bool:
     if node.op_type == "Transpose":
         return moves_nothing(node)
-    return node.op_type in VIEWS
+    return node.op_type in _RESHAPING
 
 
 def _views(node: ir.Node, site: MergeSite) -> ir.Node | None:
@@ -136,7 +137,7 @@ def _transposes(node: ir.Node, site: MergeSite) -> ir.Node | None:
     inner = _before(node)
     if inner is None or inner.op_type != "Transpose":
         return None
-    outer_perm, inner_perm = _perm(node), _perm(inner)
+    outer_perm, inner_perm = permutation_of(node), permutation_of(inner)
     if outer_perm is None or inner_perm is None:
         return None
     # Compose both permutations; drop the pair if nothing moves
@@ -156,14 +157,6 @@ def _transposes(node: ir.Node, site: MergeSite) -> ir.Node | None:
         sources=[inner],
         attributes={"perm": perm},
     )
-
-
-def _perm(node: ir.Node) -> list[int] | None:
-    perm = node.attributes.get("perm")
-    if perm is not None:
-        return [int(axis) for axis in perm.as_ints()]
-    shape = node.inputs[0].shape if node.inputs[0] is not None else None
-    return None if shape is None else list(range(len(shape)))[::-1]
 
 
 def _casts(node: ir.Node, site: MergeSite) -> ir.Node | None:
@@ -215,10 +208,9 @@ def _window(node: ir.Node) -> list[list[int]] | None:
     rank = 0 if node.outputs[0].shape is None else len(node.outputs[0].shape)
     given: list[list[int] | None] = []
     for value in node.inputs[1:]:
-        array = array_of(value)
-        if array is None and value is not None:
+        given.append(integers_of(value))
+        if value is not None and given[-1] is None:
             return None
-        given.append(None if array is None else [int(entry) for entry in array])
     # Fill in the defaults of axes and steps
     starts, ends, axes, steps = [*given, None, None, None, None][:4]
     if not rank or starts is None or ends is None:

@@ -8,6 +8,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, static_shape
+from me2e_compress.graph.nodes import DRAWS
 from me2e_compress.passes.fold_constants import table
 from me2e_compress.passes.fold_constants.inference import infer_node
 from me2e_compress.passes.fold_constants.table import NATIVE
@@ -19,20 +20,12 @@ SMALL = 1024
 LARGEST = 1 << 30
 """Limit in bytes of a computed value: a chain of Concats may claim any size."""
 
-NEVER = frozenset(
-    {
-        "Bernoulli",
-        "Constant",
-        "DequantizeLinear",
-        "DynamicQuantizeLinear",
-        "Multinomial",
-        "QuantizeLinear",
-        "RandomNormal",
-        "RandomNormalLike",
-        "RandomUniform",
-        "RandomUniformLike",
-    }
-)
+NEVER = DRAWS | {
+    "Constant",
+    "DequantizeLinear",
+    "DynamicQuantizeLinear",
+    "QuantizeLinear",
+}
 """Random operators, and quantization, which is an instruction to the runtime."""
 
 COMPUTE = frozenset(

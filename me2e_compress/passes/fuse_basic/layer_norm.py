@@ -8,6 +8,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, rank_of, static_shape
+from me2e_compress.graph.nodes import integers_at
 from me2e_compress.rewrite import (
     Facts,
     Fusion,
@@ -54,10 +55,7 @@ def _is_over_last_axes(match: Match, facts: Facts) -> bool:
 def _axes(node: ir.Node) -> list[int] | None:
     if not node.attributes.get_int("keepdims", 1):
         return None
-    if "axes" in node.attributes:
-        return [int(axis) for axis in node.attributes["axes"].as_ints()]
-    axes = array_of(node.inputs[1]) if len(node.inputs) > 1 else None
-    return None if axes is None else [int(axis) for axis in axes.reshape(-1)]
+    return integers_at(node, "axes", 1)
 
 
 def _check(match: Match, facts: Facts) -> str | None:

@@ -11,8 +11,13 @@ import math
 import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph import array_of, input_at, is_standard, static_shape
-from me2e_compress.graph.nodes import producer_of, sole_reader
+from me2e_compress.graph import is_standard, static_shape
+from me2e_compress.graph.nodes import (
+    LAYOUT_OPERATORS,
+    integers_at,
+    producer_of,
+    sole_reader,
+)
 from me2e_compress.passes.fuse_operators.digits import (
     Digit,
     Digits,
@@ -20,7 +25,6 @@ from me2e_compress.passes.fuse_operators.digits import (
     whole,
 )
 from me2e_compress.passes.fuse_operators.views import (
-    LAYOUT_OPERATORS,
     View,
     aligned,
     results,
@@ -232,12 +236,10 @@ def _total(product: View, kinds: tuple[str, ...]) -> tuple[View, bool]:
     node = sole_reader(product.value)
     if node is None or node.op_type not in kinds or not is_standard(node):
         raise PreconditionError("the weighted samples are not summed")
-    written = node.attributes.get_ints("axes")
-    given = array_of(input_at(node, 1))
-    axes = given.reshape(-1).tolist() if given is not None else written
+    axes = integers_at(node, "axes", 1)
     if not axes:
         raise PreconditionError("the sum is over all axes, or over computed ones")
-    over = {int(axis) % len(product.layout) for axis in axes}
+    over = {axis % len(product.layout) for axis in axes}
     keep = bool(node.attributes.get_int("keepdims", 1))
     layout = tuple(
         () if axis in over else digits

@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-import onnx
 import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph import array_of, opset_of, static_shape
+from me2e_compress.graph import array_of, digest, opset_of
 from me2e_compress.graph.nodes import Array
 from me2e_compress.operators import OWN_DOMAIN, expand
 from me2e_compress.passes.fuse_operators.decomposed import XY
@@ -42,54 +41,38 @@ def nodes_between(output: ir.Value, inputs: Sequence[ir.Value]) -> list[ir.Node]
     return list(known)
 
 
-def piece_of(
-    output: ir.Value, inputs: Sequence[ir.Value], opset: int
-) -> onnx.ModelProto:
-    """Write the nodes between values as a model of its own, with numbered names."""
-    names = {value: f"in{index}" for index, value in enumerate(inputs)}
-    weights: list[onnx.TensorProto] = []
-    nodes: list[onnx.NodeProto] = []
-    # Copy the nodes under new names; constants become weights
-    for node in nodes_between(output, inputs):
-        written = ir.serde.serialize_node(node)
-        del written.input[:], written.output[:], written.metadata_props[:]
-        written.name = f"node{len(nodes)}"
-        for value in node.inputs:
-            if value is not None and value not in names:
-                names[value] = f"w{len(weights)}"
-                array = array_of(value)
-                if array is None:
-                    raise PreconditionError(f"it reads {value.name} besides")
-                weights.append(onnx.numpy_helper.from_array(array, names[value]))
-            written.input.append("" if value is None else names[value])
-        for value in node.outputs:
-            names[value] = f"v{len(names)}"
-            written.output.append(names[value])
-        nodes.append(written)
-    # Declare inputs and shapes
-    ports = [_port(names[value], value) for value in inputs]
-    shapes = [
-        _port(name, value) for value, name in names.items() if name.startswith("v")
-    ]
-    body = onnx.helper.make_graph(
-        nodes, "piece", ports, [_port(names[output], output)], weights,
-        value_info=shapes,
-    )  # fmt: skip
-    imports = [
-        onnx.helper.make_opsetid(*each) for each in (("", opset), (OWN_DOMAIN, 1))
-    ]
-    return onnx.helper.make_model(body, opset_imports=imports, ir_version=IR_VERSION)
+def piece_of(output: ir.Value, inputs: Sequence[ir.Value], opset: int) -> ir.Model:
+    """Copy the nodes between values as a model of its own, with numbered names."""
+    nodes = nodes_between(output, inputs)
+    known = {*inputs, *(value for node in nodes for value in node.outputs)}
+    read = dict.fromkeys(value for node in nodes for value in node.inputs if value)
+    weights = [value for value in read if value not in known]
+    for value in weights:
+        if array_of(value) is None:
+            raise PreconditionError(f"it reads {value.name} besides")
+    imports = {"": opset, OWN_DOMAIN: 1}
+    body = ir.GraphView(
+        inputs, [output], nodes=nodes, initializers=weights, opset_imports=imports
+    ).clone()
+    # Equal pieces have equal names
+    made = (value for node in body for value in node.outputs)
+    values = [*body.inputs, *body.initializers.values(), *made]
+    for index, value in enumerate(values):
+        value.name = f"piece{index}"
+    for index, node in enumerate(body):
+        node.name = f"node{index}"
+        node.metadata_props.clear()
+    return ir.Model(body, ir_version=IR_VERSION)
 
 
-def run_piece(piece: onnx.ModelProto, feeds: Sequence[Array]) -> Array:
-    """Run a piece of a graph, with fused nodes expanded to their bodies."""
-    model = ir.from_proto(piece)
-    opset = opset_of(model)
-    for node in list(model.graph):
+def run_piece(piece: ir.Model, feeds: Sequence[Array]) -> Array:
+    """Run a piece of a graph; fused nodes are replaced by their bodies."""
+    for node in list(piece.graph):
         if node.domain == OWN_DOMAIN:
-            expand(node, opset=opset, by="check")
-    named = {f"in{index}": array for index, array in enumerate(feeds)}
-    (result,) = Session(model, optimize=False).run(named).values()
+            expand(node, opset=opset_of(piece), by="check")
+    names = (str(value.name) for value in piece.graph.inputs)
+    named = dict(zip(names, feeds, strict=True))
+    (result,) = Session(piece, optimize=False).run(named).values()
     return result
 
 
@@ -103,7 +86,7 @@ class Proofs:
 
     def __init__(self, opset: int, seed: int) -> None:
         self._opset, self._seed = opset, seed
-        self._known: dict[tuple[bytes, bytes], float] = {}
+        self._known: dict[tuple[str, str], float] = {}
 
     def error(self, before: ir.Value, after: ir.Value, views: Sequence[View]) -> float:
         """Return max|a-b|/max|a| of two values that are computed from the same views.
@@ -118,7 +101,7 @@ class Proofs:
         """
         inputs = list(dict.fromkeys(view.value for view in views))
         pieces = [piece_of(value, inputs, self._opset) for value in (before, after)]
-        key = (pieces[0].SerializeToString(), pieces[1].SerializeToString())
+        key = (digest(pieces[0]), digest(pieces[1]))
         if key not in self._known:
             self._known[key] = self._error(inputs, pieces, views)
         return self._known[key]
@@ -126,7 +109,7 @@ class Proofs:
     def _error(
         self,
         inputs: Sequence[ir.Value],
-        pieces: Sequence[onnx.ModelProto],
+        pieces: Sequence[ir.Model],
         views: Sequence[View],
     ) -> float:
         random = np.random.default_rng(self._seed)
@@ -145,8 +128,3 @@ def _draw(view: View, random: np.random.Generator) -> Array:
         return random.standard_normal(shape).astype(np.float32)
     places = random.uniform(-1 - 2 * OUTSIDE, 1 + 2 * OUTSIDE, shape)
     return ((places - view.shift) / view.scale).astype(np.float32)
-
-
-def _port(name: str, value: ir.Value) -> onnx.ValueInfoProto:
-    kind = value.dtype or ir.DataType.FLOAT
-    return onnx.helper.make_tensor_value_info(name, int(kind), static_shape(value))

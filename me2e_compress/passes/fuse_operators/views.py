@@ -7,14 +7,16 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, input_at, is_standard, static_shape
-from me2e_compress.graph.nodes import numbers_of, producer_of, sole_reader
+from me2e_compress.graph import input_at, is_standard, static_shape
+from me2e_compress.graph.nodes import (
+    VIEWS,
+    integers_of,
+    numbers_of,
+    permutation_of,
+    producer_of,
+    sole_reader,
+)
 from me2e_compress.passes.fuse_operators.digits import Digits, Layout, regrouped
-
-REGROUPING = frozenset({"Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"})
-"""Operators that keep the order of the elements."""
-LAYOUT_OPERATORS = REGROUPING | {"Transpose"}
-"""Operators that move elements and do nothing else to them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,12 +142,12 @@ def _before(view: View) -> View | Selection | None:
         return None
     # Move the digits back through the operator
     layout: Layout | None = None
-    if node.op_type in REGROUPING:
+    if node.op_type in VIEWS:
         layout = regrouped(view.layout, shape)
     elif node.op_type == "Expand":
         layout = aligned(view.layout, shape)
     elif node.op_type == "Transpose":
-        order = _order(node, len(shape))
+        order = permutation_of(node) or []
         layout = tuple(view.layout[order.index(axis)] for axis in range(len(shape)))
     return (
         None
@@ -162,20 +164,15 @@ def _after(node: ir.Node, view: View) -> View | None:
     if shape is None:
         return None
     layout: Layout | None = None
-    if node.op_type in REGROUPING:
+    if node.op_type in VIEWS:
         layout = regrouped(view.layout, shape)
     elif node.op_type == "Transpose":
-        layout = tuple(view.layout[axis] for axis in _order(node, len(shape)))
+        layout = tuple(view.layout[axis] for axis in permutation_of(node) or ())
     return (
         None
         if layout is None
         else dataclasses.replace(view, value=result, layout=layout)
     )
-
-
-def _order(node: ir.Node, rank: int) -> list[int]:
-    written = node.attributes.get_ints("perm")
-    return list(reversed(range(rank))) if written is None else list(written)
 
 
 def _unscaled(node: ir.Node, view: View) -> View | None:
@@ -228,7 +225,7 @@ _Part = tuple[int, int, int, bool]
 
 
 def _gathered(node: ir.Node, made: ir.Value, shape: tuple[int, ...]) -> _Part | None:
-    index = _integers(input_at(node, 1))
+    index = integers_of(input_at(node, 1))
     if index is None or len(index) != 1:
         return None
     axis = node.attributes.get_int("axis", 0) % len(shape)
@@ -237,8 +234,8 @@ def _gathered(node: ir.Node, made: ir.Value, shape: tuple[int, ...]) -> _Part | 
 
 
 def _sliced(node: ir.Node, made: ir.Value, shape: tuple[int, ...]) -> _Part | None:
-    starts, axes = _integers(input_at(node, 1)), _integers(input_at(node, 3))
-    steps = _integers(input_at(node, 4)) if len(node.inputs) > 4 else [1]
+    starts, axes = integers_of(input_at(node, 1)), integers_of(input_at(node, 3))
+    steps = integers_of(input_at(node, 4)) if len(node.inputs) > 4 else [1]
     found = static_shape(made)
     if starts is None or len(starts) != 1 or steps != [1] or found is None:
         return None
@@ -258,10 +255,3 @@ def _split(node: ir.Node, made: ir.Value, shape: tuple[int, ...]) -> _Part | Non
             return axis, start, parts[axis], True
         start += parts[axis]
     return None
-
-
-def _integers(value: ir.Value | None) -> list[int] | None:
-    array = array_of(value)
-    if array is None or array.dtype.kind != "i":
-        return None
-    return [int(number) for number in array.reshape(-1)]

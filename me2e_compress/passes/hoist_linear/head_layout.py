@@ -10,7 +10,7 @@ import dataclasses
 import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
-from me2e_compress.passes.hoist_linear.row_moves import VIEWS
+from me2e_compress.graph.nodes import VIEWS, permutation_of
 from me2e_compress.rewrite import is_standard, scalar_of, sole_maker
 
 Atom = tuple[int, int, int]
@@ -89,8 +89,8 @@ def _factor(node: ir.Node) -> float | None:
 def _view(axes: list[list[Atom]], node: ir.Node) -> list[list[Atom]] | None:
     shape = static_shape(node.outputs[0])
     if node.op_type == "Transpose":
-        order = node.attributes.get("perm")
-        return None if order is None else [axes[axis] for axis in order.as_ints()]
+        order = permutation_of(node)
+        return None if order is None else [axes[axis] for axis in order]
     return None if shape is None else _regroup(axes, shape)
 
 

@@ -15,10 +15,10 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
+from me2e_compress.graph.nodes import VIEWS
 from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
 from me2e_compress.passes.hoist_linear.owned_work import Amount, OwnedWork
 from me2e_compress.passes.hoist_linear.row_moves import (
-    VIEWS,
     moved_rows,
     without_repeats,
 )

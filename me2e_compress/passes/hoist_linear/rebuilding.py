@@ -7,9 +7,9 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
+from me2e_compress.graph.nodes import VIEWS
 from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer
 from me2e_compress.passes.hoist_linear.matrices import Matrix, plus, times, vector_of
-from me2e_compress.passes.hoist_linear.row_moves import VIEWS
 from me2e_compress.passes.hoist_linear.ways import (
     Composed,
     Direct,

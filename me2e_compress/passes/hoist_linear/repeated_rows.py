@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, is_standard, rank_of, static_shape
+from me2e_compress.graph import is_standard, rank_of, static_shape
+from me2e_compress.graph.nodes import integers_at
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.row_moves import (
     broadcasts,
@@ -102,7 +103,8 @@ def _is_row_wise(node: ir.Node, opset: int) -> bool:
     # Reductions and normalizations must work along the last axis
     rank = rank_of(node.outputs[0]) or 0
     if node.op_type in REDUCTIONS:
-        return bool(node.attributes.get_int("keepdims", 1)) and _axes(node) in (
+        axes = integers_at(node, "axes", 1)
+        return bool(node.attributes.get_int("keepdims", 1)) and axes in (
             [-1],
             [rank - 1],
         )
@@ -113,14 +115,6 @@ def _is_row_wise(node: ir.Node, opset: int) -> bool:
         return False
     default = 1 if softmax and opset < SOFTMAX_OPSET else -1
     return node.attributes.get_int("axis", default) in (-1, rank - 1)
-
-
-def _axes(node: ir.Node) -> list[int]:
-    given = node.attributes.get("axes")
-    if given is not None:
-        return [int(axis) for axis in given.as_ints()]
-    array = array_of(node.inputs[1]) if len(node.inputs) > 1 else None
-    return [] if array is None else [int(axis) for axis in array.reshape(-1)]
 
 
 def _repetition(value: ir.Value) -> Repetition | None:

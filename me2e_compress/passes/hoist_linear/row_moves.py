@@ -8,10 +8,8 @@ from collections.abc import Callable
 
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, is_standard, rank_of, static_shape
-
-VIEWS = frozenset({"Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"})
-"""Those that move nothing and equal a Reshape."""
+from me2e_compress.graph import is_standard, rank_of, static_shape
+from me2e_compress.graph.nodes import VIEWS, integers_at, permutation_of
 
 REPEATS = frozenset({"Concat", "Expand", "Tile"})
 """Those that may repeat axes of size 1."""
@@ -71,22 +69,13 @@ def _axis(default: int) -> Callable[[ir.Node, int], bool]:
 
 
 def _transpose(node: ir.Node, rank: int) -> bool:
-    order = node.attributes.get("perm")
-    return order is not None and order.as_ints()[-1] == rank - 1
+    order = permutation_of(node)
+    return order is not None and order[-1] == rank - 1
 
 
 def _slice(node: ir.Node, rank: int) -> bool:
-    given = node.attributes.get("axes")
-    if given is not None:
-        axes = list(given.as_ints())
-    elif len(node.inputs) > 3 and node.inputs[3] is not None:
-        array = array_of(node.inputs[3])
-        if array is None:
-            return False
-        axes = [int(axis) for axis in array.reshape(-1)]
-    else:
-        return False
-    return all(axis % rank != rank - 1 for axis in axes)
+    axes = integers_at(node, "axes", 3)
+    return axes is not None and all(axis % rank != rank - 1 for axis in axes)
 
 
 def _gather_nd(node: ir.Node, rank: int) -> bool:

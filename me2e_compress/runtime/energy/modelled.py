@@ -14,7 +14,8 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.display import Displayed, Table, megabytes, table
 from me2e_compress.errors import EnergyError
-from me2e_compress.graph.activations import VIEWS, as_written, value_bytes
+from me2e_compress.graph.activations import as_written, value_bytes
+from me2e_compress.graph.nodes import LAYOUT_OPERATORS
 
 Number = Literal["int8", "float16", "float32"]
 """The number type of the factors of a product."""
@@ -236,7 +237,7 @@ def _stored(value: ir.Value) -> ir.Value:
     while (node := at.producer()) is not None and node.inputs and node.inputs[0]:
         if node.op_type == "DequantizeLinear":
             return node.inputs[0]
-        if node.op_type not in VIEWS:
+        if node.op_type not in LAYOUT_OPERATORS:  # runtimes look through them
             break
         at = node.inputs[0]
     return value
