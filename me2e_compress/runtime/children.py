@@ -1,7 +1,7 @@
 """Child processes that run no code of the current folder and never outlive the parent.
 
-Every process of this package is started here, or within :func:`sheltered`. This file
-is a program too, ``python -P children.py SCRIPT WORDS``, which exits with its parent. It
+Every process of this package is started here, or within :func:`sheltered`. This file is
+a program too, ``python -P children.py SCRIPT WORDS``, which exits with its parent. It
 imports nothing of the package, so that the script starts at once.
 """
 
