@@ -154,7 +154,7 @@ def run(line: str, folder: Path, package: Path) -> None:
 
 
 _RECORD = ".me2e-compress.json"
-"""As `me2e_compress.workflows.claims` calls it; older packages have none."""
+"""What older packages wrote beside their outputs; it holds times."""
 
 
 def cpu_s() -> float:
@@ -164,10 +164,7 @@ def cpu_s() -> float:
 
 
 def manifest(folder: Path, package: Path) -> dict[str, str]:
-    """Return the digest of every file below a folder, by path.
-
-    The record of what was written holds times: it is left out.
-    """
+    """Return the digest of every file below a folder, by path."""
     found = (path for path in folder.rglob("*") if path.name != _RECORD)
     files = sorted(path for path in found if path.is_file())
     names = [path.relative_to(folder).as_posix() for path in files]

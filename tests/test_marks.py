@@ -48,8 +48,8 @@ def export(path: Path) -> None:
 
 
 def record(folder: Path) -> None:
-    arrays = {"camera": np.zeros((1, 4), np.float32)}
-    write_recording(folder, lambda _: [Frame(0, True, arrays, future=FUTURE)], {})
+    frame = Frame(0, True, {"camera": np.zeros((1, 4), np.float32)}, future=FUTURE)
+    write_recording(folder, lambda _: [frame], {})
 
 
 def recipe(path: Path) -> None:
@@ -60,13 +60,11 @@ def recipe(path: Path) -> None:
 WRITERS: dict[str, Callable[[Path], object]] = {
     "a.json": lambda path: write_document(path, {"long": "x" * 9000}),
     "m.onnx": lambda path: graph.save(weighted(), path),
-    "w.onnx": lambda path: graph.save(weighted(9000), path, external=True),
+    "w.onnx": lambda path: graph.save(weighted(900), path, external=True),
     "e.onnx": export,
     "r.toml": recipe,
     "s.npz": SEEN.save,
-    "c.checkpoint": lambda path: CalibrationCheckpoint(path, {}).write(
-        CalibrationState()
-    ),
+    "c.npz": lambda path: CalibrationCheckpoint(path, {}).write(CalibrationState()),
     "frames": record,
     "routes.json": lambda path: save_routes(load_routes(), path),
     "f.png": lambda path: draw_modules(trace_of(9), "m", path),
@@ -136,4 +134,5 @@ def test_pipes_and_links_are_not_ours(
 
 def test_a_copy_is_ours_as_well(tmp_path: Path) -> None:
     recipe(tmp_path / "r.toml")
-    assert is_marked(shutil.copy(tmp_path / "r.toml", tmp_path / "copy.toml"))
+    shutil.copy(tmp_path / "r.toml", tmp_path / "copy.toml")
+    assert is_marked(tmp_path / "copy.toml")

@@ -241,8 +241,8 @@ def _future(frame: Path) -> RecordedFuture | None:
         return None
     with documents.reading(path, FramesError, "not a recorded future"):
         found = documents.from_json(documents.content(path))
-        if isinstance(found, dict):
-            found.pop(*marks.IN_JSON, None)
+        if isinstance(found, dict) and found.get("generator") == marks.MARK:
+            del found["generator"]
         return RecordedFuture.model_validate(found)
 
 

@@ -7,11 +7,13 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.errors import StudyError
+from me2e_compress.marks import is_marked
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study import load_study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.paper.model_facts import Int8Counts, ModelFacts, weighed
 from me2e_compress.study.paper.paper_figures import safety
+from me2e_compress.study.paper.paper_files import write_paper
 from me2e_compress.study.paper.paper_page import paper_html
 from me2e_compress.study.paper.paper_result import PaperResult
 from me2e_compress.study.paper.paper_run import read_paper
@@ -39,6 +41,11 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> PaperResult:
 @pytest.fixture(scope="module")
 def page(result: PaperResult) -> str:
     return paper_html(result, ("me2e-compress", "study", "paper"))
+
+
+def test_all_files_say_that_we_wrote_them(result: PaperResult, tmp_path: Path) -> None:
+    assert all(map(is_marked, write_paper(result, tmp_path)))
+    assert all(map(is_marked, write_paper(result, tmp_path)))
 
 
 def verdicts(result: PaperResult) -> dict[str, Verdict]:

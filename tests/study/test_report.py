@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.errors import StudyError
-from me2e_compress.marks import IN_JSON, IN_MARKDOWN
+from me2e_compress.marks import IN_JSON, IN_MARKDOWN, is_marked
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.runtime.others_load import Load
 from me2e_compress.study import Condition, StudyResult
@@ -197,9 +197,11 @@ def test_files_are_written_beside_each_other(
 
     assert json.loads(written.record.read_text()) == IN_JSON | found.to_json()
     assert written.tables.read_text().startswith(
-        f"{IN_MARKDOWN}# Slow &amp; &lt;fast&gt; (preview: 2 of 220 routes)\n\n**Scoreboard, "
+        f"{IN_MARKDOWN}# Slow &amp; &lt;fast&gt; (preview: 2 of 220 routes)\n\n"
+        "**Scoreboard, "
     )
     assert written.report.read_text().startswith("<!doctype html>")
+    assert all(map(is_marked, (tmp_path / "new" / "study").iterdir()))
     found_files = {path.name for path in (tmp_path / "new" / "study").iterdir()}
     assert found_files == {"report.html", "study.json", "tables.md"}
 

@@ -14,6 +14,7 @@ from me2e_compress import recipe
 from me2e_compress.errors import EvaluationError, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.worker import Driven, Job
+from me2e_compress.marks import is_marked
 from me2e_compress.metrics.episode import Ending, Episode
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.study.on_road import (
@@ -121,7 +122,9 @@ def found(
 ) -> tuple[RoadSearchResult, Scripted, list[str]]:
     """The same search, gone on with; what it drove and told."""
     engine, told = Scripted(), list[str]()
-    return search(model, killed, engine, told), engine, told
+    done = search(model, killed, engine, told)
+    assert is_marked(done.output)
+    return done, engine, told
 
 
 Found = tuple[RoadSearchResult, Scripted, list[str]]

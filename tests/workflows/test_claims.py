@@ -16,6 +16,7 @@ from me2e_compress.errors import GraphError
 from me2e_compress.marks import MARK
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.workflows.claims import check_ours, writing
+from me2e_compress.workflows.frames import record_frames
 from me2e_compress.zoo import shipped
 
 THEIRS = "is there, and me2e-compress did not write it"
@@ -164,6 +165,14 @@ def test_a_folder_that_stayed_empty_goes_unless_it_was_there(tmp_path: Path) -> 
     with writing(folders=[tmp_path / "there", tmp_path / "new"]):
         assert (tmp_path / "new").is_dir()
     assert [each.name for each in tmp_path.iterdir()] == ["there"]
+
+
+def test_one_run_records_the_frames_of_a_folder(tmp_path: Path) -> None:
+    with (
+        writing(folders=[partial_of(tmp_path / "out")]),
+        pytest.raises(GraphError, match="partial is in use"),
+    ):
+        record_frames("highway", tmp_path / "out")
 
 
 def test_unfinished_frames_of_another_run_are_cleared_under_the_lock(

@@ -25,6 +25,7 @@ from me2e_compress.evaluators.highway.evaluator import (
 )
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
 from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.marks import is_marked
 from me2e_compress.metrics.episode import Ending, Episode
 from me2e_compress.simulator.routes import Route, save_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
@@ -85,6 +86,7 @@ def test_the_bytes_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> Non
 def test_wall_clock_times_lie_beside_the_folder(tmp_path: Path) -> None:
     list(evaluator(tmp_path / "results", routes=(PARKED,)).episodes())
 
+    assert is_marked(tmp_path / "results.log")
     [line] = (tmp_path / "results.log").read_text().splitlines()
 
     cost = json.loads(line)
