@@ -109,7 +109,6 @@ def passed(result: Verification) -> bool:
     return all(result.errors[n] <= result.tolerances[n] for n in result.judged)
 
 
-
 def random_outputs(model: ir.Model) -> tuple[str, ...]:
     """Name the outputs of a graph that depend on what it draws without a seed."""
     drawn = set[ir.Value]()
