@@ -20,10 +20,12 @@ class DrivenRoute(Protocol):
     @property
     def route(self) -> str:
         """Name of the route."""
+        ...
 
     @property
     def scenario(self) -> str:
         """Its scenario type."""
+        ...
 
 
 Driven = TypeVar("Driven", bound=DrivenRoute)

@@ -1,5 +1,7 @@
 """Run a study."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from me2e_compress.errors import StudyError
@@ -9,15 +11,17 @@ from me2e_compress.study.definition import Study
 from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.file import load_study
 from me2e_compress.study.outcome import VariantOutcome, this_machine
+from me2e_compress.study.paper.model_facts import weighed
+from me2e_compress.study.paper.paper_run import drive_blocks
 from me2e_compress.study.plan_fidelity import judge
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
-from me2e_compress.study.recorded import recorded
 from me2e_compress.study.side_by_side import take_pictures
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
 from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.claims import check_ours, writing
+from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.workflows.listener import SILENT, Listener
 
 
@@ -27,13 +31,17 @@ def run_study(
     engine: Engine | None = None,
     listener: Listener = SILENT,
     pictures: int = 3,
+    on_block: Callable[[StudyResult], None] | None = None,
+    weigh: Sequence[Path] = (),
     *,
     force: bool = False,
 ) -> StudyResult:
     """Make the models, time them, compare them with the baseline, drive them.
 
     With the same folder it resumes: finished models, traces and routes are reused.
-    Studies may share a folder if they share variants.
+    Studies may share a folder if they share variants. A study with the paper's tables
+    is driven block by block and gives a `PaperResult`; there a drive that fails does
+    not stop the others.
 
     Args:
         study: A study, or its TOML file.
@@ -42,6 +50,9 @@ def run_study(
             evaluator other than highway ignores it.
         listener: Is called with progress and warnings.
         pictures: Number of routes on which two drives are shown side by side.
+        on_block: Is called with the result so far after each block of a study with the
+            paper's tables that was driven now.
+        weigh: Folders of other stacks' files, for the paper's table 4.
         force: Also replace a report that we did not write.
 
     Raises:
@@ -57,20 +68,55 @@ def run_study(
     check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
     check_ours([folder / name for name in (JSON, MARKDOWN, HTML)], force=force)
     with writing(folders=[folder]):
-        return _run(study, folder, engine or LocalEngine(), listener, pictures)
+        others = tuple(found for each in weigh for found in weighed(each))
+        setup, prepared = _begun(study, folder, engine or LocalEngine(), listener)
+        if study.report == "paper":
+            return drive_blocks(setup, prepared, on_block, others)
+        return _compared(setup, prepared, pictures)
 
 
-def _run(
-    study: Study, folder: Path, engine: Engine, listener: Listener, pictures: int
-) -> StudyResult:
-    # frames, models and their latencies
+def _begun(
+    study: Study, folder: Path, engine: Engine, listener: Listener
+) -> tuple[DriveSetup, list[PreparedVariant]]:
+    """Record frames, make the models and time them; return what drives them."""
     workspace = Workspace(folder)
-    study = recorded(study, workspace, listener)
+    study = _recorded(study, workspace, listener)
     prepared = prepare_all(study, workspace, listener)
     clock = time_all(study, prepared, workspace, listener)
-    variants = _variants(study, prepared, clock, listener)
-    # drive every variant under every condition
-    setup = DriveSetup(study, clock, workspace, engine, listener)
+    return DriveSetup(study, clock, workspace, engine, listener), prepared
+
+
+def _recorded(study: Study, workspace: Workspace, listener: Listener) -> Study:
+    """Return the study with folders of frames, recorded unless they exist.
+
+    The held-out frames use the next seed, hence other routes.
+    """
+    asked = study.to_record
+    if asked is None:
+        return study
+    model = Path(study.reference.policy)
+    # calibration frames, and held-out frames of the next seed
+    folders = list[Path]()
+    for name, count, seed in (
+        ("frames", asked.frames, asked.seed),
+        ("frames-held-out", asked.held_out, asked.seed + 1),
+    ):
+        folder = workspace.folder / name
+        if not (folder / "scenes.json").is_file():
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            options = FramesOptions(count, seed, provider=study.provider)
+            record_frames(model, folder, options, listener)
+        folders.append(folder)
+    frames, held_out = folders
+    return replace(study, frames=frames, held_out=held_out, to_record=None)
+
+
+def _compared(
+    setup: DriveSetup, prepared: list[PreparedVariant], pictures: int
+) -> StudyResult:
+    """Compare the plans and the drives of every variant with the baseline's."""
+    study, clock = setup.study, setup.clock
+    variants = _variants(study, prepared, clock, setup.listener)
     drives = [
         drive
         for condition in study.conditions

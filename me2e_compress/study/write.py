@@ -26,7 +26,7 @@ class StudyFiles:
 
 
 def write_study(
-    outcome: StudyResult | PaperResult,
+    outcome: StudyResult,
     folder: str | Path,
     command: Sequence[str] = (),
     sections: Sequence[Section] = (),

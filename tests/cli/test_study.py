@@ -131,7 +131,7 @@ def test_a_model_that_ships_is_not_one_where_you_are(
     toml.write_text(STUDY.replace('"m.onnx"', '"highway"'))
     asked = list[Study]()
 
-    def noted(found: Study, *_: object, force: bool) -> None:
+    def noted(found: Study, *_: object, **__: object) -> None:
         asked.append(found)
         raise StudyError("seen")
 

@@ -1,6 +1,7 @@
 """Tables, findings and page of the paper's study, from drives that nobody drove."""
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,6 +50,16 @@ def test_all_files_say_that_we_wrote_them(result: PaperResult, tmp_path: Path) -
         assert all(map(is_marked, vars(written).values()))
 
 
+def with_cells(
+    result: PaperResult, cells: Mapping[tuple[str, str], DriveRecord]
+) -> PaperResult:
+    drives = (
+        replace(each, variant=variant, condition=condition)
+        for (variant, condition), each in cells.items()
+    )
+    return replace(result, drives=tuple(drives))
+
+
 def verdicts(result: PaperResult) -> dict[str, Verdict]:
     return {each.question: each.verdict for each in result.findings}
 
@@ -91,7 +102,7 @@ def test_other_drives_turn_a_finding_round(result: PaperResult) -> None:
     slow, ideal = result.cells["float", "fps-1"], result.cells["float", "ideal"]
     turned = {**result.cells, ("float", "fps-1"): ideal, ("float", "ideal"): slow}
 
-    found = verdicts(replace(result, cells=turned))
+    found = verdicts(with_cells(result, turned))
 
     assert found["More decisions a second drive better, up to 20"] is NO
     assert found["Comfort falls as the rate rises"] is YES
@@ -108,7 +119,7 @@ def test_what_spikes_cost_is_told_of_the_speed_that_it_is_asked_of(
     worse = tuple(replace(each, driving_score=0.0) for each in record.routes)
     cells = {**result.cells, key: replace(record, routes=worse)}
 
-    before, after = verdicts(result), verdicts(replace(result, cells=cells))
+    before, after = verdicts(result), verdicts(with_cells(result, cells))
 
     changed = [each for each in after if after[each] is not before[each]]
     assert len(changed) == 3
@@ -117,9 +128,9 @@ def test_what_spikes_cost_is_told_of_the_speed_that_it_is_asked_of(
 
 def test_what_was_not_driven_is_not_tested_and_says_so(result: PaperResult) -> None:
     cells = {key: each for key, each in result.cells.items() if key[0] != "minus-occ"}
-    lacking = replace(
-        result, cells=cells, failures={("minus-occ", "device"): "no memory"}
-    )
+    failed = DriveRecord("minus-occ", "device", reason="no memory")
+    lacking = with_cells(result, cells)
+    lacking = replace(lacking, drives=(*lacking.drives, failed))
 
     found = {each.question: each for each in lacking.findings}
     finding = found["Without occupancy it drives better"]
@@ -137,9 +148,7 @@ def test_a_drive_without_collisions_has_no_shares(result: PaperResult) -> None:
 
     question = "Without the map more of the collisions are with static things"
     [finding] = [
-        each
-        for each in replace(result, cells=cells).findings
-        if each.question == question
+        each for each in with_cells(result, cells).findings if each.question == question
     ]
 
     assert finding.reason == "a drive without a collision has no shares"
@@ -230,7 +239,7 @@ def test_the_page_holds_tables_figures_and_findings(
 
 
 def test_a_study_without_drives_has_a_page_too(result: PaperResult) -> None:
-    empty = replace(result, cells={}, facts=())
+    empty = replace(result, drives=(), facts=())
 
     page = paper_html(empty)
 

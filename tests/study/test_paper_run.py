@@ -2,19 +2,30 @@
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
 from me2e_compress.errors import StudyError
-from me2e_compress.study import Condition, Listener, Study, Timing, Variant
+from me2e_compress.study import (
+    Condition,
+    Listener,
+    Study,
+    StudyResult,
+    Timing,
+    Variant,
+    run_study,
+)
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.paper.accident import Accident
 from me2e_compress.study.paper.accident_figure import plans_before
-from me2e_compress.study.paper.paper_run import read_paper, run_paper
+from me2e_compress.study.paper.paper_result import PaperResult
+from me2e_compress.study.paper.paper_run import read_paper
 from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
 from me2e_compress.study.workload import held_frames, workload
+from me2e_compress.workflows.listener import SILENT
 from tests.study.conftest import BLIND, IDEAL, ROUTES, SLOW, Here
 
 FASTER = Variant("faster", "blind:9")
@@ -26,11 +37,24 @@ ASKED = Study(
     "blind",
     ROUTES,
     220,
+    report="paper",
     blocks=(
         StudyBlock("table-2", ("blind",), ("ideal", "slow")),
         StudyBlock("table-3", ("blind", "faster", "broken"), ("ideal",)),
     ),
 )
+
+
+def run_paper(
+    study: Study,
+    folder: Path,
+    engine: Here,
+    listener: Listener = SILENT,
+    on_block: Callable[[StudyResult], None] | None = None,
+) -> PaperResult:
+    found = run_study(study, folder, engine, listener, on_block=on_block)
+    assert isinstance(found, PaperResult)
+    return found
 
 
 @dataclass(frozen=True)
@@ -49,7 +73,9 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> First:
         ASKED,
         made.folder,
         made.engine,
-        on_block=lambda found: made.landed.append(len(found.cells)),
+        on_block=lambda found: made.landed.append(
+            sum(not each.reason for each in found.drives)
+        ),
     )
     return made
 
@@ -106,6 +132,7 @@ def test_tables_follow_from_the_records_alone(driven: Path) -> None:
 
     assert read.tables() == run.tables()
     assert read.machine == run.machine
+    assert read.lines() == run.lines() == (run.headline,)
 
 
 def test_a_record_of_another_evaluation_is_not_taken(driven: Path) -> None:
@@ -217,6 +244,7 @@ def test_models_are_timed_and_weighed(models: Path, tmp_path: Path) -> None:
         220,
         held_out=models / "frames",
         timing=Timing(10, baseline_median_s=0.2),
+        report="paper",
         blocks=(StudyBlock("table-3", ("slow",), ("device",)),),
     )
 

@@ -1,10 +1,11 @@
 """Drives of the paper's study so far, apart from what they say about its findings."""
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.outcome import StudyOutcome
 from me2e_compress.study.paper.accident import Accident
 from me2e_compress.study.paper.model_facts import ModelFacts
 
@@ -13,19 +14,13 @@ CellKey = tuple[str, str]
 
 
 @dataclass(frozen=True, repr=False)
-class PaperDrives:
+class PaperDrives(StudyOutcome):
     """The drives that were made, and facts about the files that drove.
 
-    ``cells`` are the finished drives, ``failures`` the reasons of the others; the
-    device is ``device_scale`` times slower than the machine timed on.
+    Its drives have no scores, its facts stand for variants.
     """
 
-    study: Study
-    facts: tuple[ModelFacts, ...]
-    cells: Mapping[CellKey, DriveRecord]
-    failures: Mapping[CellKey, str]
-    device_scale: float
-    machine: str
+    facts: tuple[ModelFacts, ...] = ()
     accident: Accident | None = None
 
     @property
@@ -37,6 +32,24 @@ class PaperDrives:
     def preview(self) -> str:
         """Suffix of titles if only a part of the routes is driven; empty otherwise."""
         return self.study.preview
+
+    @functools.cached_property
+    def cells(self) -> Mapping[CellKey, DriveRecord]:
+        """The finished drives."""
+        return {
+            (each.variant, each.condition): each
+            for each in self.drives
+            if not each.reason
+        }
+
+    @functools.cached_property
+    def failures(self) -> Mapping[CellKey, str]:
+        """Reasons of the drives that failed."""
+        return {
+            (each.variant, each.condition): each.reason
+            for each in self.drives
+            if each.reason
+        }
 
     def fact(self, variant: str) -> ModelFacts:
         """Return the facts about a variant; empty facts if it was not prepared."""

@@ -9,12 +9,13 @@ from me2e_compress.study.paper.paper_findings import findings
 from me2e_compress.study.paper.paper_tables import all_paper_tables
 from me2e_compress.study.paper.questions import Finding, findings_table
 from me2e_compress.study.route_columns import COLUMNS, mean_of
-from me2e_compress.workflows.result import Result, Table
+from me2e_compress.study.study_result import StudyResult
+from me2e_compress.workflows.result import Table
 
 
 @dataclass(frozen=True, repr=False)
-class PaperResult(PaperDrives, Result):
-    """The paper's findings and tables, answered by the drives that were made."""
+class PaperResult(PaperDrives, StudyResult):
+    """A study's result in the paper's tables, with its findings as questions."""
 
     @property
     def headline(self) -> str:
@@ -32,6 +33,10 @@ class PaperResult(PaperDrives, Result):
     def tables(self) -> tuple[Table, ...]:
         """Return the findings, then the paper's tables in its order."""
         return findings_table(self.findings, self.preview), *all_paper_tables(self)
+
+    def lines(self) -> tuple[str, ...]:
+        """Return how many drives there are."""
+        return (self.headline,)
 
     def alerts(self) -> tuple[str, ...]:
         """Return the drives that failed, and why."""

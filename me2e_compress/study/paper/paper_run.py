@@ -7,7 +7,7 @@ from pathlib import Path
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import Me2eError, StudyError
-from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
+from me2e_compress.manager.report import versions
 from me2e_compress.runtime.energy.models import measure_energy
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.study.definition import Study
@@ -25,45 +25,46 @@ from me2e_compress.study.paper.model_facts import (
     weighed,
 )
 from me2e_compress.study.paper.paper_result import PaperResult
-from me2e_compress.study.prepared import PreparedVariant, prepare_all
-from me2e_compress.study.recorded import recorded
+from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.study_blocks import StudyBlock
-from me2e_compress.study.timing import Clock, time_all
+from me2e_compress.study.study_result import StudyResult
+from me2e_compress.study.timing import Clock
 from me2e_compress.study.workload import held_frames
-from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
-from me2e_compress.workflows.checks import check_folder
-from me2e_compress.workflows.claims import check_ours, writing
-from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.listener import Listener
 from me2e_compress.workflows.profile import ProfileOptions, profile
 
 PROFILED = 100
 """Inferences under a profiler, for the figure of modules."""
 
 
-def run_paper(
-    study: Study,
-    folder: str | Path,
-    engine: Engine | None = None,
-    listener: Listener = SILENT,
-    on_block: Callable[[PaperResult], None] = lambda result: None,
-    weigh: Sequence[Path] = (),
-    *,
-    force: bool = False,
+def drive_blocks(
+    setup: DriveSetup,
+    prepared: Sequence[PreparedVariant],
+    on_block: Callable[[StudyResult], None] | None,
+    others: tuple[ModelFacts, ...] = (),
 ) -> PaperResult:
-    """Make the models, time them and drive every cell, block by block.
+    """Weigh the models and drive every cell, block by block.
 
-    Run again with the same folder it resumes: finished models, traces, routes and cells
-    (``records/``) are reused. A variant or cell that fails is reported, and the rest
-    continues. ``on_block`` is called after each block driven now; ``weigh`` are folders
-    of other stacks' files, counted in table 4.
+    Finished cells (``records/``) are reused. A cell that fails is reported, and the
+    rest continues. ``on_block`` is called after each block driven now; ``others`` are
+    facts about other stacks' files, for table 4.
     """
-    folder = Path(folder)
-    check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
-    check_ours([folder / name for name in (JSON, MARKDOWN, HTML)], force=force)
-    with writing(folders=[folder]):
-        others = tuple(found for each in weigh for found in weighed(each))
-        started = _begun(study, folder, engine or LocalEngine(), listener, others)
-        return _all_driven(*started, on_block)
+    study, clock = setup.study, setup.clock
+    facts = _facts(setup, prepared, others)
+    machine = this_machine(clock.load)
+    result = PaperResult(
+        study, (), (), (), clock.scale, machine, versions(), facts=facts
+    )
+    records = setup.workspace.folder / "records"
+    for block in study.blocks:
+        finished = set(records.glob("*.jsonl"))
+        result = _driven(block, setup, prepared, result)
+        if result.accident is None:
+            result = replace(result, accident=_accident(setup, prepared, result))
+        driven_now = not finished.issuperset(records.glob("*.jsonl"))
+        if on_block is not None and driven_now:
+            on_block(result)
+    return result
 
 
 def read_paper(
@@ -75,9 +76,9 @@ def read_paper(
     """
     # finished cells, and facts of their files
     folder = Path(records)
+    accident = folder / ACCIDENT
     about, facts = load_facts(folder / FILE)
     found = [DriveRecord.load(path) for path in sorted(folder.glob("*.jsonl"))]
-    cells = {(each.variant, each.condition): each for each in found}
     scale = about.get("device_scale")
     if not isinstance(scale, float | int):
         raise StudyError(f"{folder / FILE}: no device_scale")
@@ -87,12 +88,14 @@ def read_paper(
     weighed_too = (each for each in facts.values() if each.of_another_stack)
     return PaperResult(
         _of_these_routes(study, found, folder),
-        (*(facts[name] for name in names if name in facts), *weighed_too),
-        cells,
-        {},
+        (),
+        tuple(found),
+        (),
         float(scale),
         str(about.get("machine", "")),
-        Accident.load(folder / ACCIDENT) if (folder / ACCIDENT).is_file() else None,
+        {},
+        facts=(*(facts[name] for name in names if name in facts), *weighed_too),
+        accident=Accident.load(accident) if accident.is_file() else None,
     )
 
 
@@ -108,41 +111,6 @@ def _of_these_routes(study: Study, found: Sequence[DriveRecord], folder: Path) -
     if len(routes) < len(names):
         raise StudyError(f"{folder}: drives of routes that this study has not")
     return replace(study, routes=routes, set_size=found[0].set_size)
-
-
-def _begun(
-    study: Study,
-    folder: Path,
-    engine: Engine,
-    listener: Listener,
-    others: tuple[ModelFacts, ...],
-) -> tuple[DriveSetup, Sequence[PreparedVariant], PaperResult]:
-    """Make, time and weigh the models; return what drives them."""
-    workspace = Workspace(folder)
-    study = recorded(study, workspace, listener)
-    prepared = prepare_all(study, workspace, listener)
-    clock = time_all(study, prepared, workspace, listener)
-    facts = _facts(study, prepared, clock, workspace, listener, others)
-    result = PaperResult(study, facts, {}, {}, clock.scale, this_machine(clock.load))
-    setup = DriveSetup(study, clock, workspace, engine, listener)
-    return setup, prepared, result
-
-
-def _all_driven(
-    setup: DriveSetup,
-    prepared: Sequence[PreparedVariant],
-    result: PaperResult,
-    on_block: Callable[[PaperResult], None],
-) -> PaperResult:
-    records = setup.workspace.folder / "records"
-    for block in setup.study.blocks:
-        finished = set(records.glob("*.jsonl"))
-        result = _driven(block, setup, prepared, result)
-        if result.accident is None:
-            result = replace(result, accident=_accident(setup, prepared, result))
-        if not finished.issuperset(records.glob("*.jsonl")):
-            on_block(result)
-    return result
 
 
 def _accident(
@@ -180,32 +148,31 @@ def _driven(
     result: PaperResult,
 ) -> PaperResult:
     """Drive the new cells of a block; a failing one does not stop the others."""
-    cells, failures = dict(result.cells), dict(result.failures)
+    drives = list(result.drives)
+    done = {(each.variant, each.condition) for each in drives}
     wanted = (*block.variants, setup.study.baseline)
     for condition in setup.study.conditions:
         for each in prepared:
             key = each.variant.name, condition.name
             of_block = key[0] in wanted and key[1] in block.conditions
-            if not of_block or key in cells or key in failures:
+            if not of_block or key in done:
                 continue
             try:
-                cells[key] = setup.record(each, condition)
+                drives.append(setup.record(each, condition))
             except Me2eError as error:
-                failures[key] = str(error)
+                drives.append(DriveRecord(*key, reason=str(error)))
                 setup.listener.on_warning(f"{', '.join(key)}: {error}")
-    return replace(result, cells=cells, failures=failures)
+    return replace(result, drives=tuple(drives))
 
 
 def _facts(
-    study: Study,
+    setup: DriveSetup,
     prepared: Sequence[PreparedVariant],
-    clock: Clock,
-    workspace: Workspace,
-    listener: Listener,
     others: tuple[ModelFacts, ...],
 ) -> tuple[ModelFacts, ...]:
     """Collect facts of every variant, and profile the baseline, unless known."""
-    path = workspace.folder / "records" / FILE
+    study, clock, listener = setup.study, setup.clock, setup.listener
+    path = setup.workspace.folder / "records" / FILE
     known = load_facts(path)[1] if path.is_file() else {}
     found = list[ModelFacts]()
     for done, each in enumerate(prepared):
