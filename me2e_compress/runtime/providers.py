@@ -209,7 +209,6 @@ class TensorRtProvider(Provider):
             for kind in ("engine", "timing"):
                 options[f"trt_{kind}_cache_enable"] = "True"
                 options[f"trt_{kind}_cache_path"] = str(self.cache)
-        # TensorRT loads its own plugin libraries.
         theirs = [str(each) for each in self.plugins if self._is_tensorrts(each)]
         if theirs:
             options["trt_extra_plugin_lib_paths"] = ";".join(theirs)
