@@ -16,7 +16,7 @@ from me2e_compress.calibration.recording import (
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file
-from me2e_compress.errors import EvaluationError
+from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.extras import need_extra
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
@@ -131,6 +131,8 @@ def record_frames(
         MissingExtraError: Driving needs the extra ``highway``, a log ``logs``.
     """
     options, folder = options or FramesOptions(), Path(folder)
+    if not folder.name:
+        raise FramesError(f"{folder}: name a folder of its own: it is written anew")
     check_folder(folder, (source, options.adapter))
     with writing(trees=[folder], folders=[partial_of(folder)], force=options.force):
         return _recorded(source, folder, options, listener)
