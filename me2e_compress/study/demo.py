@@ -196,7 +196,7 @@ class DriverDemo:
         )
         # run it, and write its report with the demo's own sections
         engine = LocalEngine(self.workers)
-        found = run_study(study, self.out, engine, listener, force=self.force)
+        found = run_study(study, self.out, engine, listener, 1, force=self.force)
         told = (*self._told, self._files())
         written = write_study(found, self.out, self._words(), told, force=self.force)
         ending = (
