@@ -45,7 +45,7 @@ class Floor:
     """How true a model must stay.
 
     Attributes:
-        sqnr_db: least SQNR of outputs; not of discrete ones, and of the plan
+        sqnr_db: least SQNR of outputs, dB; not of discrete ones, of the plan
             only where its displacement was not measured.
         plan_m: most mean displacement of the waypoints, metres.
     """

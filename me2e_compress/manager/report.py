@@ -78,13 +78,14 @@ class Verification:
     Attributes:
         passes: the passes it covers.
         inputs: ``recorded`` frames, ``synthetic`` seeded inputs, or ``none``.
-        errors: largest relative error, by output: max|a-b|/max|a|.
+        errors: largest relative error, by output: max|a-b|/max|a|; empty if not
+            measured.
         tolerances: what was allowed.
         skipped: why nothing was measured; or None.
         unsteady: outputs that rounding alone moves as far: on these inputs they
             differ, and that says nothing about the passes.
         random: outputs that differ at every run; of the graph before, too.
-        sizes: of open dimensions; they were drawn.
+        sizes: of open dimensions; drawn to run the graphs at.
         remarks: what else is to be known: where onnxruntime's own optimizations change
             an output, and the graphs were compared without them.
     """

@@ -26,7 +26,7 @@ class Item:
         unknown_macs_nodes: number of its nodes that are not in ``macs``.
         activation_bytes: that its nodes write in a frame; bounded like ``macs``.
         unknown_activation_nodes: number of its nodes that are not in these.
-        latency_share: share of a frame's time, 0 to 1; None if nobody measured.
+        latency_share: share of a frame's time; 0 to 1, None if nobody measured.
     """
 
     module: str

@@ -40,11 +40,11 @@ class Entry:
     """One name of a registry.
 
     Attributes:
-        name: in recipes and commands.
+        name: as in recipes and commands.
         source: the package; with its version; of a name that several
             packages claim, all of them.
         doc: first line of its docstring.
-        options: in order.
+        options: in order; that of its fields.
         error: why it cannot be used; empty if it can.
     """
 

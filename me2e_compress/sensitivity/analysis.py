@@ -42,7 +42,7 @@ class Sensitivity:
         together: of all modules.
         trials: number of variants.
         float_driving: driving score of the float model; None if nothing is driven.
-        driving: of all modules in int8, likewise.
+        driving: of all modules in int8; likewise.
     """
 
     findings: tuple[ModuleSensitivity, ...]

@@ -41,7 +41,7 @@ class Decision:
         rule: id of the rule that decided; for int8 ``layer``, ``attention``,
             ``sampled`` or ``residual``; ``override`` if the user did.
         reason: the same in words.
-        shapes: of two inputs and the first output; None if open.
+        shapes: of the first two inputs and the first output; None if open.
         activations: which inputs get an activation scale. Of an Add it is one, the
             residual branch: the other comes out of a convolution that it is fused with.
         weight: which input is stored as int8; None if none is.

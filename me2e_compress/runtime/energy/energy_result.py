@@ -35,6 +35,7 @@ class EnergyResult(Displayed):
             negative.
         low: 95 % interval of ``j_per_frame``. It covers repetition on
             this device and counter, not the error of the counter itself.
+        high: likewise.
         windows: number of windows.
         window_s: mean seconds of a window.
         counter: ``nvml-total``, ``rapl``, ``ina3221`` or another.
