@@ -32,13 +32,13 @@ class Ranges(Displayed):
 
     Attributes:
         tensors: (low, high) bounds by tensor name.
-        method: observer with options, e.g. ``max-min`` or ``percentile:99.9``.
+        method: observer with options: ``max-min``, ``percentile:99.9``.
         frames: number of frames.
-        model: digest of the graph they were measured on.
+        model: digest of the graph.
         source: fingerprint of the recording.
-        outliers: crest factors of tensors whose range is due to few elements, see
+        outliers: crest factors; of tensors whose range is due to few elements, see
             :data:`OUTLIER_CREST`.
-        calibrator: TensorRT's calibrator of an imported cache; else empty.
+        calibrator: TensorRT's; of an imported cache, else empty.
     """
 
     tensors: dict[str, tuple[float, float]]

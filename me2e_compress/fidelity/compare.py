@@ -24,9 +24,11 @@ Watch: TypeAlias = Callable[[dict[str, Array], dict[str, Array], Frame], None]
 class OutputFidelity:
     """One output, all frames pooled.
 
-    ``sqnr_db`` is 10 log10(sum a^2 / sum (a - b)^2), infinite where they are equal;
-    ``error`` is max|a - b| / max|a|, infinite where a is zero and b is not. The SQNR of
-    ``discrete`` outputs (whole numbers or booleans, such as labels) says little.
+    Attributes:
+        sqnr_db: 10 log10(sum a^2 / sum (a - b)^2); infinite where they are equal.
+        error: largest difference over largest magnitude; infinite where a is zero and
+            b is not.
+        discrete: whole numbers or booleans; their SQNR says little.
     """
 
     name: str
@@ -48,14 +50,14 @@ class Fidelity:
     """The result of comparing two models over a recording.
 
     Attributes:
-        outputs: outputs that both models have, in the first model's order.
-        missing: outputs of the first model that the second lacks.
+        outputs: those that both models have; in the first model's order.
+        missing: outputs that the second model lacks.
         plan: displacement of the plan; None if it was not measured, for `plan_reason`.
         frames: how many were compared.
         plan_output: the output that holds the plan; empty if it was not measured.
-        agents: outputs that are sets of agents, matched; None if there are none.
-        same_choice: share of frames on which both choose the same candidate of a scored
-            plan; None if no scores choose it.
+        agents: sets of agents, matched; None if there are none.
+        same_choice: share of frames with the same candidate; None if no scores choose
+            the plan.
     """
 
     outputs: tuple[OutputFidelity, ...]

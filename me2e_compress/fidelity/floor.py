@@ -26,8 +26,9 @@ STEPS = 127
 class Shortfall:
     """One figure below the floor.
 
-    ``value`` is in dB, or for the plan the mean displacement in metres; ``excess`` is
-    the noise amplitude over the largest that the floor allows, above 1.
+    Attributes:
+        value: in dB; of the plan the mean displacement in metres.
+        excess: noise amplitude over the largest allowed, above 1.
     """
 
     output: str
@@ -44,9 +45,9 @@ class Floor:
     """How true a model must stay.
 
     Attributes:
-        sqnr_db: least SQNR of every output but the plan and discrete ones, dB; of the
-            plan too where its displacement was not measured.
-        plan_m: most that the waypoints may move on average, metres.
+        sqnr_db: least SQNR of outputs, dB; not of discrete ones, of the plan
+            only where its displacement was not measured.
+        plan_m: most mean displacement of the waypoints, metres.
     """
 
     sqnr_db: float = SQNR_FLOOR_DB

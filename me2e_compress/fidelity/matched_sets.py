@@ -80,11 +80,13 @@ def _read(text: str) -> object:
 class SetFidelity:
     """Sure agents of the first model against those of the second, all frames pooled.
 
-    Of the ``agents`` that the first model is sure of, ``found`` have one of the second
-    within 2 m, and for ``kept`` of these the second is sure as well; ``added`` are
-    those that the second is sure of without one of the first within 2 m. ``centre_m``
-    is the mean distance of those found (None without), ``sqnr_db`` is over them, by
-    output.
+    Attributes:
+        agents: that the first model is sure of.
+        found: with one of the second within 2 m.
+        kept: found ones that the second is sure of.
+        added: that only the second is sure of; the first has none within 2 m.
+        centre_m: mean distance of those found; None without.
+        sqnr_db: over those found, by output.
     """
 
     agents: int

@@ -161,15 +161,16 @@ class PlanQuality:
     """One number of both plans, a mean over frames.
 
     Attributes:
-        measure: distance to where the ego went, or share of plans that collide.
+        measure: ``l2`` or ``collision``: distance to where the ego went, or share of
+            plans that collide.
         unit: m or %; a difference of shares is in percentage points.
-        convention: what a horizon means, see the module.
+        convention: ``at`` the horizon (UniAD) or mean ``up-to`` it (VAD, ST-P3).
         reference: the number of the first model's plan.
         candidate: the number of the second model's plan.
-        difference: the second minus the first, frame by frame.
-        low: lower end of the difference's 95 % interval over other moments of these
-            scenes; None, like `high`, where they are too few.
-        anew_low: lower end of the wider interval over scenes drawn anew.
+        difference: the second minus the first; frame by frame.
+        low: 95 % interval over other moments of these scenes; None, like `high`,
+            where they are too few.
+        anew_low: over scenes drawn anew.
     """
 
     measure: Kind
@@ -200,7 +201,7 @@ class OpenLoop:
         frames: number of frames whose next three seconds are known.
         scenes: number of scenes that these are from.
         left_out: number of other frames.
-        qualities: L2, then collisions, which only count frames that know the other road
+        qualities: L2, then collisions; these only count frames that know the other road
             users; horizons that a plan does not reach are left out.
     """
 

@@ -233,11 +233,11 @@ class Size:
     """Nodes, weights and cost of a graph.
 
     Attributes:
-        nodes: nodes, those in subgraphs and in every call of a function included.
+        nodes: in subgraphs, too; and in every call of a function.
         weight_bytes: bytes of all initializers.
-        macs: multiply-accumulates of the nodes whose count is known: where others are
+        macs: multiply-accumulates, those known: where others are
             unknown, a lower bound, and None instead of 0.
-        unknown_macs_nodes: how many nodes are not in ``macs``: plugins, and operators
+        unknown_macs_nodes: nodes that are not in ``macs``: plugins, and operators
             of unknown shape.
     """
 

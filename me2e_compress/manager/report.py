@@ -36,7 +36,7 @@ class Step:
 
     Attributes:
         name: the pass.
-        text: the pass with its options, as a pipeline writes it.
+        text: the pass with its options; as a pipeline writes it.
         exact: whether it promises the same outputs.
         changes: places it changed.
         seconds: CPU time of its transaction: clone, pass and contract checks, without
@@ -78,13 +78,14 @@ class Verification:
     Attributes:
         passes: the passes it covers.
         inputs: ``recorded`` frames, ``synthetic`` seeded inputs, or ``none``.
-        errors: output name -> max|a-b|/max|a|; empty if not measured.
-        tolerances: output name -> what was allowed.
-        skipped: why nothing was measured, or None.
-        unsteady: outputs that rounding alone moves as far on these inputs: they
+        errors: largest relative error, by output: max|a-b|/max|a|; empty if not
+            measured.
+        tolerances: what was allowed.
+        skipped: why nothing was measured; or None.
+        unsteady: outputs that rounding alone moves as far: on these inputs they
             differ, and that says nothing about the passes.
-        random: outputs that the graph before gives anew at every run.
-        sizes: of open dimensions, that were drawn to run the graphs at.
+        random: outputs that differ at every run; of the graph before, too.
+        sizes: of open dimensions; drawn to run the graphs at.
         remarks: what else is to be known: where onnxruntime's own optimizations change
             an output, and the graphs were compared without them.
     """

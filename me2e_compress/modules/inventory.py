@@ -17,16 +17,16 @@ class Item:
     """The nodes, weights and cost of one module; None is what nobody counts.
 
     Attributes:
-        nodes: number of its nodes, those in subgraphs included.
-        parameters: elements of its initializers that hold weights: of any type but
+        nodes: those in subgraphs included.
+        parameters: elements of weights: of its initializers of any type but
             int32, int64, bool and string, which hold shapes, indices and masks.
-        weight_bytes: bytes of all its initializers.
-        macs: multiply-accumulates of the nodes whose count is known: a lower bound if
+        weight_bytes: of all initializers.
+        macs: multiply-accumulates, those known: a lower bound if
             others are unknown, and then None instead of 0.
         unknown_macs_nodes: number of its nodes that are not in ``macs``.
-        activation_bytes: bytes that its nodes write in a frame, bounded like ``macs``.
+        activation_bytes: that its nodes write in a frame; bounded like ``macs``.
         unknown_activation_nodes: number of its nodes that are not in these.
-        latency_share: share of a frame's time, 0 to 1; None if nobody measured.
+        latency_share: share of a frame's time; 0 to 1, None if nobody measured.
     """
 
     module: str

@@ -24,9 +24,9 @@ class Option:
 
     Attributes:
         name: of the field.
-        type: as it is written in Python.
-        default: as it is written in text; None where it must be given.
-        doc: what the docstring says of it; empty where it says nothing.
+        type: as in Python.
+        default: as text; None where it must be given.
+        doc: of the docstring; empty where it says nothing.
     """
 
     name: str
@@ -40,11 +40,11 @@ class Entry:
     """One name of a registry.
 
     Attributes:
-        name: what recipes and the command line call it.
-        source: the package that brings it, with its version; of a name that several
+        name: as in recipes and commands.
+        source: the package; with its version; of a name that several
             packages claim, all of them.
         doc: first line of its docstring.
-        options: in the order of its fields.
+        options: in order; that of its fields.
         error: why it cannot be used; empty if it can.
     """
 

@@ -17,11 +17,13 @@ BLAME = 0.5
 class ModuleSensitivity:
     """The loss of one module when it alone is int8.
 
-    ``nodes`` counts those that are int8 then; ``driving`` is None if nothing is driven.
-    ``blamed`` holds groups of nodes, worst first, each with its loss as the only int8
-    nodes of the graph. A single node was found by bisection; a larger group is costly
-    only together, or was left whole when the trials were used up. It is empty if the
-    loss is spread over the module.
+    Attributes:
+        nodes: int8 nodes then.
+        driving: driving score; None if nothing is driven.
+        blamed: groups of nodes with their losses; worst first. A single node was
+            found by bisection; a larger group is costly only together, or was left
+            whole when the trials were used up. It is empty if the loss is spread over
+            the module.
     """
 
     module: str
@@ -35,8 +37,12 @@ class ModuleSensitivity:
 class Sensitivity:
     """The result of an analysis: modules with int8 nodes, worst first, and together.
 
-    ``float_driving`` and ``driving`` are the closed-loop scores of the float model and
-    of all modules in int8, None if nothing is driven; ``trials`` counts variants.
+    Attributes:
+        findings: modules, worst first.
+        together: of all modules.
+        trials: number of variants.
+        float_driving: driving score of the float model; None if nothing is driven.
+        driving: of all modules in int8; likewise.
     """
 
     findings: tuple[ModuleSensitivity, ...]

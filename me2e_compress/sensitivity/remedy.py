@@ -46,9 +46,10 @@ class Int8Node:
 class Remedy:
     """What is kept in float to stay true to the float model, and the fidelity then.
 
-    ``nodes`` alone make much of the noise, in the order in which they were found;
-    ``modules`` are kept whole, where the noise is spread over their nodes.
-    ``shortfalls`` are empty if these cure everything.
+    Attributes:
+        nodes: noisy alone; in the order in which they were found.
+        modules: kept whole; the noise is spread over their nodes.
+        shortfalls: that are left; empty if these cure everything.
     """
 
     nodes: tuple[Int8Node, ...]

@@ -32,10 +32,13 @@ class Budget:
 class Candidate:
     """One assignment: the modules that are int8, and what they cost.
 
-    The predicted ``loss`` is the root of the sum of squares of its modules' own losses:
-    errors of different modules are taken to be independent. The predicted ``costs``,
-    one per budget, are those of the float model less what each module alone saves.
-    ``score`` and ``measured_costs`` are None if it was not tried.
+    Attributes:
+        loss: predicted: the root of the sum of squares of its modules' own losses, as
+            errors of different modules are taken to be independent.
+        costs: predicted, one per budget; those of the float model less what each module
+            alone saves.
+        score: measured; None, like the costs, if it was not tried.
+        measured_costs: one per budget.
     """
 
     modules: tuple[str, ...]

@@ -25,11 +25,11 @@ class LintFinding:
     """One problem of a graph for its target.
 
     Attributes:
-        severity: ``error``: the target refuses the graph or computes something else;
-            ``warning``: it runs, but not as int8 or slower than it could.
+        severity: ``error`` or ``warning``. With an error the target refuses the graph
+            or computes something else; else it runs, but not as int8, or slowly.
         rule: id of the rule.
         node: name of the node; empty for a finding about the whole graph.
-        message: what was found and what is expected.
+        message: what was found; and what is expected.
     """
 
     severity: Severity

@@ -26,9 +26,9 @@ class ModelCheck(Result):
 
     Attributes:
         drives_by: the kind of its answer, in words; empty where nothing names one.
-        inputs: the graph's inputs in order; empty if the policy is not a graph.
-        outputs: the graph's outputs, likewise.
-        problems: one line for each reason why it could not drive.
+        inputs: of the graph, in order; empty if the policy is not a graph.
+        outputs: of the graph, likewise.
+        problems: why it could not drive; one line each.
     """
 
     policy: str

@@ -83,13 +83,13 @@ class MeasuredLoss:
     """How true a compressed model stayed, and where it did not.
 
     Attributes:
-        fidelity: fidelity to the graph before the first lossy pass; None if not
+        fidelity: to the graph before the first lossy pass; None if not
             measured.
-        on: which frames were used, or why nothing was measured, in words.
-        incomparable: whether an output is not finite, or of another shape than before.
+        on: which frames, or why nothing was measured; in words.
+        incomparable: whether an output is not finite; or of another shape than before.
         unsteady: outputs that are not judged, with their dB or metres: the uncompressed
             model itself falls that low when its largest input is rounded to int8.
-        shortfalls: outputs below the floor, the worst first.
+        shortfalls: outputs below the floor; the worst first.
         guilty: the passes that cause the shortfalls.
         remedy: what would restore the quality; None if nothing was searched, because
             another pass is guilty, or the one that quantizes takes no overrides.

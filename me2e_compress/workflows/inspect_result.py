@@ -26,16 +26,16 @@ class InspectResult(Result):
         file_bytes: size with the external weights.
         opset: opset of the default domain; `domains` names the others.
         map: the module map that was used.
-        rules: how many nodes each rule of the map placed.
-        macs: multiply-accumulates of all nodes whose count is known; None if none is.
-        uncounted: number of nodes whose count is not known, by reason.
-        open_dimensions: names of the inputs' open dimensions, which MACs depend on.
-        lowered: what was changed so that onnxruntime reads the file, else empty.
-        hint: what the graph lacks for more to be known, else empty.
-        recurrent: inputs that are fed back from frame to frame, with the output.
+        rules: nodes placed, by rule of the map.
+        macs: multiply-accumulates, those known; None if none is.
+        uncounted: nodes that ``macs`` leaves out, by reason.
+        open_dimensions: of the inputs; MACs depend on them.
+        lowered: what was changed for onnxruntime; empty if nothing.
+        hint: what the graph lacks; empty if nothing.
+        recurrent: outputs that are fed back, by input.
         modelled_energy: energy of its MACs and bytes; None if not asked for.
-        weights: the checkpoint that its metadata names, else empty.
-        latency_of: which inferences the shares of time are of; empty if not measured.
+        weights: the checkpoint that its metadata names; or empty.
+        latency_of: what the shares of time are of; empty if not measured.
     """
 
     file: str

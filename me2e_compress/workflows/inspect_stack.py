@@ -23,8 +23,7 @@ class FedInput:
     """One input of one file, and what feeds it.
 
     Attributes:
-        source: an output (``backbone.feats``), ``frames``, or state (``state:
-            next_bev``).
+        source: an output (``backbone.feats``), ``frames``, or a state.
         form: type and shape.
     """
 
@@ -39,9 +38,9 @@ class StackInspectResult(Result):
     """What a stack of several files holds, by label of the file.
 
     Attributes:
-        fed: every input of every file, in the order in which the files run.
-        recurrent: inputs that are fed back from frame to frame, with the output.
-        first_values: recurrent inputs that do not begin at zeros, in words.
+        fed: every input of every file; in the order in which the files run.
+        recurrent: outputs that are fed back, by input.
+        first_values: of inputs that do not begin at zeros.
     """
 
     file: str

@@ -102,11 +102,11 @@ class Int8Outcome:
     Attributes:
         by: name of the pass.
         nodes: number of nodes that it made int8.
-        layers: number of convolutions and matrix products in all modules; None where
+        layers: convolutions and matrix products; in all modules, None where
             the pass leaves no plan.
-        kept: how many of those each rule keeps float, with its reason, most first.
-        weights: the largest weights that stayed float, at most `LISTED`.
-        float_bytes: bytes of all weights that stayed float, by rule, most first.
+        kept: layers left float, by rule and reason; most first.
+        weights: the largest that stayed float; at most `LISTED`.
+        float_bytes: weights that stayed float, by rule; most first.
         weight_only_bytes: bytes that ``weight_only_gemv`` would save; 0 where it is on,
             or where they are few.
     """

@@ -19,8 +19,8 @@ class WeightsRecord:
 
     Attributes:
         averaged: whether its moving averages were taken.
-        converted: number of tensors converted to float32, by their old type.
-        unread: names of omitted tensors, which driving does not use.
+        converted: number of tensors made float32, by old type.
+        unread: names of omitted tensors; driving does not use them.
         averages: number of moving averages that were not used.
     """
 

@@ -46,18 +46,15 @@ def test_tables_are_of_the_routes_that_are_kept(name: str) -> None:
 
 def test_the_page_says_what_the_tables_of_shifts_say() -> None:
     tables = rows((KEPT / "shifts" / "tables.md").read_text("utf-8"))
-    section = PAGE.read_text("utf-8").split("| change |")[1].split("\n\n")[0]
-    for line in section.splitlines()[2:]:
-        change, float_, int8, beyond, success = line.strip("| ").split(" | ")
-        one = tables[f"float.{change}", "float.fps-4"]
-        two = tables[f"full.{change}", "full.fps-4"]
-        assert turned(float_) == one[:3]
-        assert turned(int8) == two[:3]
-        assert turned(beyond) == two[-6:-3]
-        assert turned(success) == two[-3:]
+    more = {
+        change: [-each for each in tables[f"full.{change}", "full.fps-4"][-6:]]
+        for change in ("fps-2", "night", "noise")
+    }
+    middle, high, low = more["fps-2"][:3]
 
+    said = PAGE.read_text("utf-8").split("int8 loses more driving score")[1]
 
-def turned(cell: str) -> list[float]:
-    """Give a loss and its interval as a gain."""
-    middle, low, high = numbers(cell)
-    return [-middle, -high, -low]
+    assert numbers(said.partition(" points).")[0]) == [
+        *(middle, low, high),
+        *(each[3] for each in more.values()),
+    ]

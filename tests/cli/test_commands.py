@@ -33,7 +33,7 @@ def test_the_list_of_commands_says_what_the_command_says(name: str) -> None:
 def test_every_command_is_documented(name: str) -> None:
     root = Path(__file__).parents[2]
     page = (root / "docs" / "commands.md").read_text(encoding="utf-8")
-    assert re.search(rf"^\| `me2e-compress {name}\b", page, re.MULTILINE)
+    assert re.search(rf"^\* `me2e-compress {name}\b", page, re.MULTILINE)
     assert f"`{name}`" in (root / "README.md").read_text(encoding="utf-8")
 
 

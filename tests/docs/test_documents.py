@@ -5,8 +5,9 @@ The documents themselves are held against the page where the commands are tested
 
 import pytest
 
+from benchmarks.json_page import page
 from me2e_compress.cli.app import COMMANDS
-from tests.docs.documents import EVERY, faults, sections
+from tests.docs.documents import EVERY, PAGE, faults, sections
 
 GOOD = {
     "schema": 1,
@@ -18,6 +19,20 @@ GOOD = {
     "bytes": 1,
     "weights": None,
 }
+WEIGHTS: dict[str, object] = {
+    "file": "m.pth",
+    "sha256": "0",
+    "epoch": None,
+    "iteration": 3,
+    "averaged": False,
+    "converted": {},
+    "unread": ["head.weight"],
+    "averages": 0,
+}
+
+
+def test_the_page_is_what_the_classes_say() -> None:
+    assert PAGE.read_text("utf-8") == page()
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -36,8 +51,11 @@ def test_the_page_has_no_other_section() -> None:
     ("change", "fault"),
     [
         ({}, []),
-        ({"opset": "17"}, ["opset is ['string'], not ['integer']"]),
+        ({"opset": "17"}, ["opset is a str"]),
         ({"more": 1}, ["more is not documented"]),
+        ({"verdict": [1]}, ["verdict[] is a int"]),
+        ({"weights": {**WEIGHTS, "sha256": None}}, ["weights.sha256 is a NoneType"]),
+        ({"weights": {**WEIGHTS, "converted": {"float16": 2}}}, []),
     ],
 )
 def test_what_differs_from_the_page_is_found(

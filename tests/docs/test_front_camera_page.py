@@ -45,12 +45,6 @@ def test_it_is_recorded_cloned_and_plans(clone: ModuleType, tmp_path: Path) -> N
     assert planned.reshape(-1) == pytest.approx(xs[0] @ weights, abs=1e-3)
 
 
-def test_the_page_shows_the_adapter() -> None:
-    (shown,) = blocks(PAGE, "toml")
-
-    assert shown.text.strip() == (HOME / "front.toml").read_text().strip()
-
-
 def test_every_command_of_the_page_names_what_is_there() -> None:
     (shown,) = blocks(PAGE, "sh")
 

@@ -11,11 +11,14 @@ import pytest
 from tests.docs.pages import ROOT
 
 TEXT = (ROOT / "docs" / "words.md").read_text(encoding="utf-8")
-WORDS = re.findall(r"^\| `(\w+)` \| .* \| `([\w.]+)` \|$", TEXT, re.MULTILINE)
-INSTEAD = TEXT.partition("| not | but |")[2]
+WORDS = [
+    (word, room)
+    for room, words in re.findall(r"^\* `([\w.]+)`: (.*)$", TEXT, re.MULTILINE)
+    for word in re.findall(r"`([A-Z]\w+)`, ", words)
+]
 BANNED = [
     word.strip()
-    for words in re.findall(r"^\| ([a-z][^|]*) \|", INSTEAD, re.MULTILINE)
+    for words in re.findall(r"^\* not (.*), but ", TEXT, re.MULTILINE)
     for word in words.split(",")
 ]
 FILES = sorted((ROOT / "me2e_compress").rglob("*.py"))

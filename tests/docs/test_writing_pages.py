@@ -13,7 +13,7 @@ from me2e_compress.registry import Registry
 from me2e_compress.testing import check_form
 from me2e_compress.workflows import listing
 from tests.docs.conftest import run
-from tests.docs.pages import EXAMPLE, WRITING, blocks
+from tests.docs.pages import EXAMPLE, ROOT, WRITING, blocks
 
 pytestmark = pytest.mark.xdist_group("installed")
 EXAMPLE_PROJECT = (EXAMPLE / "pyproject.toml").read_text(encoding="utf-8")
@@ -40,9 +40,11 @@ def test_the_commands_of_a_page_run(page: Path, folder: Path, site: Path) -> Non
 
 
 @pages
-def test_the_example_package_is_what_the_page_shows(page: Path) -> None:
+def test_the_example_package_is_what_the_page_shows_or_names(page: Path) -> None:
     shown = [block for block in blocks(page, "python") if block.file]
-    assert shown
+    named = re.findall(r"\.\./(examples/third_party/\w+/\w+\.py)", page.read_text())
+    assert shown or named
+    assert all((ROOT / each).is_file() for each in named)
     for block in shown:
         source = EXAMPLE / str(block.file)
         assert block.body == source.read_text(encoding="utf-8")

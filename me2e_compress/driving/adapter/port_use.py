@@ -9,8 +9,9 @@ from me2e_compress.driving.ports import Shape
 class PortUse:
     """One input or output of a graph, and its part in driving.
 
-    ``use`` is an input's feed or how an output is read, None for nothing; ``problem``
-    says why the model cannot drive so, and is empty where it can.
+    Attributes:
+        use: its feed, or how it is read; None for nothing.
+        problem: why the model cannot drive so; empty where it can.
     """
 
     name: str

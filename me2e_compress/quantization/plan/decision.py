@@ -41,7 +41,7 @@ class Decision:
         rule: id of the rule that decided; for int8 ``layer``, ``attention``,
             ``sampled`` or ``residual``; ``override`` if the user did.
         reason: the same in words.
-        shapes: shapes of the first two inputs and the first output; None if open.
+        shapes: of the first two inputs and the first output; None if open.
         activations: which inputs get an activation scale. Of an Add it is one, the
             residual branch: the other comes out of a convolution that it is fused with.
         weight: which input is stored as int8; None if none is.
@@ -74,8 +74,8 @@ class ScaleGroup:
     """Tensors, or readers of one, that are quantized together.
 
     Attributes:
-        kind: ``shared-input``: several nodes read one tensor, through one pair;
-            ``concat``: the inputs and the result of a Concat are on one scale.
+        kind: ``shared-input`` or ``concat``. Several nodes read one tensor;
+            or the inputs and the result of a Concat are on one scale.
         name: name of the tensor, or of the Concat.
         tensors: the activations on one scale.
         nodes: names of the nodes that read them in int8.
@@ -108,8 +108,8 @@ class QuantPlan(Displayed):
         decisions: one per node.
         rules: name of the rule set.
         groups: what was decided together.
-        kept_float: int8 nodes that stay float on the target for which the plan was
-            carried out; empty before that.
+        kept_float: int8 nodes that stay float on the target; empty before the plan was
+            carried out for one.
     """
 
     scheme: QuantScheme

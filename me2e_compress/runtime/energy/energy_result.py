@@ -28,29 +28,29 @@ class EnergyResult(Displayed):
     Frames run one at a time, back to back, as in MLPerf's SingleStream.
 
     Attributes:
-        joules: energy of all windows together, idle power included.
+        joules: of all windows; idle power included.
         frames: inferences in all windows.
-        j_per_frame: joules per frame, gross: idle power included.
-        net_j_per_frame: joules per frame without idle power; noise may make it
+        j_per_frame: idle power included; gross.
+        net_j_per_frame: without idle power; noise may make it
             negative.
-        low: lower end of the 95 % interval of ``j_per_frame``. It covers repetition on
+        low: 95 % interval of ``j_per_frame``. It covers repetition on
             this device and counter, not the error of the counter itself.
-        high: upper end of that interval.
+        high: likewise.
         windows: number of windows.
         window_s: mean seconds of a window.
-        counter: name of the counter: ``nvml-total``, ``rapl``, ``ina3221``, ...
-        counter_step_s: seconds between updates of the counter.
-        idle_w: watts of the idle device with the model loaded: mean of before and
+        counter: ``nvml-total``, ``rapl``, ``ina3221`` or another.
+        counter_step_s: seconds between its updates.
+        idle_w: watts of the idle device; with the model loaded, mean of before and
             after.
-        temperature: degrees Celsius before the first window and after the last.
+        temperature: degrees Celsius, before and after.
         clocks: lowest and highest MHz of each clock.
-        throttled: reasons for which the device throttled itself in a window.
+        throttled: why the device slowed itself down in a window.
         device: name of the device.
         scope: what the counter covers: a board, packages, rails.
         reason: why nothing was measured; empty if it was.
         model_sha256: digest of the model that ran; None if unknown.
         window_j_per_frame: joules per frame of each window.
-        power_j_per_frame: joules per frame by integrated power, beside the counter.
+        power_j_per_frame: by integrated power; beside the counter.
         warnings: reasons to doubt the figure.
     """
 

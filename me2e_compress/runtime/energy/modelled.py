@@ -61,16 +61,16 @@ class ModelledEnergy(Displayed):
 
     Attributes:
         modelled_j_per_frame: joules; None where no node could be counted.
-        mac_j: joules of multiply-accumulates.
-        memory_j: joules of weights and activations from and to external memory.
+        mac_j: of multiply-accumulates.
+        memory_j: of external memory; of weights and activations from and to it.
         macs: multiply-accumulates by type of the factors.
-        weight_bytes: weights, read once a frame.
-        activation_bytes: activations read and written by multiplying nodes; all other
+        weight_bytes: read once a frame.
+        activation_bytes: read and written by multiplying nodes; all other
             nodes are assumed to be fused into these.
         by_module: joules of each module.
         unknown_nodes: number of nodes that are not counted.
         process: ``45nm`` or ``7nm``.
-        source: where the figures of the process are published.
+        source: of the figures.
     """
 
     modelled_j_per_frame: float | None
