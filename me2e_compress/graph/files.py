@@ -17,6 +17,7 @@ from me2e_compress.display import reason
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import structure
 from me2e_compress.graph.opset import lower
+from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR
 from me2e_compress.graph.weight_files import (
     data_file,
@@ -118,7 +119,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
     earlier = _named_in(path, names)
     data = next(each for each in names if each not in earlier)
     if external is None:
-        external = bool(stored) or _weight_bytes(model) > INLINE_LIMIT_BYTES
+        external = bool(stored) or weight_bytes(model) > INLINE_LIMIT_BYTES
     with (
         drafts.naming(path),
         tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as folder,
@@ -225,12 +226,3 @@ def _inlined(model: ir.Model) -> ir.Model:
             if isinstance(tensor, ir.ExternalTensor):
                 value.const_value = ir.tensor(tensor.numpy(), name=value.name)
     return copy
-
-
-def _weight_bytes(model: ir.Model) -> int:
-    return sum(
-        value.const_value.nbytes
-        for graph in model.graphs()
-        for value in graph.initializers.values()
-        if value.const_value is not None
-    )

@@ -65,8 +65,21 @@ def nodes_in(graph: ir.Graph | ir.Function) -> Iterator[ir.Node]:
     """Walk the nodes of a graph, those of its bodies behind the node that has them."""
     for node in graph:
         yield node
-        for body in bodies_of(node):
-            yield from nodes_in(body)
+        yield from nodes_inside(node)
+
+
+def nodes_inside(node: ir.Node) -> Iterator[ir.Node]:
+    """Walk the nodes of a node's bodies, and of the bodies in them."""
+    for body in bodies_of(node):
+        yield from nodes_in(body)
+
+
+def reads_of(node: ir.Node) -> Iterator[ir.Value]:
+    """Walk what a node reads of its own graph, by its bodies too."""
+    yield from filter(None, node.inputs)
+    for inner in nodes_inside(node):
+        reads = (value for value in inner.inputs if value is not None)
+        yield from (value for value in reads if value.graph is node.graph)
 
 
 _WITH_BODIES = frozenset({"If", "Loop", "Scan", "SequenceMap"})
@@ -98,8 +111,7 @@ def producer_of(value: ir.Value | None) -> ir.Node | None:
 
 def has_subgraph(node: ir.Node) -> bool:
     """Return whether a node carries a graph of its own (If, Loop, Scan, ...)."""
-    kinds = (ir.AttributeType.GRAPH, ir.AttributeType.GRAPHS)
-    return any(attribute.type in kinds for attribute in node.attributes.values())
+    return bool(bodies_of(node))
 
 
 def graphs_of(graph: ir.Graph) -> Iterator[ir.Graph]:

@@ -5,6 +5,7 @@ import onnx_ir as ir
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.modules import ModuleMap
+from me2e_compress.passes.substitutes import module_of
 
 PLANNER = "planner"
 """The module that makes the plan, in every preset."""
@@ -16,7 +17,7 @@ def seeing(model: ir.Model, modules: ModuleMap) -> tuple[str, ...]:
     return tuple(
         str(value.name)
         for value in model.graph.outputs
-        if _module(value) == PLANNER and _depends(value, features)
+        if module_of(value) == PLANNER and _depends(value, features)
     )
 
 
@@ -32,11 +33,6 @@ def check_sight(
             f"{how} the plan is cut: {blind[0]} depends on nothing of {features} any"
             f" more; keep a module, or add an edge to the {PLANNER}"
         )
-
-
-def _module(value: ir.Value) -> str:
-    producer = value.producer()
-    return "" if producer is None else provenance.module_of(producer)
 
 
 def _depends(value: ir.Value, features: set[str]) -> bool:
