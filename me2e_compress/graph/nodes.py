@@ -1,7 +1,7 @@
 """Facts about nodes and values: who makes, who reads, and what constants hold."""
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -96,6 +96,28 @@ def bodies_of(node: ir.Node) -> Sequence[ir.Graph]:
             found.append(attribute.as_graph())
         elif attribute.type == ir.AttributeType.GRAPHS:
             found.extend(attribute.as_graphs())
+    return found
+
+
+def attribute_values(node: ir.Node) -> tuple[bytes, ...]:
+    """Return a node's attributes, serialized: equal ones compare equal."""
+    return tuple(
+        ir.serde.serialize_attribute(node.attributes[name]).SerializeToString(
+            deterministic=True
+        )
+        for name in sorted(node.attributes)
+    )
+
+
+def makers_of(values: Iterable[ir.Value | None]) -> dict[ir.Node, None]:
+    """Find the nodes that compute some values, by what their bodies read too."""
+    found: dict[ir.Node, None] = {}
+    waiting = list(values)
+    while waiting:
+        node = producer_of(waiting.pop())
+        if node is not None and node not in found:
+            found[node] = None
+            waiting.extend(reads_of(node))
     return found
 
 
