@@ -13,7 +13,7 @@ import onnx_ir.passes.common as common
 
 from me2e_compress.calibration.probes import Probe
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.nodes import reads_of
+from me2e_compress.graph.nodes import makers_of, reads_of
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay
@@ -147,7 +147,7 @@ def schedule_probes(model: ir.Model) -> None:
     """
     # What the model's own outputs need keeps its order; the rest waits for its inputs.
     nodes = list(model.graph)
-    own = _needed([v for v in model.graph.outputs if v.name != READINGS])
+    own = makers_of([v for v in model.graph.outputs if v.name != READINGS])
     waiting = {node: _sources(node) for node in nodes if node not in own}
     order: list[ir.Node] = []
 
@@ -204,18 +204,6 @@ def _watch(
     elif len(where):
         where.insert_before(where[0], nodes)
     return readings
-
-
-def _needed(values: Sequence[ir.Value]) -> set[ir.Node]:
-    """Return the nodes that compute some values."""
-    found: set[ir.Node] = set()
-    pending = [node for value in values if (node := value.producer()) is not None]
-    while pending:
-        node = pending.pop()
-        if node not in found:
-            found.add(node)
-            pending += [p for v in reads_of(node) if (p := v.producer()) is not None]
-    return found
 
 
 def _sources(node: ir.Node) -> set[ir.Value]:

@@ -176,12 +176,12 @@ def file_bytes(path: Path) -> int:
 
 def sha256_of(path: Path) -> str:
     """Hash a file, and with it the external data it names, as lower-case hex."""
-    seal = hashlib.sha256()
-    if _holds(path, _LOCATION, seal):
+    hasher = hashlib.sha256()
+    if _holds(path, _LOCATION, hasher):
         for file in _external_files(path):
             for block in _blocks(file):
-                seal.update(block)
-    return seal.hexdigest()
+                hasher.update(block)
+    return hasher.hexdigest()
 
 
 def _external_files(path: Path) -> list[Path]:
@@ -194,18 +194,18 @@ def _external_files(path: Path) -> list[Path]:
     return list(dict.fromkeys(found))
 
 
-def _holds(path: Path, words: bytes, seal: "hashlib._Hash | None" = None) -> bool:
+def _holds(path: Path, words: bytes, hasher: "hashlib._Hash | None" = None) -> bool:
     """Return whether a file holds some bytes; hash it on the way.
 
     It is read block by block: a mapped file would count as memory of this process.
     """
     found, tail = False, b""
     for block in _blocks(path):
-        if seal is not None:
-            seal.update(block)
+        if hasher is not None:
+            hasher.update(block)
         seen = tail + block
         found, tail = found or words in seen, seen[-len(words) :]
-        if found and seal is None:
+        if found and hasher is None:
             break
     return found
 
