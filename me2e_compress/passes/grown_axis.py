@@ -71,13 +71,16 @@ def _reshape(
 
 
 def _inferred(model: ir.Model, node: ir.Node, what: str) -> dict[str, tuple[int, ...]]:
+    cause: Exception | None = None
     try:
         found = infer_node(node, graph.opset_of(model))
     except REFUSALS as error:
+        found, cause = {}, error
+    if not found:
         read = listed([value for value in node.inputs if value is not None])
         raise PreconditionError(
             f"{what} does not fit {node.name} ({node.op_type}), which reads {read}"
-        ) from error
+        ) from cause
     # Only static shapes count
     return {
         name: tuple(dim.dim_value for dim in kind.tensor_type.shape.dim)
