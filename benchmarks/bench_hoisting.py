@@ -1,9 +1,8 @@
-"""What ``hoist-linear`` saves, and what merging layers that share their input costs.
+"""What ``hoist-linear`` saves.
 
     python -m benchmarks.bench_hoisting
 
-The keys of VAD-tiny's motion decoder as they are exported and behind the pass, then
-queries, keys and values (or sampling offsets and weights) apart and merged: CPU time
+The keys of VAD-tiny's motion decoder as they are exported and behind the pass: CPU time
 of onnxruntime on two threads, the least of rounds that alternate. First, how long the
 pass itself takes on graphs of more and more products of repeated rows.
 """
@@ -35,15 +34,6 @@ keys (float[1,{TOKENS},{WIDTH}] map, float[{AGENTS},{TOKENS},2] position,
     split = Reshape(keys, heads)  turned = Transpose<perm = [0, 2, 3, 1]>(split)
     scores = MatMul(q, turned)
 }}"""
-LAYERS = (
-    (20, 64, (64, 64, 64)),
-    (150, 64, (64, 64, 64)),
-    (300, 256, (256, 256, 256)),
-    (2_000, 256, (256, 256, 256)),
-    (10_000, 256, (128, 64)),
-)
-"""Rows, their width, and the columns of the layers that read them."""
-
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
@@ -64,10 +54,10 @@ def model_of(text: str, weights: Arrays) -> ir.Model:
     return model
 
 
-def hoisted(text: str, weights: Arrays, *, merge: bool) -> ir.Model:
+def hoisted(text: str, weights: Arrays) -> ir.Model:
     model = model_of(text, weights)
     context = Context(ModuleMap.whole())
-    return HoistLinear(merge_shared=merge).run(model, context).model
+    return HoistLinear().run(model, context).model
 
 
 def session_of(model: ir.Model) -> onnxruntime.InferenceSession:
@@ -104,29 +94,9 @@ def show_keys() -> None:
         "position": normal(AGENTS, TOKENS, 2),
         "q": normal(AGENTS, HEADS, 1, CHANNELS),
     }
-    models = [model_of(KEYS, weights), hoisted(KEYS, weights, merge=False)]
+    models = [model_of(KEYS, weights), hoisted(KEYS, weights)]
     before, after = milliseconds(models, feeds, 1)
     print(f"keys of the motion decoder: {before:.1f} ms, hoisted {after:.1f} ms")
-
-
-def show_layers(rows: int, width: int, columns: tuple[int, ...]) -> None:
-    weights: dict[str, npt.NDArray[Any]] = {}
-    body, outputs = [], []
-    for at, count in enumerate(columns):
-        weights |= {f"w{at}": normal(width, count), f"b{at}": normal(count)}
-        body.append(f"p{at} = MatMul(x, w{at})  s{at} = Add(p{at}, b{at})")
-        body.append(f"y{at} = Relu(s{at})")
-        outputs.append(f"float[1,{rows},{count}] y{at}")
-    opset = '<ir_version: 8, opset_import: ["" : 17]>'
-    head = f"{opset}\nlayers (float[1,{rows},{width}] x) => ({', '.join(outputs)})"
-    text = f"{head} {{ {'  '.join(body)} }}"
-    models = [model_of(text, weights), hoisted(text, weights, merge=True)]
-    runs = max(1, 20_000_000 // (rows * width * sum(columns)))
-    apart, merged = milliseconds(models, {"x": normal(1, rows, width)}, runs)
-    print(
-        f"{rows:>6} x {width} @ {columns}: {apart:.3f} ms apart,"
-        f" merged {merged:.3f} ms, {merged / apart:.2f}"
-    )
 
 
 def show_pass(count: int) -> None:
@@ -150,5 +120,3 @@ if __name__ == "__main__":
     for products in (400, 800, 1600):
         show_pass(products)
     show_keys()
-    for each in LAYERS:
-        show_layers(*each)

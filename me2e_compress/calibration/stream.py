@@ -13,6 +13,7 @@ import onnx_ir.passes.common as common
 
 from me2e_compress.calibration.probes import Probe
 from me2e_compress.errors import GraphError
+from me2e_compress.graph.nodes import makers_of, reads_of
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay
@@ -146,7 +147,7 @@ def schedule_probes(model: ir.Model) -> None:
     """
     # What the model's own outputs need keeps its order; the rest waits for its inputs.
     nodes = list(model.graph)
-    own = _needed([v for v in model.graph.outputs if v.name != READINGS])
+    own = makers_of([v for v in model.graph.outputs if v.name != READINGS])
     waiting = {node: _sources(node) for node in nodes if node not in own}
     order: list[ir.Node] = []
 
@@ -205,39 +206,6 @@ def _watch(
     return readings
 
 
-def _needed(values: Sequence[ir.Value]) -> set[ir.Node]:
-    """Return the nodes that compute some values."""
-    found: set[ir.Node] = set()
-    pending = [node for value in values if (node := value.producer()) is not None]
-    while pending:
-        node = pending.pop()
-        if node not in found:
-            found.add(node)
-            pending += [p for v in _reads(node) if (p := v.producer()) is not None]
-    return found
-
-
 def _sources(node: ir.Node) -> set[ir.Value]:
     """Return the values that a node needs before it can run."""
-    return {v for v in _reads(node) if v.producer() is not None or v.is_graph_input()}
-
-
-def _reads(node: ir.Node) -> Iterator[ir.Value]:
-    """Yield the inputs of a node and those that its bodies read."""
-    for value in node.inputs:
-        if value is not None:
-            yield value
-    for attribute in node.attributes.values():
-        for body in _bodies(attribute):
-            for inner in body.all_nodes():
-                for value in inner.inputs:
-                    if value is not None and value.graph is node.graph:
-                        yield value
-
-
-def _bodies(attribute: ir.Attr) -> Sequence[ir.Graph]:
-    if attribute.type == ir.AttributeType.GRAPH:
-        return (attribute.as_graph(),)
-    if attribute.type == ir.AttributeType.GRAPHS:
-        return tuple(attribute.as_graphs())
-    return ()
+    return {v for v in reads_of(node) if v.producer() is not None or v.is_graph_input()}

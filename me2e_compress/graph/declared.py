@@ -1,15 +1,15 @@
 """What a file declares: names, types and sizes, and nodes that fit their operators."""
 
-import dataclasses
 import functools
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import onnx
 from onnx import TensorProto
+from onnx.onnx_cpp2py_export.checker import CheckerContext
 
 from me2e_compress.errors import GraphError
+from me2e_compress.graph.nodes import STANDARD
 
 LARGEST_ELEMENTS = 2**40
 """Elements of one tensor: no memory holds more."""
@@ -124,155 +124,105 @@ def _check_values(tensor: TensorProto, what: str, count: int) -> None:
         raise GraphError(f"{what} has {found} values, its shape says {wanted}")
 
 
-_ATTRIBUTE_TYPES = frozenset(onnx.AttributeProto.AttributeType.values()) - {0}
-_FIELD = {onnx.AttributeProto.TENSOR: "t", onnx.AttributeProto.GRAPH: "g"}
-"""The field of an attribute that has no value of its own where it is left out."""
+def check_signature(node: onnx.NodeProto, versions: Mapping[str, int]) -> None:
+    """Check a node of ONNX's own against its operator, by ONNX's checker.
 
-
-def check_signature(
-    node: onnx.NodeProto,
-    versions: Mapping[str, int],
-    functions: Mapping[tuple[str, str, str], onnx.FunctionProto],
-    *,
-    in_function: bool,
-) -> None:
-    """Check a node against the operator or function of its name, if there is one.
-
-    An operator that nobody knows, as plugins are, takes anything.
+    One that nobody knows, as plugins are, takes anything, and so does an operator that
+    ONNX gave up: runtimes may have it still.
 
     Args:
         node: the node.
         versions: opset of every domain.
-        functions: of the model.
-        in_function: whether it stands in one, where attributes may refer to its own.
 
     Raises:
-        GraphError: too many or too few inputs or outputs, or an attribute of another
-            type, without a name, or twice.
+        GraphError: too many or too few inputs or outputs, or an attribute that is
+            unknown or of another type.
     """
-    kinds = _kinds(node, in_function=in_function)
-    function = functions.get((node.domain, node.op_type, node.overload))
-    if function is not None:
-        _at_most(node, "inputs", len(node.input), len(function.input))
-        _at_most(node, "outputs", len(node.output), len(function.output))
+    version = versions.get("", versions.get("ai.onnx", 0))
+    if node.domain not in STANDARD or not onnx.defs.has(node.op_type, version, ""):
         return
-    operator = _operator(node, versions)
-    if operator is None:
+    if onnx.defs.get_schema(node.op_type, version, "").deprecated:
         return
-    _at_most(node, "inputs", len(node.input), operator.most_inputs)
-    _at_most(node, "outputs", len(node.output), operator.most_outputs)
-    if len(node.input) < operator.least_inputs:
-        raise GraphError(
-            f"{_called(node)} has {len(node.input)} inputs, at least"
-            f" {operator.least_inputs} are needed"
-        )
-    for name, needed in zip(node.input, operator.needed, strict=False):
-        if needed and not name:
-            raise GraphError(f"{_called(node)}: input {needed} is left out")
-    for name, kind in kinds.items():
-        if name not in operator.attributes:
-            raise GraphError(f"{_called(node)} has no attribute {name}")
-        wanted = operator.attributes[name]
-        if kind not in (wanted, None):
-            raise GraphError(
-                f"{_called(node)}: attribute {name} is of type {_type_name(kind)}, it"
-                f" must be {_type_name(wanted)}"
-            )
-    if node.op_type == "Transpose":
-        _check_permutation(node)
-    for name in operator.required:
-        if name not in kinds:
-            raise GraphError(f"{_called(node)} lacks the attribute {name}")
-
-
-def _check_permutation(node: onnx.NodeProto) -> None:
-    for each in node.attribute:
+    try:
+        onnx.checker.check_node(_without_contents(node), _context(version))
+    except onnx.checker.ValidationError as error:
+        reason = " ".join(str(error).split("==> Context")[0].split())
+        raise GraphError(f"{_called(node)}: {reason}") from error
+    for each in node.attribute if node.op_type == "Transpose" else ():
         if each.name == "perm" and sorted(each.ints) != list(range(len(each.ints))):
             raise GraphError(f"{_called(node)}: perm {list(each.ints)} is none")
 
 
-@dataclasses.dataclass(frozen=True)
-class _Operator:
-    """What a standard operator takes and gives, of one opset.
-
-    Attributes:
-        least_inputs: that must be there.
-        most_inputs: that may be.
-        most_outputs: likewise.
-        needed: the names of the first inputs; empty for one that may be left out.
-        attributes: their types.
-        required: those that must be there.
-    """
-
-    least_inputs: int
-    most_inputs: int
-    most_outputs: int
-    needed: tuple[str, ...]
-    attributes: Mapping[str, int | None]
-    required: tuple[str, ...]
-
-
-def _operator(node: onnx.NodeProto, versions: Mapping[str, int]) -> _Operator | None:
-    if node.domain not in ("", "ai.onnx"):
-        return None
-    version = versions.get("", versions.get("ai.onnx"))
-    return None if version is None else _known(node.op_type, version)
-
-
 @functools.cache
-def _known(op_type: str, version: int) -> _Operator | None:
-    if not onnx.defs.has(op_type, max_inclusive_version=version, domain=""):
-        return None
-    schema = onnx.defs.get_schema(op_type, version, "")
-    single = onnx.defs.OpSchema.FormalParameterOption.Single
-    return _Operator(
-        schema.min_input,
-        schema.max_input,
-        schema.max_output,
-        tuple(each.name if each.option == single else "" for each in schema.inputs),
-        {name: _number(each.type) for name, each in schema.attributes.items()},
-        tuple(name for name, each in schema.attributes.items() if each.required),
+def _context(version: int) -> CheckerContext:
+    context = CheckerContext()
+    context.ir_version, context.opset_imports = onnx.IR_VERSION, {"": version}
+    return context
+
+
+def _without_contents(node: onnx.NodeProto) -> onnx.NodeProto:
+    """Return a node with empty tensors and graphs: those are checked apart."""
+    contents = {onnx.AttributeProto.TENSOR, onnx.AttributeProto.GRAPH}
+    if not node.domain and contents.isdisjoint(each.type for each in node.attribute):
+        return node
+    bare = onnx.NodeProto(
+        name=node.name, op_type=node.op_type, input=node.input, output=node.output
     )
+    for each in node.attribute:
+        if each.type not in contents or each.ref_attr_name:
+            bare.attribute.append(each)
+        elif each.type == onnx.AttributeProto.TENSOR:
+            empty = TensorProto(data_type=TensorProto.FLOAT, dims=[0])
+            bare.attribute.add(name=each.name, type=each.type, t=empty)
+        else:
+            bare.attribute.add(
+                name=each.name, type=each.type, g=onnx.GraphProto(name="body")
+            )
+    return bare
 
 
-def _number(kind: Any) -> int:
-    """Return the number of a type that ONNX's stubs do not describe."""
-    return int(kind.value)
+def check_attributes(node: onnx.NodeProto, *, in_function: bool) -> None:
+    """Check that each attribute has a name and a value, or refers to a function's.
 
-
-def _called(node: onnx.NodeProto) -> str:
-    return f"node {node.name!r} ({node.op_type})"
-
-
-def _type_name(kind: int | None) -> str:
-    return onnx.AttributeProto.AttributeType.Name(kind or 0)
-
-
-def _at_most(node: onnx.NodeProto, what: str, found: int, most: int) -> None:
-    if found > most:
-        raise GraphError(f"{_called(node)} has {found} {what}, at most {most} may be")
-
-
-def _kinds(node: onnx.NodeProto, *, in_function: bool) -> dict[str, int | None]:
-    """Return the types of attributes by name; None for one that refers to another."""
-    found: dict[str, int | None] = {}
+    Raises:
+        GraphError: one has not, is there twice, or refers to one where there is none.
+    """
+    found = set[str]()
     for each in node.attribute:
         name = each.name
         if type(name) is not str or not name or name in found:
             raise GraphError(f"{_called(node)}: attribute {name!r} twice, or nameless")
+        found.add(name)
         if each.ref_attr_name:
             if not in_function:
                 raise GraphError(
                     f"{_called(node)}: attribute {name} refers to one of a function,"
                     " and stands in none"
                 )
-            found[name] = None
             continue
-        kind = each.type
-        if kind not in _ATTRIBUTE_TYPES:
+        if each.type not in _ATTRIBUTE_TYPES:
             raise GraphError(f"{_called(node)}: attribute {name} is of no known type")
-        field = _FIELD.get(kind)
+        field = _FIELD.get(each.type)
         if field is not None and not each.HasField(field):
             raise GraphError(f"{_called(node)}: attribute {name} has no value")
-        found[name] = kind
-    return found
+
+
+_ATTRIBUTE_TYPES = frozenset(onnx.AttributeProto.AttributeType.values()) - {0}
+_FIELD = {onnx.AttributeProto.TENSOR: "t", onnx.AttributeProto.GRAPH: "g"}
+"""The field of an attribute that has no value of its own where it is left out."""
+
+
+def check_call(node: onnx.NodeProto, function: onnx.FunctionProto) -> None:
+    """Refuse a call of a function with more inputs or outputs than it has."""
+    for what, given, most in (
+        ("inputs", node.input, function.input),
+        ("outputs", node.output, function.output),
+    ):
+        if len(given) > len(most):
+            raise GraphError(
+                f"{_called(node)} has {len(given)} {what}, at most {len(most)} may be"
+            )
+
+
+def _called(node: onnx.NodeProto) -> str:
+    return f"node {node.name!r} ({node.op_type})"

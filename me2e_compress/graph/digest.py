@@ -18,27 +18,27 @@ def digest(model: ir.Model) -> str:
     Weights are hashed once per tensor object: clones share them, so hashing a graph
     again after a pass costs only the walk over its nodes.
     """
-    seal = hashlib.blake2b(digest_size=16)
-    seal.update(repr(sorted(model.opset_imports.items())).encode())
-    seal.update(repr(sorted(model.metadata_props.items())).encode())
-    _graph(seal, model.graph)
+    hasher = hashlib.blake2b(digest_size=16)
+    hasher.update(repr(sorted(model.opset_imports.items())).encode())
+    hasher.update(repr(sorted(model.metadata_props.items())).encode())
+    _graph(hasher, model.graph)
     for key in sorted(model.functions, key=str):
-        seal.update(repr(key).encode())
-        _nodes(seal, model.functions[key])
-    return seal.hexdigest()
+        hasher.update(repr(key).encode())
+        _nodes(hasher, model.functions[key])
+    return hasher.hexdigest()
 
 
-def _graph(seal: "hashlib.blake2b", graph: ir.Graph) -> None:
+def _graph(hasher: "hashlib.blake2b", graph: ir.Graph) -> None:
     for value in (*graph.inputs, *graph.outputs):
-        seal.update(f"{value.name}:{value.type}:{value.shape}\n".encode())
+        hasher.update(f"{value.name}:{value.type}:{value.shape}\n".encode())
     for name in sorted(graph.initializers):
-        seal.update(f"={name}\n".encode())
+        hasher.update(f"={name}\n".encode())
         tensor = graph.initializers[name].const_value
-        seal.update(b"?" if tensor is None else _tensor(tensor))
-    _nodes(seal, graph)
+        hasher.update(b"?" if tensor is None else _tensor(tensor))
+    _nodes(hasher, graph)
 
 
-def _nodes(seal: "hashlib.blake2b", nodes: Iterable[ir.Node]) -> None:
+def _nodes(hasher: "hashlib.blake2b", nodes: Iterable[ir.Node]) -> None:
     for node in nodes:
         head = (
             node.domain,
@@ -48,41 +48,41 @@ def _nodes(seal: "hashlib.blake2b", nodes: Iterable[ir.Node]) -> None:
             [value.name for value in node.outputs],
             sorted(node.metadata_props.items()),
         )
-        seal.update(repr(head).encode())
+        hasher.update(repr(head).encode())
         for name in sorted(node.attributes):
-            _attribute(seal, node.attributes[name])
+            _attribute(hasher, node.attributes[name])
 
 
-def _attribute(seal: "hashlib.blake2b", attribute: ir.Attr) -> None:
-    seal.update(f"{attribute.name}/{attribute.type}/".encode())
+def _attribute(hasher: "hashlib.blake2b", attribute: ir.Attr) -> None:
+    hasher.update(f"{attribute.name}/{attribute.type}/".encode())
     if attribute.is_ref():
-        seal.update(f"@{attribute.ref_attr_name}".encode())
+        hasher.update(f"@{attribute.ref_attr_name}".encode())
     elif attribute.type == ir.AttributeType.GRAPH:
-        _graph(seal, attribute.as_graph())
+        _graph(hasher, attribute.as_graph())
     elif attribute.type == ir.AttributeType.GRAPHS:
         for graph in attribute.as_graphs():
-            _graph(seal, graph)
+            _graph(hasher, graph)
     elif attribute.type == ir.AttributeType.TENSOR:
-        seal.update(_tensor(attribute.value))  # as_tensor() checks a protocol: slow
+        hasher.update(_tensor(attribute.value))  # as_tensor() checks a protocol: slow
     elif attribute.type == ir.AttributeType.TENSORS:
         for tensor in attribute.as_tensors():
-            seal.update(_tensor(tensor))
+            hasher.update(_tensor(tensor))
     else:
-        seal.update(repr(attribute.value).encode())
+        hasher.update(repr(attribute.value).encode())
 
 
 def _tensor(tensor: ir.TensorProtocol) -> bytes:
     known = _TENSORS.get(tensor)
     if known is None:
         # SHA-256 has processor instructions: half the time of BLAKE2 on weights.
-        seal = hashlib.sha256()
-        seal.update(f"{tensor.dtype}{tensor.shape}".encode())
+        hasher = hashlib.sha256()
+        hasher.update(f"{tensor.dtype}{tensor.shape}".encode())
         if tensor.dtype == ir.DataType.STRING:
-            seal.update(repr(tensor.numpy().tolist()).encode())
+            hasher.update(repr(tensor.numpy().tolist()).encode())
         else:
             # A view, not bytes: a mapped weight must not be copied to be hashed.
             flat = np.ascontiguousarray(tensor.numpy()).reshape(-1)
-            seal.update(flat.view(np.uint8).data)
-        known = seal.digest()
+            hasher.update(flat.view(np.uint8).data)
+        known = hasher.digest()
         _TENSORS[tensor] = known
     return known

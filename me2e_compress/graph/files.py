@@ -17,6 +17,7 @@ from me2e_compress.display import reason
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import structure
 from me2e_compress.graph.opset import lower
+from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR
 from me2e_compress.graph.weight_files import (
     data_file,
@@ -118,7 +119,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
     earlier = _named_in(path, names)
     data = next(each for each in names if each not in earlier)
     if external is None:
-        external = bool(stored) or _weight_bytes(model) > INLINE_LIMIT_BYTES
+        external = bool(stored) or weight_bytes(model) > INLINE_LIMIT_BYTES
     with (
         drafts.naming(path),
         tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as folder,
@@ -175,12 +176,12 @@ def file_bytes(path: Path) -> int:
 
 def sha256_of(path: Path) -> str:
     """Hash a file, and with it the external data it names, as lower-case hex."""
-    seal = hashlib.sha256()
-    if _holds(path, _LOCATION, seal):
+    hasher = hashlib.sha256()
+    if _holds(path, _LOCATION, hasher):
         for file in _external_files(path):
             for block in _blocks(file):
-                seal.update(block)
-    return seal.hexdigest()
+                hasher.update(block)
+    return hasher.hexdigest()
 
 
 def _external_files(path: Path) -> list[Path]:
@@ -193,18 +194,18 @@ def _external_files(path: Path) -> list[Path]:
     return list(dict.fromkeys(found))
 
 
-def _holds(path: Path, words: bytes, seal: "hashlib._Hash | None" = None) -> bool:
+def _holds(path: Path, words: bytes, hasher: "hashlib._Hash | None" = None) -> bool:
     """Return whether a file holds some bytes; hash it on the way.
 
     It is read block by block: a mapped file would count as memory of this process.
     """
     found, tail = False, b""
     for block in _blocks(path):
-        if seal is not None:
-            seal.update(block)
+        if hasher is not None:
+            hasher.update(block)
         seen = tail + block
         found, tail = found or words in seen, seen[-len(words) :]
-        if found and seal is None:
+        if found and hasher is None:
             break
     return found
 
@@ -225,12 +226,3 @@ def _inlined(model: ir.Model) -> ir.Model:
             if isinstance(tensor, ir.ExternalTensor):
                 value.const_value = ir.tensor(tensor.numpy(), name=value.name)
     return copy
-
-
-def _weight_bytes(model: ir.Model) -> int:
-    return sum(
-        value.const_value.nbytes
-        for graph in model.graphs()
-        for value in graph.initializers.values()
-        if value.const_value is not None
-    )

@@ -1,7 +1,7 @@
 """Facts about nodes and values: who makes, who reads, and what constants hold."""
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -65,8 +65,21 @@ def nodes_in(graph: ir.Graph | ir.Function) -> Iterator[ir.Node]:
     """Walk the nodes of a graph, those of its bodies behind the node that has them."""
     for node in graph:
         yield node
-        for body in bodies_of(node):
-            yield from nodes_in(body)
+        yield from nodes_inside(node)
+
+
+def nodes_inside(node: ir.Node) -> Iterator[ir.Node]:
+    """Walk the nodes of a node's bodies, and of the bodies in them."""
+    for body in bodies_of(node):
+        yield from nodes_in(body)
+
+
+def reads_of(node: ir.Node) -> Iterator[ir.Value]:
+    """Walk what a node reads of its own graph, by its bodies too."""
+    yield from filter(None, node.inputs)
+    for inner in nodes_inside(node):
+        reads = (value for value in inner.inputs if value is not None)
+        yield from (value for value in reads if value.graph is node.graph)
 
 
 _WITH_BODIES = frozenset({"If", "Loop", "Scan", "SequenceMap"})
@@ -86,6 +99,28 @@ def bodies_of(node: ir.Node) -> Sequence[ir.Graph]:
     return found
 
 
+def attribute_values(node: ir.Node) -> tuple[bytes, ...]:
+    """Return a node's attributes, serialized: equal ones compare equal."""
+    return tuple(
+        ir.serde.serialize_attribute(node.attributes[name]).SerializeToString(
+            deterministic=True
+        )
+        for name in sorted(node.attributes)
+    )
+
+
+def makers_of(values: Iterable[ir.Value | None]) -> dict[ir.Node, None]:
+    """Find the nodes that compute some values, by what their bodies read too."""
+    found: dict[ir.Node, None] = {}
+    waiting = list(values)
+    while waiting:
+        node = producer_of(waiting.pop())
+        if node is not None and node not in found:
+            found[node] = None
+            waiting.extend(reads_of(node))
+    return found
+
+
 def input_at(node: ir.Node, index: int) -> ir.Value | None:
     """Return an input of a node; None if it is left out."""
     return node.inputs[index] if index < len(node.inputs) else None
@@ -98,8 +133,7 @@ def producer_of(value: ir.Value | None) -> ir.Node | None:
 
 def has_subgraph(node: ir.Node) -> bool:
     """Return whether a node carries a graph of its own (If, Loop, Scan, ...)."""
-    kinds = (ir.AttributeType.GRAPH, ir.AttributeType.GRAPHS)
-    return any(attribute.type in kinds for attribute in node.attributes.values())
+    return bool(bodies_of(node))
 
 
 def graphs_of(graph: ir.Graph) -> Iterator[ir.Graph]:

@@ -36,7 +36,7 @@ def restore(
     found = _match(nodes, list(like.graph.all_nodes()))
     if node_names:
         _rename(nodes, found)
-    _bequeath(nodes, found, by)
+    _inherit_from_neighbours(nodes, found, by)
 
 
 def _merge(props: dict[str, str], past: dict[str, str]) -> None:
@@ -88,7 +88,9 @@ def _rename(nodes: Sequence[ir.Node], found: dict[ir.Node, ir.Node]) -> None:
             node.name = name
 
 
-def _bequeath(nodes: Sequence[ir.Node], found: dict[ir.Node, ir.Node], by: str) -> None:
+def _inherit_from_neighbours(
+    nodes: Sequence[ir.Node], found: dict[ir.Node, ir.Node], by: str
+) -> None:
     alive = {value.name for node in nodes for value in node.outputs}
     claimed: set[ir.Node] = set()
     for node in nodes:

@@ -13,6 +13,8 @@ import onnx
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.declared import (
+    check_attributes,
+    check_call,
     check_port,
     check_signature,
     check_tensor,
@@ -227,7 +229,12 @@ class _Walk:
                     f"node {node.name!r} reads {name!r}, which nothing makes"
                 )
             self.in_order = self.in_order and name in before
-        check_signature(node, self.versions, self.functions, in_function=in_function)
+        check_attributes(node, in_function=in_function)
+        called = self.functions.get((node.domain, node.op_type, node.overload))
+        if called is None:
+            check_signature(node, self.versions)
+        else:
+            check_call(node, called)
         for each in node.metadata_props:
             check_text("metadata of a node", (each.key, each.value))
         for attribute in node.attribute:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 
 import onnx_ir as ir
 
-from me2e_compress.graph.nodes import graphs_of, input_at, is_plugin, nodes_in
+from me2e_compress.graph.nodes import input_at, is_plugin, nodes_in, nodes_inside
 from me2e_compress.graph.plugins import knowledge
 from me2e_compress.graph.shapes import static_shape
 
@@ -41,7 +41,7 @@ def macs(node: ir.Node) -> int | None:
     if is_plugin(node):
         return knowledge().macs(node)
     if node.op_type in _LOOPS:  # nobody knows how often it runs
-        inside = (inner for inner in _inside(node) if inner.op_type not in _LOOPS)
+        inside = (inner for inner in nodes_inside(node) if inner.op_type not in _LOOPS)
         return 0 if all(macs(inner) == 0 for inner in inside) else None
     if node.op_type in _UNCOUNTED:
         return None
@@ -102,14 +102,6 @@ def total_macs(counts: Iterable[int | None]) -> tuple[int | None, int]:
         else:
             total += count
     return (total if total or not unknown else None), unknown
-
-
-def _inside(node: ir.Node) -> Iterable[ir.Node]:
-    """Walk the nodes of a node's bodies, and of the bodies in them."""
-    for attribute in node.attributes.values():
-        if attribute.type == ir.AttributeType.GRAPH:
-            for body in graphs_of(attribute.as_graph()):
-                yield from body
 
 
 def _conv(weight: int) -> Counter:
@@ -252,12 +244,7 @@ def size(model: ir.Model) -> Size:
     found, unknown = total_macs(map(macs_counter(model), nodes_in(model.graph)))
     return Size(
         nodes=node_count(model),
-        weight_bytes=sum(
-            value.const_value.nbytes
-            for graph in model.graphs()
-            for value in graph.initializers.values()
-            if value.const_value is not None
-        ),
+        weight_bytes=weight_bytes(model),
         macs=found,
         unknown_macs_nodes=unknown,
     )
@@ -277,6 +264,16 @@ def node_count(model: ir.Model) -> int:
         return bodies[key]
 
     return sum(count(node) for node in nodes_in(model.graph))
+
+
+def weight_bytes(model: ir.Model) -> int:
+    """Return the bytes of all initializers."""
+    return sum(
+        value.const_value.nbytes
+        for graph in model.graphs()
+        for value in graph.initializers.values()
+        if value.const_value is not None
+    )
 
 
 def _ports(values: Iterable[ir.Value]) -> tuple[Port, ...]:

@@ -5,16 +5,16 @@ without a run.
 """
 
 import dataclasses
-from collections.abc import Iterator
 
 import onnx
 import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.errors import Me2eError, PassError, VerificationError
+from me2e_compress.graph.node_inference import REFUSALS, infer_node
 from me2e_compress.graph.nodes import has_subgraph, is_standard, nodes_in, opset_of
 from me2e_compress.graph.provenance import is_same
-from me2e_compress.graph.shapes import INLINE_BYTES, without_weights
+from me2e_compress.graph.shapes import without_weights
 from me2e_compress.manager import pass_contract
 from me2e_compress.passes.base import Context, Pass, PassResult
 
@@ -136,47 +136,19 @@ def contradiction(node: ir.Node, opset: int) -> str | None:
     """
     if not is_standard(node) or has_subgraph(node):
         return None
-    types = {str(each.name): _type(each) for each in node.inputs if each is not None}
-    known = {key: kind for key, kind in types.items() if kind is not None}
-    if len(known) < len(types) or not onnx.defs.has(node.op_type, opset):
+    if not all(
+        isinstance(each.type, ir.TensorType) for each in filter(None, node.inputs)
+    ):
         return None
     try:
-        found = onnx.shape_inference.infer_node_outputs(
-            onnx.defs.get_schema(node.op_type, opset),
-            ir.serde.serialize_node(node),
-            known,
-            dict(_constants(node)),
-            opset_imports=[onnx.helper.make_opsetid("", opset)],
-        )
-    except (
-        onnx.shape_inference.InferenceError,
-        onnx.checker.ValidationError,
-    ) as error:
+        found = infer_node(node, opset)
+    except REFUSALS as error:
         return " ".join(str(error).split())
     for value in node.outputs:
         kind = found.get(value.name or "")
         if kind is not None and (reason := _conflict(value, kind)):
             return reason
     return None
-
-
-def _type(value: ir.Value) -> onnx.TypeProto | None:
-    if not isinstance(value.type, ir.TensorType):
-        return None
-    shape = None
-    if value.shape is not None:
-        shape = [dim if isinstance(dim, int) else None for dim in value.shape]
-    return onnx.helper.make_tensor_type_proto(int(value.type.dtype), shape)
-
-
-def _constants(node: ir.Node) -> Iterator[tuple[str, onnx.TensorProto]]:
-    """Yield the small constants that a node reads: axes, shapes, sizes."""
-    for value in node.inputs:
-        tensor = None if value is None else value.const_value
-        if value is None or tensor is None or value.is_graph_input():
-            continue
-        if tensor.nbytes <= INLINE_BYTES:
-            yield str(value.name), ir.serde.serialize_tensor(tensor)
 
 
 def _conflict(value: ir.Value, kind: onnx.TypeProto) -> str | None:

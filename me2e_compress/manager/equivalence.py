@@ -4,12 +4,12 @@ On outputs that a graph draws anew at every run nothing can be compared.
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.nodes import DRAWS, bodies_of, nodes_in
+from me2e_compress.graph.nodes import DRAWS, bodies_of, reads_of
 from me2e_compress.manager import runtime_levels
 from me2e_compress.manager.output_errors import errors, tolerances
 from me2e_compress.manager.report import Verification
@@ -113,7 +113,7 @@ def random_outputs(model: ir.Model) -> tuple[str, ...]:
     """Name the outputs of a graph that depend on what it draws without a seed."""
     drawn = set[ir.Value]()
     for node in model.graph:
-        if _draws(node, model) or not drawn.isdisjoint(_read_by(node)):
+        if _draws(node, model) or not drawn.isdisjoint(reads_of(node)):
             drawn.update(node.outputs)
     return tuple(str(each.name) for each in model.graph.outputs if each in drawn)
 
@@ -125,14 +125,3 @@ def _draws(node: ir.Node, model: ir.Model) -> bool:
     function = model.functions.get(node.op_identifier())
     bodies = bodies_of(node) if function is None else (function,)
     return any(_draws(each, model) for body in bodies for each in body)
-
-
-def _read_by(node: ir.Node) -> Iterator[ir.Value]:
-    """Yield what a node reads, in its bodies too."""
-    for each in (node, *_inside(node)):
-        yield from (value for value in each.inputs if value is not None)
-
-
-def _inside(node: ir.Node) -> Iterator[ir.Node]:
-    for body in bodies_of(node):
-        yield from nodes_in(body)

@@ -2,12 +2,13 @@
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.graph.nodes import reads_of
 
 PIPELINE = "pipeline.txt"
 """Says what fails, and by that whose folder it is."""
@@ -52,7 +53,7 @@ def window(model: ir.Model, start: int, stop: int) -> ir.Model | None:
     inputs = {
         value.name: value
         for node in nodes
-        for value in _read_by(node)
+        for value in reads_of(node)
         if id(value) not in made and not value.is_initializer()
     }
     outputs = {
@@ -74,17 +75,6 @@ def window(model: ir.Model, start: int, stop: int) -> ir.Model | None:
         functions=[function.clone() for function in model.functions.values()],
         metadata_props={"me2e.reproducer": "part of a graph"},
     )
-
-
-def _read_by(node: ir.Node) -> Iterator[ir.Value]:
-    """List what a node reads of its graph, by the graphs inside it too."""
-    yield from filter(None, node.inputs)
-    for attribute in node.attributes.values():
-        if attribute.type == ir.AttributeType.GRAPH:
-            for body in graph.graphs_of(attribute.as_graph()):
-                for inner in body:
-                    reads = (value for value in inner.inputs if value is not None)
-                    yield from (value for value in reads if value.graph is node.graph)
 
 
 def _leaves(value: ir.Value, inside: set[ir.Node]) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 import onnx_ir as ir
 
 from me2e_compress.errors import FramesError, GraphError
-from me2e_compress.graph.nodes import is_read
+from me2e_compress.graph.nodes import is_read, makers_of
 from me2e_compress.manager.output_errors import errors, relative
 from me2e_compress.manager.verification_inputs import VerificationInputs
 from me2e_compress.rewrite import sweep
@@ -83,7 +83,8 @@ def _first_node(
     frame = inputs.frames[0]
     session = Session(model, optimize="none", provider=inputs.provider)
     feeds = {**frame.arrays, **session.first_state(frame.arrays)}
-    behind = _makers(model, output)
+    makers = makers_of(v for v in model.graph.outputs if v.name == output)
+    behind = [node for node in model.graph if node in makers]
 
     def differs(node: ir.Node) -> bool:
         return _gap(_up_to(model, node), feeds, level, inputs) > allowed
@@ -95,18 +96,6 @@ def _first_node(
         middle = (good + bad) // 2
         good, bad = (good, middle) if differs(behind[middle]) else (middle, bad)
     return behind[bad]
-
-
-def _makers(model: ir.Model, output: str) -> list[ir.Node]:
-    """List the nodes that an output is computed by, in order."""
-    last = {value.name: value.producer() for value in model.graph.outputs}[output]
-    found, waiting = set[ir.Node](), [last]
-    while waiting:
-        node = waiting.pop()
-        if node is not None and node not in found:
-            found.add(node)
-            waiting.extend(node.predecessors())
-    return [node for node in model.graph if node in found]
 
 
 def _up_to(model: ir.Model, node: ir.Node) -> ir.Model:

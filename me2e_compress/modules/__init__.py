@@ -3,13 +3,7 @@
 from me2e_compress.modules.assign import assign
 from me2e_compress.modules.assignment import Assignment, Placement
 from me2e_compress.modules.detect import detect, map_of, map_of_files
-from me2e_compress.modules.inventory import (
-    Inventory,
-    Item,
-    WeightEntry,
-    inventory,
-    itemise,
-)
+from me2e_compress.modules.inventory import Item, itemise
 from me2e_compress.modules.module_map import (
     Module,
     ModuleMap,
@@ -17,11 +11,10 @@ from me2e_compress.modules.module_map import (
     Substitute,
     presets,
 )
-from me2e_compress.modules.paths import PathGlob, exits, scope_of
+from me2e_compress.modules.paths import PathGlob, scope_of
 
 __all__ = [
     "Assignment",
-    "Inventory",
     "Item",
     "Module",
     "ModuleMap",
@@ -29,11 +22,8 @@ __all__ = [
     "Placement",
     "Role",
     "Substitute",
-    "WeightEntry",
     "assign",
     "detect",
-    "exits",
-    "inventory",
     "itemise",
     "map_of",
     "map_of_files",

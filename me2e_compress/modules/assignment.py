@@ -44,10 +44,6 @@ class Assignment(Displayed):
         """Return the module of a node of the graph that was assigned."""
         return self.placements[node].module
 
-    def rule_of(self, node: ir.Node) -> Rule:
-        """Return the rule that decided."""
-        return self.placements[node].rule
-
     def nodes(self, module: str) -> list[ir.Node]:
         """List a module's nodes in graph order."""
         return [n for n, place in self.placements.items() if place.module == module]

@@ -1,15 +1,17 @@
-"""Count a graph's weights and costs by module, and compare it with a state dict."""
+"""Count a graph's weights and costs by module."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import onnx_ir as ir
 
 from me2e_compress.modules.module_map import ModuleMap
 from me2e_compress.modules.paths import parameter_path
 
-_INTEGERS = (ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL)
-_NOT_WEIGHTS = (*_INTEGERS, ir.DataType.STRING)
+_NOT_WEIGHTS = (
+    *(ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL),
+    ir.DataType.STRING,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,84 +100,3 @@ def _owned(
         if value.const_value is not None
         and (owner := _owner_of(value, modules, module_of)) is not None
     ]
-
-
-@dataclasses.dataclass(frozen=True)
-class WeightEntry:
-    """One tensor of the state dict or of the file; ``module`` is None if unknown.
-
-    ``kind`` is "batch-norm statistics", "batch-norm counter" or "parameter" (other
-    buffers too) in a state dict; "renamed weight", "constant" or "integer constant" in
-    a file.
-    """
-
-    name: str
-    module: str | None
-    elements: int
-    kind: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Inventory:
-    """A file against its state dict: tensors in both, by name and number of elements.
-
-    ``missing`` tensors are folded, merged or never read; ``extra`` ones are renamed,
-    folded together or made by the exporter.
-    """
-
-    present: tuple[WeightEntry, ...]
-    missing: tuple[WeightEntry, ...]
-    extra: tuple[WeightEntry, ...]
-
-
-def inventory(
-    model: ir.Model,
-    modules: ModuleMap,
-    module_of: Callable[[ir.Node], str],
-    state_dict: Mapping[str, int],
-) -> Inventory:
-    """Compare a file's initializers with a state dict.
-
-    ``state_dict`` maps names, buffers included, to numbers of elements.
-    """
-    # what the file stores
-    stored = {
-        name: value
-        for graph in (model.graph, *model.graph.subgraphs())
-        for name, value in graph.initializers.items()
-        if value.const_value is not None
-    }
-    sizes = {name: _elements(value) for name, value in stored.items()}
-    # what the state dict has, by the map's names
-    ours = [
-        WeightEntry(name, modules.match(name), elements, _kind_in_state_dict(name))
-        for name, elements in state_dict.items()
-    ]
-    return Inventory(
-        present=tuple(w for w in ours if sizes.get(w.name) == w.elements),
-        missing=tuple(w for w in ours if sizes.get(w.name) != w.elements),
-        extra=tuple(
-            WeightEntry(
-                name, _owner_of(value, modules, module_of), sizes[name], _kind(value)
-            )
-            for name, value in stored.items()
-            if state_dict.get(name) != sizes[name]
-        ),
-    )
-
-
-def _elements(value: ir.Value) -> int:
-    return 0 if value.const_value is None else value.const_value.size
-
-
-def _kind_in_state_dict(name: str) -> str:
-    last = name.rpartition(".")[2]
-    if last in ("running_mean", "running_var"):
-        return "batch-norm statistics"
-    return "batch-norm counter" if last == "num_batches_tracked" else "parameter"
-
-
-def _kind(value: ir.Value) -> str:
-    if value.dtype in _INTEGERS:
-        return "integer constant"
-    return "renamed weight" if "::" in (value.name or "") else "constant"

@@ -105,17 +105,6 @@ def scope_of(node: ir.Node) -> str:
     return scope
 
 
-def exits(model: ir.Model, pattern: str) -> tuple[ir.Value, ...]:
-    """List the values of a scope that the rest of the graph reads, in graph order.
-
-    Graph outputs count too. ``pattern`` is one of a module map, e.g.
-    ``*.motion_decoder``. The last value is what the torch module returned, if it
-    returns one tensor.
-    """
-    glob = PathGlob(pattern)
-    return leaving(model, lambda node: _within(glob, scope_of(node)))
-
-
 def leaving(model: ir.Model, holds: Callable[[ir.Node], bool]) -> tuple[ir.Value, ...]:
     """List the values of some nodes that others read or the graph outputs."""
     members = {node: None for node in model.graph if holds(node)}
@@ -143,10 +132,6 @@ def entering(model: ir.Model, holds: Callable[[ir.Node], bool]) -> tuple[ir.Valu
         and (value.producer() is not None or value.is_graph_input())
         and value.const_value is None
     )
-
-
-def _within(glob: PathGlob, scope: str) -> bool:
-    return bool(scope) and glob.reach(tuple(scope.split("."))) is not None
 
 
 def _from_name(name: str | None) -> str:

@@ -11,15 +11,13 @@ from me2e_compress import graph, rewrite
 from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance
-from me2e_compress.graph.nodes import LAYOUT_OPERATORS
+from me2e_compress.graph.nodes import LAYOUT_OPERATORS, makers_of, reads_of
 from me2e_compress.modules import ModuleMap, Substitute
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.edges import Edge, add_edge
 from me2e_compress.passes.parts import Part, within
-from me2e_compress.passes.planner_sight import PLANNER, check_sight, seeing
 from me2e_compress.passes.substitutes import (
     constant_like,
-    depends,
     means_of,
     module_of,
     replace_readers,
@@ -27,6 +25,9 @@ from me2e_compress.passes.substitutes import (
     shaped_like,
     zeros_like,
 )
+
+PLANNER = "planner"
+"""The module that makes the plan, in every preset."""
 
 _LAYOUT = LAYOUT_OPERATORS | {"Cast"}
 """Operators that only change the layout or type of another node's result."""
@@ -97,7 +98,7 @@ class AblateModules(Pass):
         _require_nodes(model, self.drop)
         for pattern in self.keep:
             result_of(model, Part(pattern))
-        before, sighted = graph.node_count(model), seeing(model, context.modules)
+        before, seeing = graph.node_count(model), _seeing(model, context.modules)
         # Separate the dropped modules from everything that stays
         _hand_over(model, self._goes)
         gone = self._cut_outputs(model)
@@ -119,7 +120,7 @@ class AblateModules(Pass):
         rewrite.sweep(model)
         model.graph.sort()
         # The planner must still depend on the cameras
-        check_sight(model, context.modules, sighted, self.drop)
+        _check_sight(model, context.modules, seeing, self.drop)
         removed = before - graph.node_count(model)
         said = counted(abs(removed), "node")
         notes.append(f"{said} {'removed' if removed >= 0 else 'added'}")
@@ -204,7 +205,8 @@ class AblateModules(Pass):
                 f"{wanted.by} cannot substitute for {wanted.scope}: it is of module"
                 f" {module_of(new)}, which is dropped too"
             )
-        if depends(new, {old}):
+        makers = makers_of([new])
+        if new is old or any(old in reads_of(node) for node in makers):
             raise PreconditionError(
                 f"{wanted.by} cannot substitute for {wanted.scope}: it reads its result"
             )
@@ -255,3 +257,29 @@ def _hand_over(model: ir.Model, goes: Callable[[ir.Node], bool]) -> int:
             provenance.stamp(node, dataclasses.replace(past, module=module))
             count += 1
     return count
+
+
+def _seeing(model: ir.Model, modules: ModuleMap) -> tuple[str, ...]:
+    """Return the planner's outputs that depend on the feature extraction."""
+    features = set(modules.names("feature"))
+    return tuple(
+        str(value.name)
+        for value in model.graph.outputs
+        if module_of(value) == PLANNER
+        and any(provenance.module_of(node) in features for node in makers_of([value]))
+    )
+
+
+def _check_sight(
+    model: ir.Model, modules: ModuleMap, before: tuple[str, ...], drop: tuple[str, ...]
+) -> None:
+    """Raise a PreconditionError unless the plan still depends on the cameras."""
+    seeing = _seeing(model, modules)
+    blind = [name for name in before if name not in seeing]
+    if blind:
+        features = ", ".join(modules.names("feature"))
+        how = f"without {', '.join(drop)}" if drop else "by these edges"
+        raise PreconditionError(
+            f"{how} the plan is cut: {blind[0]} depends on nothing of {features} any"
+            f" more; keep a module, or add an edge to the {PLANNER}"
+        )

@@ -129,17 +129,6 @@ class Pass(abc.ABC):
         values = [getattr(self, name) for name in self.option_names()]
         return tuple(value for value in values if isinstance(value, Path))
 
-    def options(self) -> dict[str, object]:
-        """Return the options that differ from their defaults, without functions."""
-        found: dict[str, object] = {}
-        for field in dataclasses.fields(self):
-            value, default = getattr(self, field.name), field.default
-            if field.default_factory is not dataclasses.MISSING:
-                default = field.default_factory()
-            if field.name != "name" and not callable(value) and value != default:
-                found[field.name] = value
-        return found
-
     @classmethod
     def option_names(cls) -> tuple[str, ...]:
         """Return the names of the options, in order."""

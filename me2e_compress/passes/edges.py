@@ -11,15 +11,11 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance
+from me2e_compress.graph.nodes import makers_of
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes.grown_axis import carry
 from me2e_compress.passes.parts import Part, fit, listed, stretched
-from me2e_compress.passes.substitutes import (
-    depends,
-    finished,
-    reshaped,
-    shaped_like,
-)
+from me2e_compress.passes.substitutes import finished, reshaped, shaped_like
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,21 +78,21 @@ def add_edge(
     # Find both ends; a cycle is refused
     source, reader = Part.of(edge.source, modules), Part.of(edge.reader, modules)
     new, old = _ends(model, edge, source, reader, modules, goes)
-    heirs = [node for node in old.consumers() if reader.holds(node)]
-    if depends(new, {value for node in heirs for value in node.outputs}):
+    readers = [node for node in old.consumers() if reader.holds(node)]
+    if not makers_of([new]).keys().isdisjoint(readers):
         raise PreconditionError(
             f"edge {edge.label}: {new.name} depends on what {edge.reader} makes of"
             f" {old.name}"
         )
     # Redirect only the readers inside the reading part
-    uses = [(node, index) for node, index in old.uses() if node in heirs]
-    joined = _join(model.graph, edge, new, old, heirs, by)
+    uses = [(node, index) for node, index in old.uses() if node in readers]
+    joined = _join(model.graph, edge, new, old, readers, by)
     for node, index in uses:
         node.replace_input_with(index, joined)
     model.graph.sort()
     if edge.how == "append":
         carry(model, joined, old, f"edge {edge.label}: {listed([new])}")
-    return _told(edge, new, old)
+    return _description(edge, new, old)
 
 
 def _ends(
@@ -178,28 +174,28 @@ def _join(
     edge: Edge,
     new: ir.Value,
     old: ir.Value,
-    heirs: Sequence[ir.Node],
+    readers: Sequence[ir.Node],
     by: str,
 ) -> ir.Value:
     want = graph.static_shape(old) or ()
     if edge.how == "replace":
-        return shaped_like(where, new, old, heirs, by)
+        return shaped_like(where, new, old, readers, by)
     if edge.how == "add":
         padded = stretched(graph.static_shape(new) or (), want) or want
-        shaped = reshaped(where, new, padded, heirs, by)
+        shaped = reshaped(where, new, padded, readers, by)
         node = ir.node("Add", [old, shaped])
     else:
         padded = _as_queries(new, old) or ()
-        shaped = reshaped(where, new, padded, heirs, by)
+        shaped = reshaped(where, new, padded, readers, by)
         node = ir.node("Concat", [old, shaped], {"axis": edge.axis})
         size = list(want)
         size[edge.axis] += padded[edge.axis]
         want = tuple(size)
-    provenance.inherit(node, heirs, by=by)
+    provenance.inherit(node, readers, by=by)
     return finished(where, node, want, old, f"{old.name}_joined")
 
 
-def _told(edge: Edge, new: ir.Value, old: ir.Value) -> str:
+def _description(edge: Edge, new: ir.Value, old: ir.Value) -> str:
     before, after = listed([old]), listed([new])
     if edge.how == "append":
         return f"{edge.reader} reads {after} behind {before}"

@@ -3,15 +3,12 @@
 import math
 
 import numpy as np
-import onnx
 import onnx_ir as ir
 
 from me2e_compress import graph, rewrite
 from me2e_compress.errors import PreconditionError
+from me2e_compress.graph.node_inference import REFUSALS, infer_node
 from me2e_compress.passes.parts import listed
-
-_SHOWN_BYTES = 1024
-"""Constants up to this size (shapes, axes) are shown to the shape inference."""
 
 
 def carry(model: ir.Model, grown: ir.Value, old: ir.Value, what: str) -> None:
@@ -74,42 +71,19 @@ def _reshape(
 
 
 def _inferred(model: ir.Model, node: ir.Node, what: str) -> dict[str, tuple[int, ...]]:
-    # Constants up to a limit are shown to the inference
-    opset = model.opset_imports.get(node.domain, 0)
-    read = [value for value in node.inputs if value is not None]
+    cause: Exception | None = None
     try:
-        schema = onnx.defs.get_schema(node.op_type, opset, node.domain)
-        found = onnx.shape_inference.infer_node_outputs(
-            schema,
-            ir.to_proto(node),
-            {str(value.name): _type(value) for value in read},
-            {str(v.name): held for v in read if (held := _held(v)) is not None},
-            opset_imports=[onnx.helper.make_opsetid(node.domain, opset)],
-        )
-    except (
-        onnx.defs.SchemaError,
-        onnx.shape_inference.InferenceError,
-        ValueError,
-    ) as error:
+        found = infer_node(node, graph.opset_of(model))
+    except REFUSALS as error:
+        found, cause = {}, error
+    if not found:
+        read = listed([value for value in node.inputs if value is not None])
         raise PreconditionError(
-            f"{what} does not fit {node.name} ({node.op_type}), which reads"
-            f" {listed(read)}"
-        ) from error
+            f"{what} does not fit {node.name} ({node.op_type}), which reads {read}"
+        ) from cause
     # Only static shapes count
     return {
         name: tuple(dim.dim_value for dim in kind.tensor_type.shape.dim)
         for name, kind in found.items()
         if all(dim.HasField("dim_value") for dim in kind.tensor_type.shape.dim)
     }
-
-
-def _type(value: ir.Value) -> onnx.TypeProto:
-    kind = value.dtype.value if value.dtype is not None else 0
-    return onnx.helper.make_tensor_type_proto(kind, graph.static_shape(value))
-
-
-def _held(value: ir.Value) -> onnx.TensorProto | None:
-    array = graph.array_of(value)
-    if array is None or array.nbytes > _SHOWN_BYTES:
-        return None
-    return onnx.numpy_helper.from_array(array)

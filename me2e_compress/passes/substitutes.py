@@ -1,6 +1,6 @@
 """Values that replace those whose nodes are removed."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,21 +44,6 @@ def result_of(model: ir.Model, part: Part, like: ir.Value | None = None) -> ir.V
             f" {listed(found)}"
         )
     return found[index]
-
-
-def depends(value: ir.Value, on: Collection[ir.Value]) -> bool:
-    """Return whether a value is one of others or computed from them."""
-    queue, seen = [value], {value}
-    while queue:
-        current = queue.pop()
-        if current in on:
-            return True
-        producer = current.producer()
-        for each in () if producer is None else producer.inputs:
-            if each is not None and each not in seen:
-                seen.add(each)
-                queue.append(each)
-    return False
 
 
 def is_shape_arithmetic(value: ir.Value) -> bool:

@@ -1,10 +1,9 @@
 """The cost of a node per frame, and its equivalent in bytes of the file."""
 
-import math
-
 import onnx_ir as ir
 
-from me2e_compress.graph import macs, static_shape
+from me2e_compress.graph import macs
+from me2e_compress.graph.activations import value_bytes
 from me2e_compress.graph.nodes import VIEWS
 
 BYTES_PER_NODE = 2048
@@ -30,13 +29,6 @@ def work(node: ir.Node) -> float:
     if node.op_type in VIEWS or node.op_type in ("Shape", "Size"):  # move no data
         return 1.0
     values = [*node.inputs, *node.outputs]
-    moved = sum(_bytes(value) for value in values if value is not None)
+    moved = sum(value_bytes(value) or 0 for value in values if value is not None)
     products = macs(node) or 0
     return 1.0 + products / MACS_PER_NODE + moved / MOVED_BYTES_PER_NODE
-
-
-def _bytes(value: ir.Value) -> int:
-    shape = static_shape(value)
-    if shape is None or value.dtype is None:
-        return 0
-    return math.ceil(math.prod(shape) * value.dtype.itemsize)

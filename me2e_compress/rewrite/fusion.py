@@ -125,14 +125,6 @@ class Kit:
         remove_node(root)
 
 
-def _no_objection(found: Match, facts: Facts) -> None:
-    return None
-
-
-def _always(found: Match, facts: Facts) -> bool:
-    return True
-
-
 @dataclasses.dataclass(frozen=True)
 class Fusion:
     """A pattern, a check and a rewrite.
@@ -156,12 +148,8 @@ class Fusion:
     name: str
     pattern: Pattern
     rewrite: Callable[[Match, Kit], str | None]
-    check: Callable[[Match, Facts], str | None] = dataclasses.field(
-        default_factory=lambda: _no_objection
-    )
-    where: Callable[[Match, Facts], bool] = dataclasses.field(
-        default_factory=lambda: _always
-    )
+    check: Callable[[Match, Facts], str | None] | None = None
+    where: Callable[[Match, Facts], bool] | None = None
 
 
 def needs_opset(what: str, version: int) -> Callable[[Match, Facts], str | None]:
@@ -255,9 +243,9 @@ class _Run:
         self, fusion: Fusion, node: ir.Node, body: ir.Graph, refused: Counter[str]
     ) -> bool:
         found = match(fusion.pattern, node)
-        if found is None or not fusion.where(found, self.facts):
+        if found is None or (fusion.where and not fusion.where(found, self.facts)):
             return False
-        reason = fusion.check(found, self.facts)
+        reason = fusion.check(found, self.facts) if fusion.check else None
         if reason is None:
             reason = fusion.rewrite(found, Kit(body, found, self.by, self.names))
         if reason is None:

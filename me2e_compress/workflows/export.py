@@ -212,7 +212,7 @@ def _record_shapes(model: ir.Model) -> None:
         before = left
         graph.infer_shapes(copy)
         sweep = Sweep(
-            copy.opset_imports, set(), set(), through_compute=False, trust_shapes=True
+            graph.opset_of(copy), set(), set(), through_compute=False, trust_shapes=True
         )
         sweep.run(copy.graph)
         left = _unshaped(copy)

@@ -1,6 +1,7 @@
 """Passes that misbehave, each in one way, and one that does not."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -11,241 +12,158 @@ from me2e_compress.passes.base import Context, Pass, PassResult
 
 
 @dataclass(frozen=True)
-class _Sample(Pass):
-    """Base of the samples.
+class Sample(Pass):
+    """Runs a function that changes the graph; it says how often it did."""
 
-    Given:   x
-    Result:  x
-    """
-
-    name: ClassVar[str] = "sample"
+    name: str  # type: ignore[misc]
+    edit: Callable[[ir.Model], int]
     exact: ClassVar[bool] = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        return PassResult(model, 0)
+        return PassResult(model, self.edit(model))
 
 
 @dataclass(frozen=True)
-class Idle(_Sample):
-    name: ClassVar[str] = "idle"
+class Lossy(Sample):
+    """Promises nothing."""
+
+    exact: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
-class DropsReluOfSigmoid(_Sample):
-    """Right: a sigmoid is never negative."""
-
-    name: ClassVar[str] = "drops-relu-of-sigmoid"
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        changes = 0
-        for node in list(model.graph):
-            source = node.inputs[0].producer() if node.inputs[0] else None
-            if node.op_type == "Relu" and source and source.op_type == "Sigmoid":
-                node.outputs[0].replace_all_uses_with(source.outputs[0])
-                model.graph.remove(node, safe=True)
-                changes += 1
-        return PassResult(model, changes)
-
-
-@dataclass(frozen=True)
-class TurnsTanhIntoSigmoid(_Sample):
+class TurnsTanhIntoSigmoid(Pass):
     """Wrong, and says it is exact."""
 
     name: ClassVar[str] = "turns-tanh-into-sigmoid"
+    exact: ClassVar[bool] = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        changes = 0
-        for node in model.graph:
-            if node.op_type == "Tanh":
-                node.op_type = "Sigmoid"
-                provenance.inherit(node, [node], by=self.name)
-                changes += 1
-        return PassResult(model, changes)
+        written = _write_sigmoid(model)
+        for node in written:
+            provenance.inherit(node, [node], by=self.name)
+        return PassResult(model, len(written))
 
 
-@dataclass(frozen=True)
-class Rounds(_Sample):
-    """Right, but for the last place of every weight."""
+def _write_sigmoid(model: ir.Model) -> list[ir.Node]:
+    tanhs = [node for node in model.graph if node.op_type == "Tanh"]
+    for node in tanhs:
+        node.op_type = "Sigmoid"
+    return tanhs
 
-    name: ClassVar[str] = "rounds"
 
-    def run(self, model: ir.Model, context: Context) -> PassResult:
+def _drop_relu(model: ir.Model) -> int:
+    changes = 0
+    for node in list(model.graph):
+        source = node.inputs[0].producer() if node.inputs[0] else None
+        if node.op_type == "Relu" and source and source.op_type == "Sigmoid":
+            node.outputs[0].replace_all_uses_with(source.outputs[0])
+            model.graph.remove(node, safe=True)
+            changes += 1
+    return changes
+
+
+def _break(model: ir.Model) -> int:
+    if any(node.op_type == "Tanh" for node in model.graph):
+        raise KeyError("no such value")
+    return 0
+
+
+def _rename_output(model: ir.Model) -> int:
+    model.graph.outputs[0].name = "other"
+    return 1
+
+
+def _make_up_a_past(model: ir.Model) -> int:
+    past = provenance.Provenance("backbone", ("/no/such/node",), ("makes-up-a-past",))
+    provenance.stamp(model.graph[0], past)
+    return 1
+
+
+def _forget(model: ir.Model) -> int:
+    del model.graph[0].metadata_props[provenance.ORIGINS]
+    return 1
+
+
+def _invalidate(model: ir.Model) -> int:
+    model.graph[0].op_type = "NoSuchOperator"
+    provenance.inherit(model.graph[0], [model.graph[0]], by="invalidates")
+    return 1
+
+
+def _swap_sizes(model: ir.Model) -> int:
+    shape = next(node for node in model.graph if node.op_type == "Shape")
+    if shape.inputs[0] is model.graph.inputs[1]:
+        return 0
+    shape.replace_input_with(0, model.graph.inputs[1])
+    provenance.inherit(shape, [shape], by="swaps-sizes")
+    return 1
+
+
+def _remove_dead(model: ir.Model) -> int:
+    dead = [node for node in model.graph if node.op_type == "NoSuchOperator"]
+    model.graph.remove(dead, safe=True)
+    return len(dead)
+
+
+def _swap_terms(model: ir.Model) -> int:
+    epsilon, sums = model.graph.initializers["e"], 0
+    for node in model.graph:
+        if node.op_type == "Add" and node.inputs[0] is epsilon:
+            node.replace_input_with(0, node.inputs[1])
+            node.replace_input_with(1, epsilon)
+            sums += 1
+    return sums
+
+
+def _of_weights(
+    change: Callable[[np.ndarray], np.ndarray],
+) -> Callable[[ir.Model], int]:
+    """Return the edit that writes other numbers into every weight."""
+
+    def edit(model: ir.Model) -> int:
         for value in model.graph.initializers.values():
             if value.const_value is not None:
-                data = np.nextafter(value.const_value.numpy(), np.float32(9e9))
-                value.const_value = ir.tensor(data, name=value.name)
-        return PassResult(model, len(model.graph.initializers))
+                array = change(value.const_value.numpy())
+                value.const_value = ir.tensor(array, name=value.name)
+        return len(model.graph.initializers)
+
+    return edit
 
 
-@dataclass(frozen=True)
-class Scales(_Sample):
-    """Multiplies every weight, and says it is exact."""
-
-    name: ClassVar[str] = "scales"
-    by: float = 1.0
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        for value in model.graph.initializers.values():
-            if value.const_value is not None:
-                data = value.const_value.numpy() * np.float32(self.by)
-                value.const_value = ir.tensor(data, name=value.name)
-        return PassResult(model, len(model.graph.initializers))
-
-
-@dataclass(frozen=True)
-class Breaks(_Sample):
-    name: ClassVar[str] = "breaks"
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        if any(node.op_type == "Tanh" for node in model.graph):
-            raise KeyError("no such value")
-        return PassResult(model, 0)
+IDLE = Sample("idle", lambda model: 0)
+DROPS_RELU = Sample("drops-relu-of-sigmoid", _drop_relu)
+"""Right: a sigmoid is never negative."""
+ROUNDS = Sample("rounds", _of_weights(lambda w: np.nextafter(w, np.float32(9e9))))
+"""Right, but for the last place of every weight."""
+SWAPS_TERMS = Sample("swaps-terms", _swap_terms)
+"""Right: a sum is the same in the other order."""
+REMOVES_DEAD = Sample("remove-dead", _remove_dead)
+HALVES = Lossy("halves", _of_weights(lambda w: w / np.float32(2)))
+BREAKS = Sample("breaks", _break)
+RENAMES_OUTPUT = Sample("renames-output", _rename_output)
+CLAIMS_TOO_MUCH = Sample("claims-too-much", lambda model: 3)
+DENIES_IT = Sample("denies-it", lambda model: 0 * len(_write_sigmoid(model)))
+LEAVES_NO_NAME = Sample("leaves-no-name", lambda model: len(_write_sigmoid(model)))
+MAKES_UP_A_PAST = Sample("makes-up-a-past", _make_up_a_past)
+FORGETS = Sample("forgets", _forget)
+INVALIDATES = Sample("invalidates", _invalidate)
+SWAPS_SIZES = Sample("swaps-sizes", _swap_sizes)
+"""Wrong where two open dimensions differ, and right where they are equal."""
 
 
-@dataclass(frozen=True)
-class Witness(_Sample):
-    """Writes down the shape of every value that it is shown."""
-
-    name: ClassVar[str] = "witness"
-    shapes: list[str] = field(default_factory=list)
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        values = [value for node in model.graph for value in node.outputs]
-        self.shapes.extend(str(value.shape) for value in values)
-        return PassResult(model, 0)
+def scales(by: float) -> Sample:
+    """Multiply every weight, and say that it is exact."""
+    return Sample("scales", _of_weights(lambda w: w * np.float32(by)))
 
 
-@dataclass(frozen=True)
-class RenamesOutput(_Sample):
-    name: ClassVar[str] = "renames-output"
+def leaves(axis: int) -> Sample:
+    """Write an axis that does not fit what its reader reads."""
 
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        model.graph.outputs[0].name = "other"
-        return PassResult(model, 1)
-
-
-@dataclass(frozen=True)
-class ClaimsTooMuch(_Sample):
-    name: ClassVar[str] = "claims-too-much"
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        return PassResult(model, 3)
-
-
-@dataclass(frozen=True)
-class DeniesIt(_Sample):
-    name: ClassVar[str] = "denies-it"
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        return PassResult(TurnsTanhIntoSigmoid().run(model, context).model, 0)
-
-
-@dataclass(frozen=True)
-class LeavesNoName(_Sample):
-    name: ClassVar[str] = "leaves-no-name"
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        return TurnsTanhIntoSigmoid().run(model, context)
-
-
-@dataclass(frozen=True)
-class MakesUpAPast(_Sample):
-    name: ClassVar[str] = "makes-up-a-past"
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        node = model.graph[0]
-        past = provenance.Provenance("backbone", ("/no/such/node",), (self.name,))
-        provenance.stamp(node, past)
-        return PassResult(model, 1)
-
-
-@dataclass(frozen=True)
-class Forgets(_Sample):
-    name: ClassVar[str] = "forgets"
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        del model.graph[0].metadata_props[provenance.ORIGINS]
-        return PassResult(model, 1)
-
-
-@dataclass(frozen=True)
-class Invalidates(_Sample):
-    name: ClassVar[str] = "invalidates"
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        model.graph[0].op_type = "NoSuchOperator"
-        provenance.inherit(model.graph[0], [model.graph[0]], by=self.name)
-        return PassResult(model, 1)
-
-
-@dataclass(frozen=True)
-class Halves(_Sample):
-    """Lossy: halves every weight."""
-
-    name: ClassVar[str] = "halves"
-    exact: ClassVar[bool] = False
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        for value in model.graph.initializers.values():
-            if value.const_value is not None:
-                data = value.const_value.numpy() * np.float32(0.5)
-                value.const_value = ir.tensor(data, name=value.name)
-        return PassResult(model, len(model.graph.initializers), ("halved",))
-
-
-@dataclass(frozen=True)
-class SwapsSizes(_Sample):
-    """Wrong where two open dimensions differ, and right where they are equal."""
-
-    name: ClassVar[str] = "swaps-sizes"
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        shape = next(node for node in model.graph if node.op_type == "Shape")
-        if shape.inputs[0] is model.graph.inputs[1]:
-            return PassResult(model, 0)
-        shape.replace_input_with(0, model.graph.inputs[1])
-        provenance.inherit(shape, [shape], by=self.name)
-        return PassResult(model, 1)
-
-
-@dataclass(frozen=True)
-class RemovesDead(_Sample):
-    name: ClassVar[str] = "remove-dead"
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        dead = [node for node in model.graph if node.op_type == "NoSuchOperator"]
-        model.graph.remove(dead, safe=True)
-        return PassResult(model, len(dead))
-
-
-@dataclass(frozen=True)
-class Leaves(_Sample):
-    """Writes an attribute or an axis that does not fit what a node reads."""
-
-    name: ClassVar[str] = "leaves"
-    axes: int = 0
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
+    def edit(model: ir.Model) -> int:
         axes = model.graph.initializers["axes"]
-        if axes.const_value is None or int(axes.const_value.numpy()[0]) == self.axes:
-            return PassResult(model, 0)
-        axes.const_value = ir.tensor(np.array([self.axes]), name="axes")
+        axes.const_value = ir.tensor(np.array([axis]), name="axes")
         reader = next(iter(axes.consumers()))
-        provenance.inherit(reader, [reader], by=self.name)
-        return PassResult(model, 1)
+        provenance.inherit(reader, [reader], by="leaves")
+        return 1
 
-
-@dataclass(frozen=True)
-class SwapsTerms(_Sample):
-    """Right: a sum is the same in the other order."""
-
-    name: ClassVar[str] = "swaps-terms"
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        epsilon, sums = model.graph.initializers["e"], 0
-        for node in model.graph:
-            if node.op_type == "Add" and node.inputs[0] is epsilon:
-                node.replace_input_with(0, node.inputs[1])
-                node.replace_input_with(1, epsilon)
-                sums += 1
-        return PassResult(model, sums)
+    return Sample("leaves", edit)

@@ -24,7 +24,7 @@ def test_a_pass_s_graph_is_written_once_for_checker_and_inference(
     for home in (shapes, attempt):
         monkeypatch.setattr(home, "without_weights", noted)
     monkeypatch.setattr("me2e_compress.graph.validity.without_weights", noted)
-    chosen = (passes.DropsReluOfSigmoid(),)
+    chosen = (passes.DROPS_RELU,)
     PassManager(chosen, verify_frames=0).run(ir.from_onnx_text(CHAIN), context)
 
     assert len(written) == 3  # as given, imported, rewritten

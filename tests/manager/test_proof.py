@@ -26,7 +26,7 @@ MIXED = """m (float[n,4] x, float[1,8] s) => (float[n,4] y, float[1,8] t)
 
 
 def test_an_open_dimension_is_run_at_two_sizes(context: Context) -> None:
-    (check,) = checks(MIXED, context, passes.Rounds())
+    (check,) = checks(MIXED, context, passes.ROUNDS)
     assert check.sizes == ({"n": 2}, {"n": 3})
     assert check.fed == "synthetic, n=2 and n=3"
     assert set(check.errors) == {"y", "t"}
@@ -34,7 +34,7 @@ def test_an_open_dimension_is_run_at_two_sizes(context: Context) -> None:
 
 def test_a_wrong_pass_is_found_out_behind_an_open_dimension(context: Context) -> None:
     with pytest.raises(VerificationError, match=r"scales promises .* changed y by"):
-        checks(MIXED, context, passes.Scales(1.01))
+        checks(MIXED, context, passes.scales(1.01))
 
 
 def test_open_dimensions_are_given_different_sizes(context: Context) -> None:
@@ -43,7 +43,7 @@ def test_open_dimensions_are_given_different_sizes(context: Context) -> None:
         ["/backbone/Neg"] u = Neg(z)
     }"""
     with pytest.raises(VerificationError, match="swaps-sizes promises"):
-        checks(text, context, passes.SwapsSizes())
+        checks(text, context, passes.SWAPS_SIZES)
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_open_dimensions_are_given_different_sizes(context: Context) -> None:
 def test_sizes_are_drawn_until_the_graph_runs(
     text: str, sizes: tuple[dict[str, int], ...], context: Context
 ) -> None:
-    (check,) = checks(text, context, passes.Idle())
+    (check,) = checks(text, context, passes.IDLE)
     assert check.sizes == sizes
     assert check.unproven is None
 
@@ -80,7 +80,7 @@ def test_a_graph_that_runs_at_no_size_is_not_proven(context: Context) -> None:
     text = """m (float[n,4] x) => (float[7,997] y) <int64[2] odd = {7, 997}> {
         ["/backbone/Reshape"] y = Reshape(x, odd)
     }"""
-    (check,) = checks(text, context, passes.Idle())
+    (check,) = checks(text, context, passes.IDLE)
     assert "runs at none of the sizes that were tried for n (" in (check.unproven or "")
     assert "--set-dim" in (check.unproven or "")
 
@@ -89,12 +89,12 @@ def test_inputs_that_are_no_numbers_are_not_proven(context: Context) -> None:
     text = """m (string[2] x) => (string[2] y) {
         ["/backbone/Identity"] y = Identity(x)
     }"""
-    (check,) = checks(text, context, passes.Idle())
+    (check,) = checks(text, context, passes.IDLE)
     assert check.unproven == "input x is STRING: seeded inputs are numbers"
 
 
 def test_what_is_checked_on_no_frame_is_not_proven(context: Context) -> None:
-    (check,) = checks(MIXED, context, passes.Rounds(), frames=0)
+    (check,) = checks(MIXED, context, passes.ROUNDS, frames=0)
     assert check.passes == ("import-normalize", "rounds")
     assert check.unproven == "no frame was asked for (--verify-frames 0)"
 
@@ -105,7 +105,7 @@ def test_passes_before_a_graph_could_run_are_not_proven(context: Context) -> Non
         ["/backbone/Mul"] y = Mul(x, w)
     }"""
     first, second = checks(
-        text, context, passes.Rounds(), passes.RemovesDead(), passes.Rounds()
+        text, context, passes.ROUNDS, passes.REMOVES_DEAD, passes.ROUNDS
     )
     assert first.passes == ("import-normalize", "rounds", "remove-dead")
     assert "no operator" in (first.unproven or "")
@@ -118,7 +118,7 @@ def test_an_output_that_is_drawn_at_every_run_is_named(context: Context) -> None
         ["/backbone/Add"] noise = Add(r, x)
         ["/backbone/Neg"] y = Neg(x)
     }"""
-    (check,) = checks(text, context, passes.Idle())
+    (check,) = checks(text, context, passes.IDLE)
     assert check.random == ("noise",)
     assert check.judged == ("y",)
     assert check.left_out == "noise: another at every run"
@@ -128,7 +128,7 @@ def test_where_every_output_is_drawn_nothing_is_proven(context: Context) -> None
     text = """m (float[64] x) => (float[64] noise) {
         ["/backbone/Noise"] noise = RandomNormalLike(x)
     }"""
-    (check,) = checks(text, context, passes.Idle())
+    (check,) = checks(text, context, passes.IDLE)
     assert check.unproven == "noise: another at every run"
 
 
@@ -145,7 +145,7 @@ def test_a_wrong_axis_is_caught_without_a_run(
     axis: int, reason: str, context: Context
 ) -> None:
     with pytest.raises(VerificationError, match=rf"leaves left node .*Sum.*{reason}"):
-        checks(REDUCED, context, passes.Leaves(axis), frames=0)
+        checks(REDUCED, context, passes.leaves(axis), frames=0)
 
 
 NORM = """m (float[4,8] x) => (float[4,8] y)
@@ -168,7 +168,7 @@ NORM = """m (float[4,8] x) => (float[4,8] y)
 def test_what_onnxruntime_itself_changes_is_no_fault_of_a_pass(
     context: Context,
 ) -> None:
-    (check,) = checks(NORM, context, passes.SwapsTerms())
+    (check,) = checks(NORM, context, passes.SWAPS_TERMS)
     assert check.errors["y"] < 1e-6
     (remark,) = check.remarks
     assert "another y of the graph before the passes at its level basic" in remark

@@ -155,7 +155,7 @@ def test_the_result_tells_nodes_and_rules() -> None:
     assert found.rules() == {"scope": 2, "neighbour": 1}
     assert [node.outputs[0].name for node in found.nodes("det")] == ["b", "y"]
     assert found.module_of(model.graph[0]) == "neck"
-    assert found.rule_of(model.graph[2]) == "neighbour"
+    assert found.placements[model.graph[2]].rule == "neighbour"
 
 
 def test_a_required_pattern_that_matches_nothing_is_an_error() -> None:

@@ -1,13 +1,6 @@
 import onnx_ir as ir
 
-from me2e_compress.modules import (
-    Item,
-    ModuleMap,
-    WeightEntry,
-    assign,
-    inventory,
-    itemise,
-)
+from me2e_compress.modules import Item, ModuleMap, assign, itemise
 
 MAP = ModuleMap.parse(
     '[modules.neck]\nrole = "feature"\noptional = ["neck"]\n'
@@ -87,32 +80,3 @@ def test_int8_weights_are_parameters() -> None:
     weight.const_value = ir.tensor([1, 2], dtype=ir.DataType.INT8)
     neck = itemise(graph, MAP, assign(graph, MAP).module_of)[0]
     assert (neck.parameters, neck.weight_bytes) == (2, 2)
-
-
-def test_inventory_tells_what_is_there_more_and_less() -> None:
-    graph = model()
-    graph.graph.initializers["shared"].name = "onnx::Add_12"
-    found = inventory(
-        graph,
-        MAP,
-        assign(graph, MAP).module_of,
-        {
-            "neck.w": 2,
-            "det.w": 4,
-            "idle": 3,
-            "neck.bn.running_mean": 2,
-            "neck.bn.num_batches_tracked": 1,
-        },
-    )
-    assert found.present == (WeightEntry("neck.w", "neck", 2, "parameter"),)
-    assert found.missing == (
-        WeightEntry("det.w", "det", 4, "parameter"),
-        WeightEntry("idle", None, 3, "parameter"),
-        WeightEntry("neck.bn.running_mean", "neck", 2, "batch-norm statistics"),
-        WeightEntry("neck.bn.num_batches_tracked", "neck", 1, "batch-norm counter"),
-    )
-    assert found.extra == (
-        WeightEntry("size", "det", 1, "integer constant"),
-        WeightEntry("idle", None, 2, "constant"),
-        WeightEntry("onnx::Add_12", "det", 2, "renamed weight"),
-    )

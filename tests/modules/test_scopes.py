@@ -1,7 +1,7 @@
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.modules import exits, scope_of
+from me2e_compress.modules import scope_of
 
 
 def node(name: str, output: str = "", **props: str) -> ir.Node:
@@ -50,17 +50,3 @@ def test_dynamo_metadata() -> None:
 def test_metadata_without_a_scope(scopes: str) -> None:
     flat = node("/a/div", **{"pkg.torch.onnx.name_scopes": scopes})
     assert scope_of(flat) == ""
-
-
-def test_exits_are_what_the_rest_of_the_graph_reads() -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 8, opset_import: ["": 17]>'
-        "g (float[2] x) => (float[2] y, float[2] c) {"
-        ' ["/head/a/Relu"] a = Relu(x) ["/head/a/Neg"] b = Neg(a)'
-        ' ["/head/a/Abs"] c = Abs(b) ["/plan/Exp"] d = Exp(b)'
-        ' ["/plan/Sub"] y = Sub(d, a) }'
-    )
-    assert [value.name for value in exits(model, "*.a")] == ["a", "b", "c"]
-    assert [value.name for value in exits(model, "head.a")] == ["a", "b", "c"]
-    assert [value.name for value in exits(model, "plan")] == ["y"]
-    assert exits(model, "nothing") == ()

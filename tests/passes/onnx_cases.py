@@ -21,18 +21,6 @@ ROUNDINGS = 8
 """How far passes may move an output, in units of the last place of its largest number:
 where they let onnxruntime fuse attention, it sums in another order (3 units)."""
 
-REASONS = {
-    "is not a registered function/op": "no such operator",
-    "No Op registered for": "no such operator",
-    "Unrecognized attribute": "no such attribute",
-    ") of operator (": "no such type",
-    "NOT_IMPLEMENTED": "no kernel",
-    "Exception during initialization": "its kernel cannot do that",
-    "while running": "its kernel cannot do that",
-    "bound to different types": "its function body does not fit",
-}
-"""What onnxruntime says, and why it does not run a case."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Case:
@@ -233,12 +221,6 @@ def _read(value: onnxruntime.OrtValue) -> Any:
             raw_data=ctypes.string_at(value.data_ptr(), value.tensor_size_in_bytes()),
         )
     )
-
-
-def reason(refusal: Exception) -> str:
-    """Sort what onnxruntime says; give it as it is where nobody has sorted it yet."""
-    said = str(refusal)
-    return next((why for part, why in REASONS.items() if part in said), said)
 
 
 def differs(case: Case, found: Sequence[Any]) -> str | None:

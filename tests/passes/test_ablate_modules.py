@@ -86,11 +86,6 @@ def test_readers_of_a_dropped_module_read_zeros(stack: ir.Model) -> None:
     assert not provenance.missing(result.model)
 
 
-def test_outputs_of_a_dropped_module_are_kept_from_harm(stack: ir.Model) -> None:
-    with pytest.raises(PreconditionError, match=r"map makes the outputs lanes: .*true"):
-        AblateModules(drop=("map",)).run(stack, context())
-
-
 def test_outputs_go_where_that_was_asked_for(stack: ir.Model) -> None:
     chosen = AblateModules(drop=("map",), drop_outputs=True)
 
@@ -142,29 +137,54 @@ def test_a_substitute_of_the_same_elements_is_reshaped(stack: ir.Model) -> None:
     np.testing.assert_array_equal(run, [[[0, 0, 4, 6]]])
 
 
+OPEN = STACK.replace("float[1,4] camera", "float[n,4] camera")
+SIZED = STACK.replace(
+    '["/planner/look/Reshape"] seen = Reshape(lanes, flat)',
+    '["/map/Shape"] size = Shape(f)\n["/planner/look/Reshape"] seen = Reshape(f, size)',
+)
+NO_MAP = AblateModules(drop=("map",), drop_outputs=True)
+NO_AGENTS = AblateModules(drop=("agents",))
+NEITHER = replace(NO_MAP, drop=("map", "agents"))
+
+
 @pytest.mark.parametrize(
-    ("scope", "by", "message"),
+    ("chosen", "substitutes", "message"),
     [
-        ("*.nowhere", "*.meet", r"no value leaves a scope \*\.nowhere"),
-        ("*.look", "*.nowhere", r"no value leaves a scope \*\.nowhere"),
-        ("*.look", "map", "nothing that leaves map fits ego_map"),
-        ("agents", "*.meet", "cannot substitute for agents: it reads its result"),
+        (AblateModules(drop=("map",)), "", r"map makes the outputs lanes: .*true"),
+        (replace(NO_MAP, drop=("map", "planner")), "", "every output: plan, lanes"),
+        (NO_MAP, substitute("*.nowhere", "*.meet"), r"leaves a scope \*\.nowhere"),
+        (NO_MAP, substitute("*.look", "*.nowhere"), r"leaves a scope \*\.nowhere"),
+        (NO_MAP, substitute("*.look", "map"), "nothing that leaves map fits ego_map"),
+        (NO_MAP, substitute("agents", "*.meet"), "for agents: it reads its result"),
+        (NEITHER, substitute("*.look", "agents"), "of module agents, which is dropped"),
     ],
 )
-def test_a_substitute_that_does_not_fit_is_refused(
-    stack: ir.Model, scope: str, by: str, message: str
+def test_what_does_not_fit_the_graph_is_refused(
+    stack: ir.Model, chosen: AblateModules, substitutes: str, message: str
 ) -> None:
-    chosen = AblateModules(drop=("map",), drop_outputs=True)
-
     with pytest.raises(PreconditionError, match=message):
-        chosen.run(stack, context(substitute(scope, by)))
+        chosen.run(stack, context(substitutes))
 
 
-def test_a_dropped_substitute_is_refused(stack: ir.Model) -> None:
-    chosen = AblateModules(drop=("map", "agents"), drop_outputs=True)
-
-    with pytest.raises(PreconditionError, match="of module agents, which is dropped"):
-        chosen.run(stack, context(substitute("*.look", "agents")))
+@pytest.mark.parametrize(
+    ("chosen", "text", "error", "message"),
+    [
+        (NO_AGENTS, OPEN, PreconditionError, r"agents has shape .*fold-constants"),
+        (NO_MAP, SIZED, PreconditionError, "size is arithmetic on shapes"),
+        (replace(NO_AGENTS, fill="means"), STACK, FramesError, r"frames .*means=FILE"),
+        (
+            replace(NO_AGENTS, means=Path("m.npz")),
+            STACK,
+            RecipeError,
+            "means goes with fill=means only",
+        ),
+    ],
+)
+def test_a_value_that_nobody_can_fill_in_is_refused(
+    chosen: AblateModules, text: str, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        chosen.run(net(text, {}), context())
 
 
 def test_a_kept_scope_stays(stack: ir.Model) -> None:
@@ -177,38 +197,12 @@ def test_a_kept_scope_stays(stack: ir.Model) -> None:
         AblateModules(drop=("agents",), keep=("*.lane",)).run(stack, context())
 
 
-def test_dropping_everything_that_is_an_output_is_refused(stack: ir.Model) -> None:
-    chosen = AblateModules(drop=("map", "planner"), drop_outputs=True)
-
-    with pytest.raises(PreconditionError, match="makes every output: plan, lanes"):
-        chosen.run(stack, context())
-
-
 def test_unknown_and_absent_modules_are_named(stack: ir.Model) -> None:
     with pytest.raises(ModuleMapError, match=r"occ: .*backbone, agents, map, planner"):
         AblateModules(drop=("occ",)).run(stack, context())
     once = AblateModules(drop=("agents",)).run(stack, context()).model
     with pytest.raises(PreconditionError, match=r"module agents; .*backbone, map, pl"):
         AblateModules(drop=("agents",)).run(once, context())
-
-
-def test_shapes_must_be_static() -> None:
-    open_stack = net(STACK.replace("float[1,4] camera", "float[n,4] camera"), {})
-
-    with pytest.raises(PreconditionError, match=r"agents has shape .*fold-constants"):
-        AblateModules(drop=("agents",)).run(open_stack, context())
-
-
-def test_arithmetic_on_shapes_is_not_zeroed() -> None:
-    text = STACK.replace(
-        '["/planner/look/Reshape"] seen = Reshape(lanes, flat)',
-        '["/map/Shape"] size = Shape(f)\n'
-        '["/planner/look/Reshape"] seen = Reshape(f, size)',
-    )
-    chosen = AblateModules(drop=("map",), drop_outputs=True)
-
-    with pytest.raises(PreconditionError, match="size is arithmetic on shapes"):
-        chosen.run(net(text, {}), context())
 
 
 @pytest.fixture
@@ -262,16 +256,6 @@ def test_means_from_a_file_go_before_frames(
     assert f"agents reads as its mean in {file}" in result.notes
 
 
-def test_a_mean_is_never_made_up(stack: ir.Model) -> None:
-    with pytest.raises(FramesError, match=r"needs recorded frames .*means=FILE"):
-        AblateModules(drop=("agents",), fill="means").run(stack, context())
-
-
-def test_a_file_of_means_goes_with_means_only(stack: ir.Model) -> None:
-    with pytest.raises(RecipeError, match="means goes with fill=means only"):
-        AblateModules(drop=("agents",), means=Path("m.npz")).run(stack, context())
-
-
 @pytest.mark.parametrize(
     ("name", "array", "error", "words"),
     [
@@ -307,15 +291,10 @@ def test_means_of_another_graph(
 
 
 def test_shapes_have_no_mean(recording: CalibrationSet) -> None:
-    text = STACK.replace(
-        '["/planner/look/Reshape"] seen = Reshape(lanes, flat)',
-        '["/map/Shape"] size = Shape(f)\n'
-        '["/planner/look/Reshape"] seen = Reshape(f, size)',
-    )
-    chosen = AblateModules(drop=("map",), fill="means", drop_outputs=True)
-
     with pytest.raises(PreconditionError, match="size is arithmetic on shapes"):
-        chosen.run(net(text, {}), replace(context(), frames=recording))
+        replace(NO_MAP, fill="means").run(
+            net(SIZED, {}), replace(context(), frames=recording)
+        )
 
 
 SHARED = STACK.replace(

@@ -7,7 +7,7 @@ from me2e_compress.graph import static_shape
 from me2e_compress.manager import PassManager
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.passes.attach_bodies import AttachBodies
-from me2e_compress.passes.expand_operators import ExpandOperators
+from me2e_compress.passes.fused_nodes import ExpandOperators
 from tests.passes.decomposed import Sizes, decomposed
 from tests.passes.small import NO_MODULES, apply, compute, ops, read
 

@@ -29,10 +29,6 @@ class Sample(Pass):
         return PassResult(model, 0)
 
 
-def test_options_are_those_that_differ() -> None:
-    assert Sample(limit=3, drop=()).options() == {"limit": 3}
-
-
 def test_files_are_the_paths_that_are_set() -> None:
     assert Sample().files() == ()
     assert Sample(means=Path("m.npz")).files() == (Path("m.npz"),)

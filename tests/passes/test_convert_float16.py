@@ -98,34 +98,40 @@ def test_without_keep_io_inputs_and_outputs_are_half() -> None:
     assert casts(half) == 0
 
 
-@pytest.mark.parametrize(
-    ("body", "weights", "operator"),
-    [
-        ("y = Exp(a)", {}, "Exp"),
-        ("y = Softmax(a)", {}, "Softmax"),  # over 2,000 elements
-        ("y = Add(a, c)", {"c": -1e9}, "Add"),
-        ("y = Add(a, c)", {"c": 1e-12}, "Add"),
-        ("y = trt.Plugin(a)", {}, "Plugin"),
-    ],
-)
-def test_what_stays_in_float32(
-    body: str, weights: dict[str, float], operator: str
-) -> None:
-    constant = ", float c" if weights else ""
-    text = f"g (float[4,2000] x{constant}) => (float[4,2000] y) {{ a = Relu(x)\n"
-    half = converted(f"{text}{body}}}", weights)
-
-    assert types_of(half) == {"Relu": "FLOAT16", operator: "FLOAT"}
-
-
-def test_a_short_softmax_is_half() -> None:
-    half = converted("s (float[4,1024] x) => (float[4,1024] y) { y = Softmax(x) }")
-
-    assert types_of(half) == {"Softmax": "FLOAT16"}
-
-
-def test_positions_and_what_they_are_computed_with_stay_in_float32() -> None:
-    half = converted(
+TYPES: dict[str, tuple[str, dict[str, str]]] = {
+    "an exponential": (
+        "g (float[4] x) => (float[4] y) { a = Relu(x) y = Exp(a) }",
+        {"Relu": "FLOAT16", "Exp": "FLOAT"},
+    ),
+    "a long softmax": (
+        "g (float[4,2000] x) => (float[4,2000] y) { a = Relu(x) y = Softmax(a) }",
+        {"Relu": "FLOAT16", "Softmax": "FLOAT"},
+    ),
+    "a short softmax": (
+        "g (float[4,1024] x) => (float[4,1024] y) { y = Softmax(x) }",
+        {"Softmax": "FLOAT16"},
+    ),
+    "a mask": (
+        "g (float[4] x) => (float[4] y) <float c = {-1e9}> { y = Add(x, c) }",
+        {"Add": "FLOAT"},
+    ),
+    "an epsilon": (
+        "g (float[4] x) => (float[4] y) <float c = {1e-12}> { y = Add(x, c) }",
+        {"Add": "FLOAT"},
+    ),
+    "a default of an input": (
+        "g (float[2] x, float[2] c = {-1e9, 0}) => (float[2] y) { y = Add(x, c) }",
+        {"Add": "FLOAT"},
+    ),
+    "a plugin": (
+        "g (float[4] x) => (float[4] y) { a = Relu(x) y = trt.Plugin(a) }",
+        {"Relu": "FLOAT16", "Plugin": "FLOAT"},
+    ),
+    "a comparison": (
+        "c (float[4] x, float[4] t) => (bool[4] y) { y = Greater(x, t) }",
+        {"Greater": "FLOAT"},
+    ),
+    "positions, and what they are computed with": (
         """p (float[1,4,8,8] f, float[1,2,2,2] ref, float[1,2,2,8] q, float[8,2] w,
                float[1,4,4] lidar2img) => (float[1,4,2,2] y) <float two = {2.0}> {
             value = Relu(f)
@@ -133,17 +139,46 @@ def test_positions_and_what_they_are_computed_with_stay_in_float32() -> None:
             at = Add(ref, offset)
             grid = Mul(at, two)
             y = GridSample(value, grid)
-        }"""
-    )
+        }""",
+        {
+            "Relu": "FLOAT16",
+            **dict.fromkeys(("MatMul", "Add", "Mul", "GridSample"), "FLOAT"),
+        },
+    ),
+    "an LSTM": (
+        "r (float[5,1,6] x, float[1,32,6] w, float[1,32,8] r)"
+        " => (float[5,1,1,8] y) { y = LSTM<hidden_size=8>(x, w, r) }",
+        {"LSTM": "FLOAT16"},
+    ),
+    "a GRU": (
+        "r (float[5,1,6] x, float[1,24,6] w, float[1,24,8] r)"
+        " => (float[5,1,1,8] y) { y = GRU<hidden_size=8>(x, w, r) }",
+        {"GRU": "FLOAT16"},
+    ),
+    "what is made like an input": (
+        "m (float[2,2] x) => (float[2,2] y) { a = Relu(x) y = EyeLike(a) }",
+        {"Relu": "FLOAT16", "EyeLike": "FLOAT"},
+    ),
+    "what is drawn like an input": (
+        "m (float[2,2] x) => (float[2,2] y) { a = Relu(x) y = RandomNormalLike(a) }",
+        {"Relu": "FLOAT16", "RandomNormalLike": "FLOAT"},
+    ),
+}
 
-    assert types_of(half) == {
-        "Relu": "FLOAT16", "MatMul": "FLOAT", "Add": "FLOAT", "Mul": "FLOAT",
-        "GridSample": "FLOAT",
-    }  # fmt: skip
+
+@pytest.mark.parametrize("case", TYPES)
+def test_what_becomes_float16_and_what_stays(case: str) -> None:
+    text, wanted = TYPES[case]
+
+    half = converted(text)
+
+    assert types_of(half) == wanted
+    if case != "a plugin":
+        onnx.checker.check_model(ir.to_proto(half), full_check=True)
 
 
-def test_a_camera_matrix_reaches_the_projection_unrounded() -> None:
-    half = converted(
+CASTS: dict[str, tuple[str, int]] = {
+    "a camera matrix reaches the projection unrounded": (
         """p (float[1,4,8,8] f, float[1,2,4] lidar2img, float[4,2] points)
             => (float[1,4,1,2] y) {
             row = Transpose<perm=[0,1,2]>(lidar2img)
@@ -152,25 +187,25 @@ def test_a_camera_matrix_reaches_the_projection_unrounded() -> None:
             grid = Reshape(pixel, shape)
             y = GridSample(f, grid)
         }""",
-        {"points": np.ones((4, 2))},
-    )
+        0,
+    ),
+    "moves between float32": (
+        "m (float[4,2] x) => (float[2,4] y) { a = Exp(x) b = Transpose(a) y = Log(b) }",
+        0,
+    ),
+    "one for both readers, one for either output": (
+        "m (float[4,4] x) => (float[4,4] y, float[4,4] z)"
+        " { a = Exp(x) y = Relu(a) z = Sigmoid(a) }",
+        3,
+    ),
+}
 
-    assert casts(half) == 0
 
+@pytest.mark.parametrize("case", CASTS)
+def test_no_more_casts_than_needed(case: str) -> None:
+    text, count = CASTS[case]
 
-def test_comparisons_are_made_of_what_was_compared() -> None:
-    half = converted("c (float[4] x, float[4] t) => (bool[4] y) { y = Greater(x, t) }")
-
-    assert types_of(half) == {"Greater": "FLOAT"}
-
-
-def test_moves_between_float32_have_no_casts() -> None:
-    half = converted(
-        "m (float[4,2] x) => (float[2,4] y)"
-        " { a = Exp(x)\n b = Transpose(a)\n y = Log(b) }"
-    )
-
-    assert casts(half) == 0
+    assert casts(converted(text)) == count
 
 
 def test_what_a_half_and_a_float_reader_share_is_moved_in_half() -> None:
@@ -207,15 +242,6 @@ def test_what_is_no_number_of_one_type_stays(body: str) -> None:
     model = bare(OPSET.replace("17", "26") + text, {})
 
     assert check_pass(ConvertFloat16(), model).changes == 0
-
-
-def test_readers_share_a_cast() -> None:
-    half = converted(
-        "m (float[4,4] x) => (float[4,4] y, float[4,4] z)"
-        " { a = Exp(x)\n y = Relu(a)\n z = Sigmoid(a) }"
-    )
-
-    assert casts(half) == 3  # one for both readers, one for either output
 
 
 def test_numbers_that_the_frames_show_to_be_too_large(tmp_path: Path) -> None:
@@ -274,17 +300,6 @@ def test_no_such_module() -> None:
         )
 
 
-@pytest.mark.parametrize("cell", ["LSTM", "GRU"])
-def test_recurrent_layers_are_half(cell: str) -> None:
-    gates = {"LSTM": 4, "GRU": 3}[cell] * 8
-    half = converted(
-        f"r (float[5,1,6] x, float[1,{gates},6] w, float[1,{gates},8] r)"
-        f" => (float[5,1,1,8] y) {{ y = {cell}<hidden_size=8>(x, w, r) }}",
-    )
-
-    assert types_of(half) == {cell: "FLOAT16"}
-
-
 def test_a_weight_that_float32_reads_too_is_stored_in_both() -> None:
     half = converted(
         """w (float[1,4,8,8] f, float[2,2,2,8] q, float[8,2] w, float[3,8] z)
@@ -340,22 +355,6 @@ def test_an_input_and_its_default_are_of_one_type(*, keep_io: bool) -> None:
     assert io["v"] == io["u"] == FLOAT  # so do an Exp, and a body
     np.testing.assert_allclose(y, [20, 48], rtol=2e-3)
     np.testing.assert_allclose(z, [4 + np.exp(3), 8 + np.exp(4)], rtol=2e-3)
-
-
-def test_a_default_that_float16_does_not_hold_stays_in_float32() -> None:
-    text = "m (float[2] x, float[2] c = {-1e9, 0}) => (float[2] y) { y = Add(x, c) }"
-
-    assert types_of(converted(text, keep_io=False)) == {"Add": "FLOAT"}
-
-
-@pytest.mark.parametrize("operator", ["EyeLike", "RandomNormalLike"])
-def test_what_is_made_like_an_input_keeps_its_type(operator: str) -> None:
-    half = converted(
-        f"m (float[2,2] x) => (float[2,2] y) {{ a = Relu(x)\n y = {operator}(a) }}"
-    )
-
-    assert types_of(half) == {"Relu": "FLOAT16", operator: "FLOAT"}
-    onnx.checker.check_model(ir.to_proto(half), full_check=True)
 
 
 def test_a_scale_stays_where_the_output_has_a_type_of_its_own() -> None:

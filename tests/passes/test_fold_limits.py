@@ -1,6 +1,6 @@
 """Folding computes nothing that is larger than it may be."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import onnx_ir as ir
@@ -33,7 +33,7 @@ def test_a_value_beyond_the_limit_stays_computed(
     rows = list[int]()
 
     def evaluate(
-        values: Sequence[ir.Value], known: Knowledge, opsets: Mapping[str, int]
+        values: Sequence[ir.Value], known: Knowledge, opset: int
     ) -> tuple[dict[ir.Value, Array], list[ir.Node]]:
         made = [one.nodes[0].outputs[0] for one in known.expressions]
         rows.extend((static_shape(each) or (0,))[0] for each in made)

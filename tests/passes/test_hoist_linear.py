@@ -264,22 +264,3 @@ def test_a_copy_for_every_camera_is_multiplied_once() -> None:
     )  # fmt: skip
     assert products(model) == 4 * QUERIES * WIDE**2
     assert ops(model) == ["Relu", "MatMul", "Add", "Concat"]
-
-
-@pytest.mark.parametrize("version", [11, 17])
-def test_layers_that_share_what_they_read_merge_if_asked(version: int) -> None:
-    text = graph_of(
-        "(float[20,16] x) => (float[20,8] q, float[20,8] k, float[20,4] v)",
-        "a = MatMul(x, wq)  q = Add(a, bq)  k = MatMul(x, wk)"
-        " c = Gemm<transB = 1>(x, wv, bv)  v = Relu(c)",
-        version,
-    )
-    weights = {
-        "wq": normal(16, 8), "bq": normal(8), "wk": normal(16, 8),
-        "wv": normal(4, 16), "bv": normal(4),
-    }  # fmt: skip
-    assert apply(HoistLinear(), read(text, **weights)).changes == 0
-    model = read(text, **weights)
-    assert apply(HoistLinear(merge_shared=True), model).changes == 3
-    assert ops(model) == ["MatMul", "Add", "Split", "Relu"]
-    assert difference(model, text, weights) < 1e-5

@@ -4,9 +4,8 @@ import pytest
 
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
-from me2e_compress.passes.expand_operators import ExpandOperators
+from me2e_compress.passes.fused_nodes import ExpandOperators, TranslatePlugins
 from me2e_compress.passes.import_normalize import with_own_domains
-from me2e_compress.passes.translate_plugins import TranslatePlugins
 from tests.passes.small import NO_MODULES, apply, compute, ops, read
 
 OPSET = """<ir_version: 9, opset_import: ["" : 17, "trt.plugins" : 1, "mmdeploy" : 1]>

@@ -99,8 +99,8 @@ def test_a_second_run_that_claims_and_changes_nothing_is_explained(
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
-        (passes.Idle(), "docstring lacks Given: and Result:"),
-        (passes.Forgets(), "docstring lacks Given: and Result:"),
+        (passes.IDLE, "docstring lacks Given: and Result:"),
+        (passes.FORGETS, "docstring lacks Given: and Result:"),
     ],
 )
 def test_a_pass_without_given_and_result_is_caught(

@@ -11,7 +11,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.stream import Recording
 from me2e_compress.graph import is_standard, provenance, static_shape
-from me2e_compress.graph.nodes import Numbers, constant_values, numbers_of
+from me2e_compress.graph.nodes import LAYOUT_OPERATORS, Numbers, constant_values
 from me2e_compress.passes.convert_float16.element_types import ElementTypes
 from me2e_compress.quantization.coordinates import position_arithmetic
 from me2e_compress.runtime.providers import CPU, Provider
@@ -49,13 +49,10 @@ _CHOICES = frozenset(
 _PLACES = frozenset({"DeformConv", "Det", "GridSample", "Range", "RoiAlign"})
 """Operators that take coordinates beside their data."""
 
-_MOVES = frozenset(
-    {
-        "Concat", "Expand", "Flatten", "Gather", "GatherElements", "GatherND",
-        "Identity", "Pad", "Reshape", "ScatterElements", "ScatterND", "Slice", "Split",
-        "Squeeze", "Tile", "Transpose", "Unsqueeze",
-    }
-)  # fmt: skip
+_MOVES = LAYOUT_OPERATORS | {
+    "Concat", "Expand", "Gather", "GatherElements", "GatherND", "Pad",
+    "ScatterElements", "ScatterND", "Slice", "Split", "Tile",
+}  # fmt: skip
 """What only moves elements: it is as exact in either type."""
 
 
@@ -124,11 +121,9 @@ def _by_operator(node: ir.Node) -> str | None:
 
 def _by_constants(node: ir.Node, types: ElementTypes) -> str | None:
     for index in types.inputs(node):
-        value = node.inputs[index]
-        numbers = numbers_of(value)
-        if numbers is None and value is not None and value.const_value is not None:
-            numbers = value.const_value.numpy().astype(np.float64)  # an input's default
-        if numbers is not None and not _fits(numbers):
+        value = node.inputs[index]  # the default of an input counts as well
+        tensor = None if value is None else ir.convenience.get_const_tensor(value)
+        if tensor is not None and not _fits(tensor.numpy().astype(np.float64)):
             return "a constant that float16 does not hold"
     return None
 

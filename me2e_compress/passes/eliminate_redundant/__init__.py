@@ -3,14 +3,13 @@
 import dataclasses
 import hashlib
 from collections import Counter
-from collections.abc import Mapping
 from typing import ClassVar
 
 import onnx_ir as ir
 import onnx_ir.passes.common as common
 
-from me2e_compress.graph import array_of, infer_shapes, provenance
-from me2e_compress.graph.nodes import DRAWS
+from me2e_compress.graph import array_of, infer_shapes, opset_of, provenance
+from me2e_compress.graph.nodes import DRAWS, attribute_values
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.eliminate_redundant.identities import identity_of
 from me2e_compress.passes.eliminate_redundant.merges import MergeSite, merge
@@ -68,15 +67,8 @@ def _key(node: ir.Node, module: str) -> object:
     inputs = [id(value) for value in node.inputs]
     if node.op_type in COMMUTATIVE:
         inputs.sort()
-    # Serialized attributes compare by value
-    attributes = tuple(
-        ir.serde.serialize_attribute(node.attributes[name]).SerializeToString(
-            deterministic=True
-        )
-        for name in sorted(node.attributes)
-    )
     named = tuple(bool(value.name) for value in node.outputs)
-    return (node.op_type, tuple(inputs), named, attributes, module)
+    return (node.op_type, tuple(inputs), named, attribute_values(node), module)
 
 
 def share_initializers(graph: ir.Graph) -> int:
@@ -150,7 +142,7 @@ class EliminateRedundant(Pass):
             before, branches = tally.total(), tally["branches"]
             outputs = list(model.graph.outputs)
             for body in graphs_of(model.graph):
-                self._round(body, model.opset_imports, tally)
+                self._round(body, opset_of(model), tally)
             if tally["branches"] > branches or outputs != list(model.graph.outputs):
                 infer_shapes(model)  # in a branch less is known; of an output, more
             tally["unread"] += remove_dead(model.graph)
@@ -160,10 +152,8 @@ class EliminateRedundant(Pass):
         tally["functions and opsets"] += _remove_unused(model)
         return PassResult(model, tally.total(), _notes(tally))
 
-    def _round(
-        self, body: ir.Graph, opsets: dict[str, int], tally: Counter[str]
-    ) -> None:
-        site = MergeSite(body, opsets, self.name)
+    def _round(self, body: ir.Graph, opset: int, tally: Counter[str]) -> None:
+        site = MergeSite(body, opset, self.name)
         tally["initializers"] += share_initializers(body)
         work = dict.fromkeys(reversed(list(body)))
         while work:
@@ -183,7 +173,7 @@ class EliminateRedundant(Pass):
             remove_node(node)
             tally["unread"] += 1
             return makers
-        inlined = _inline_branch(node, site.opsets, self.name)
+        inlined = _inline_branch(node, site.opset, self.name)
         if inlined is not None:
             tally["branches"] += 1
             return inlined
@@ -218,9 +208,7 @@ def _notes(tally: Counter[str]) -> tuple[str, ...]:
     return ("removed: " + ", ".join(found),) if found else ()
 
 
-def _inline_branch(
-    node: ir.Node, opsets: Mapping[str, int], by: str
-) -> list[ir.Node] | None:
+def _inline_branch(node: ir.Node, opset: int, by: str) -> list[ir.Node] | None:
     """Replace an If whose condition is known by the nodes of its branch.
 
     It stays (None) where its branch passes an outer value on as a graph output, or
@@ -243,7 +231,7 @@ def _inline_branch(
         outside = new.producer() is not None and new.graph is not branch
         if outside and not can_replace(old, new):
             return None
-    if not branch_fits(node, branch, opsets):
+    if not branch_fits(node, branch, opset):
         return None
     # Move the nodes out and rewire their readers
     nodes = list(branch)

@@ -5,7 +5,7 @@ node itself, now unread, where nothing is left of it), or None where it does not
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 import onnx_ir as ir
@@ -63,15 +63,10 @@ class MergeSite:
     """A graph that is being rewritten, and the constants made for it so far."""
 
     graph: ir.Graph
-    opsets: Mapping[str, int]
+    opset: int
     by: str
     shapes: dict[tuple[int, ...], ir.Value] = dataclasses.field(default_factory=dict)
     names: set[str] = dataclasses.field(default_factory=set)
-
-    @property
-    def opset(self) -> int:
-        """The version of the standard operators."""
-        return self.opsets.get("", self.opsets.get("ai.onnx", 0))
 
     def shape(self, sizes: tuple[int, ...], reader: ir.Node) -> ir.Value:
         """Return the initializer of a shape, named uniquely after its first reader."""

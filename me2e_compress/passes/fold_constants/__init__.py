@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 from collections import Counter
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -35,7 +34,7 @@ __all__ = ["FoldConstants"]
 @dataclasses.dataclass
 class _Tally:
     lifted: int = 0
-    seated: int = 0
+    reshaped: int = 0
     dead: int = 0
     folded: int = 0
     stored: int = 0
@@ -45,7 +44,7 @@ class _Tally:
 
     @property
     def changes(self) -> int:
-        return self.lifted + self.seated + self.dead + self.folded
+        return self.lifted + self.reshaped + self.dead + self.folded
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,8 +75,9 @@ class FoldConstants(Pass):
         # Normalize first: Constant nodes and bounds of Range
         tally = _Tally(lifted=lift_constants(model))
         declared = [value.shape for value in model.graph.outputs]
+        opset = graphs.opset_of(model)
         for body in graphs_of(model.graph):
-            tally.seated += _seat_ranges(body, model.opset_imports, self.name)
+            tally.reshaped += _reshape_bounds(body, opset, self.name)
         # Fold until nothing changes
         before = -1
         while tally.changes > before:
@@ -85,21 +85,19 @@ class FoldConstants(Pass):
             tally.dead += remove_dead(model.graph)
             tally.kept = 0
             for body in list(graphs_of(model.graph)):
-                self._fold(body, model.opset_imports, tally, trust=body is model.graph)
+                self._fold(body, opset, tally, trust=body is model.graph)
         # Shapes of graph outputs may have become known
         found = [value.shape for value in model.graph.outputs]
         refined = sum(a is not b for a, b in zip(declared, found, strict=True))
         return PassResult(model, tally.changes + refined, _notes(tally))
 
-    def _fold(
-        self, body: ir.Graph, opsets: dict[str, int], tally: _Tally, *, trust: bool
-    ) -> None:
+    def _fold(self, body: ir.Graph, opset: int, tally: _Tally, *, trust: bool) -> None:
         refused: set[ir.Node] = set()
         fresh: set[ir.Value] = set()
         while True:
             # Collect constant expressions and choose what to store
             known = Sweep(
-                opsets,
+                opset,
                 refused,
                 fresh,
                 through_compute=self.through_compute,
@@ -108,7 +106,7 @@ class FoldConstants(Pass):
             choice = choose(known, self.bytes_per_node)
             # Evaluate the choice; start over if it taught new shapes or failed
             asked = [value for value in choice.values if value not in known.arrays]
-            found, failed = evaluation.evaluate(asked, known, opsets)
+            found, failed = evaluation.evaluate(asked, known, opset)
             tally.refused.update(node.op_type for node in failed)
             refused.update(failed)
             if failed or _learn(asked, found):
@@ -170,13 +168,13 @@ def _commit(
     # Store each value once for all nodes that compute it
     for value in choice.values:
         one, index = place[value]
-        answers = any(node.outputs[index].is_graph_output() for node in one.nodes)
-        label = f"{value.name}_value" if answers else value.name or ""
+        is_output = any(node.outputs[index].is_graph_output() for node in one.nodes)
+        label = f"{value.name}_value" if is_output else value.name or ""
         weight = stored.add(arrays[value], label)
         for node in one.nodes:
             equal = node.outputs[index]
             if equal.is_graph_output():
-                _answer(graph, node, equal, weight, name)
+                _keep_output(graph, node, equal, weight, name)
             else:
                 equal.replace_all_uses_with(weight)
     # Remove the nodes, readers first
@@ -200,22 +198,22 @@ class _Store:
         return self.known[key]
 
 
-def _answer(
+def _keep_output(
     graph: ir.Graph, node: ir.Node, value: ir.Value, weight: ir.Value, name: str
 ) -> None:
     if len(node.outputs) == 1:
         put(node, "Identity", [weight], by=name)
         return
     label = f"{node.name}_{node.outputs.index(value)}"
-    answer = ir.node("Identity", [weight], num_outputs=1, name=label)
-    graph.insert_after(node, answer)
-    provenance.inherit(answer, [node], by=name)
-    new = answer.outputs[0]
+    identity = ir.node("Identity", [weight], num_outputs=1, name=label)
+    graph.insert_after(node, identity)
+    provenance.inherit(identity, [node], by=name)
+    new = identity.outputs[0]
     new.name, new.type, new.shape = value.name, value.type, value.shape
     replace_value(value, new)
 
 
-def _seat_ranges(graph: ir.Graph, opsets: Mapping[str, int], by: str) -> int:
+def _reshape_bounds(graph: ir.Graph, opset: int, by: str) -> int:
     """Reshape vectors that an If passes to a Range to scalars, and count them.
 
     ONNX's own function bodies pass a vector of one element through an If to a Range,
@@ -227,12 +225,12 @@ def _seat_ranges(graph: ir.Graph, opsets: Mapping[str, int], by: str) -> int:
     Result:  If -> n -> Reshape to a scalar -> Range(0, n, 1)
     """
     choices = [node for node in graph if node.op_type == "If"]
-    return sum(_seat(node, graph, opsets, by) for node in choices)
+    return sum(_reshape_bounds_of(node, graph, opset, by) for node in choices)
 
 
-def _seat(choice: ir.Node, graph: ir.Graph, opsets: Mapping[str, int], by: str) -> int:
+def _reshape_bounds_of(choice: ir.Node, graph: ir.Graph, opset: int, by: str) -> int:
     branches = [attribute.as_graph() for attribute in choice.attributes.values()]
-    if all(branch_fits(choice, branch, opsets) for branch in branches):
+    if all(branch_fits(choice, branch, opset) for branch in branches):
         return 0
     # Find the ranges that read a result of the If
     bounds = [

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 
 import onnx_ir as ir
 
-from me2e_compress.graph import static_shape
+from me2e_compress.graph.activations import value_bytes
 from me2e_compress.passes.fold_constants.knowledge import Expression, Knowledge
 from me2e_compress.passes.fold_constants.min_cut import FlowNetwork
 from me2e_compress.passes.work import work
@@ -42,25 +42,25 @@ def choose(known: Knowledge, bytes_per_node: int) -> FoldChoice:
     A connected group that does not grow the weights is folded as a whole.
     """
     # Solve each group of connected expressions on its own
-    market = _Market(known, bytes_per_node)
+    prices = _Prices(known, bytes_per_node)
     gone: set[Expression] = set()
-    for lot in market.lots():
-        gone.update(lot if market.growth(lot) <= 0 else market.cheapest(lot))
+    for group in prices.groups():
+        gone.update(group if prices.growth(group) <= 0 else prices.cheapest(group))
     # Store what remaining nodes still read
     values = [
         value
         for one in known.expressions
         if one in gone
         for value in one.nodes[0].outputs
-        if market.is_wanted(value, gone)
+        if prices.is_wanted(value, gone)
     ]
     kept = sum(len(one.nodes) for one in known.expressions if one not in gone)
-    growth = sum(map(market.value_bytes, values)) - market.freed(gone)
+    growth = sum(map(prices.value_bytes, values)) - prices.freed(gone)
     chosen = [one for one in known.expressions if one in gone]
     return FoldChoice(values, chosen, kept, int(growth))
 
 
-class _Market:
+class _Prices:
     """Prices of the values of one graph, and who reads them."""
 
     def __init__(self, known: Knowledge, bytes_per_node: int) -> None:
@@ -85,8 +85,8 @@ class _Market:
             if value.const_value is not None and self._dies(value)
         }
 
-    def growth(self, lot: Iterable[Expression]) -> float:
-        gone = set(lot)
+    def growth(self, group: Iterable[Expression]) -> float:
+        gone = set(group)
         made = (value for one in gone for value in one.nodes[0].outputs)
         stored = sum(self.value_bytes(value) for value in made if value in self.outside)
         return stored - self.freed(gone)
@@ -106,17 +106,15 @@ class _Market:
         array = self.known.arrays.get(value)
         if array is not None:
             return array.nbytes + ENTRY_BYTES
-        shape = static_shape(value)
-        if shape is None or value.dtype is None:
-            return 0
-        return math.prod(shape) * value.dtype.itemsize + ENTRY_BYTES
+        known = value_bytes(value)
+        return 0 if known is None else known + ENTRY_BYTES
 
-    def cheapest(self, lot: list[Expression]) -> list[Expression]:
+    def cheapest(self, group: list[Expression]) -> list[Expression]:
         network = FlowNetwork()
         source, sink = network.vertex(), network.vertex()
         # Edges for nodes that stay and for values that are stored
-        place = {one: network.vertex() for one in lot}
-        for one in lot:  # one that stays is paid for in every frame
+        place = {one: network.vertex() for one in group}
+        for one in group:  # one that stays is paid for in every frame
             price = self.rate * sum(map(work, one.nodes))
             network.edge(source, place[one], price)
             for value in one.nodes[0].outputs:  # one that goes: what it stores
@@ -128,16 +126,16 @@ class _Market:
                     for reader in self.readers[value]:
                         network.edge(stored, place[reader])
         # A weight stays while any of its readers stays
-        read = [value for one in lot for value in one.inputs if value in self.weights]
+        read = [value for one in group for value in one.inputs if value in self.weights]
         for value in dict.fromkeys(read):  # a weight that somebody reads stays
             weight = network.vertex()
             network.edge(source, weight, self.weights[value])
             for reader in self.readers[value]:
                 network.edge(weight, place[reader])
         side = network.cut(source, sink)
-        return [one for one in lot if place[one] in side]
+        return [one for one in group if place[one] in side]
 
-    def lots(self) -> list[list[Expression]]:
+    def groups(self) -> list[list[Expression]]:
         parent = {one: one for one in self.known.expressions}
 
         # Union-find over the expressions

@@ -18,7 +18,7 @@ SILENT = 4
 
 
 def evaluate(
-    values: Sequence[ir.Value], known: Knowledge, opsets: Mapping[str, int]
+    values: Sequence[ir.Value], known: Knowledge, opset: int
 ) -> tuple[dict[ir.Value, Array], list[ir.Node]]:
     """Return the computed values, and the nodes that the runtime refused.
 
@@ -28,16 +28,16 @@ def evaluate(
     if not needed:
         return {}, []
     try:
-        return _run(needed, list(values), known.arrays, known, opsets), []
+        return _run(needed, list(values), known.arrays, known, opset), []
     except REFUSALS:
-        return _one_by_one(needed, values, known, opsets)
+        return _one_by_one(needed, values, known, opset)
 
 
 def _one_by_one(
     needed: Sequence[Expression],
     values: Sequence[ir.Value],
     known: Knowledge,
-    opsets: Mapping[str, int],
+    opset: int,
 ) -> tuple[dict[ir.Value, Array], list[ir.Node]]:
     done: dict[ir.Value, Any] = dict(known.arrays)
     refused: list[ir.Node] = []
@@ -48,7 +48,7 @@ def _one_by_one(
         if any(value in known.maker and value not in done for value in inputs):
             continue
         try:
-            done.update(_run([one], outputs, done, known, opsets))
+            done.update(_run([one], outputs, done, known, opset))
         except REFUSALS:
             refused.extend(one.nodes)
     found = {value: done[value] for value in values if value in done}
@@ -72,7 +72,7 @@ def _run(
     values: Sequence[ir.Value],
     arrays: Mapping[ir.Value, Any],
     known: Knowledge,
-    opsets: Mapping[str, int],
+    opset: int,
 ) -> dict[ir.Value, Any]:
     names: dict[ir.Value, str] = {}
     feeds: dict[str, Any] = {}
@@ -85,7 +85,7 @@ def _run(
             [_port(name, array) for name, array in feeds.items()],
             [onnx.ValueInfoProto(name=names[value]) for value in values],
         ),
-        opset_imports=[onnx.helper.make_opsetid(*item) for item in opsets.items()],
+        opset_imports=[onnx.helper.make_opsetid("", opset)],
         ir_version=8,
     )
     # No optimization: run exactly the nodes as written

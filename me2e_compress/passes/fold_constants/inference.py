@@ -5,15 +5,15 @@ from collections.abc import Mapping
 import onnx
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of
+from me2e_compress.graph import array_of, node_inference
 from me2e_compress.graph.shapes import refined
-from me2e_compress.rewrite import Array, is_standard
+from me2e_compress.rewrite import Array
 
 
-def infer_node(
+def learn_shapes(
     node: ir.Node,
     known: Mapping[ir.Value, Array],
-    opsets: Mapping[str, int],
+    opset: int,
     *,
     trust_shapes: bool = True,
 ) -> bool:
@@ -22,13 +22,13 @@ def infer_node(
     Use ``trust_shapes=False`` in loops, whose outputs may change shape between rounds.
     """
     try:
-        found = _ask(node, known, {}, opsets)
-    except (onnx.shape_inference.InferenceError, onnx.checker.ValidationError):
+        found = node_inference.infer_node(node, opset, known=known.get)
+    except node_inference.REFUSALS:
         return False
     return _record(node, found, answers=trust_shapes)
 
 
-def branch_fits(node: ir.Node, branch: ir.Graph, opsets: Mapping[str, int]) -> bool:
+def branch_fits(node: ir.Node, branch: ir.Graph, opset: int) -> bool:
     """Return whether an If's readers would be valid if they read a branch directly.
 
     An If hides the shapes of its branches: a reader may work only because of that (a
@@ -36,12 +36,10 @@ def branch_fits(node: ir.Node, branch: ir.Graph, opsets: Mapping[str, int]) -> b
     """
     instead = dict(zip(node.outputs, branch.outputs, strict=True))
     readers = dict.fromkeys(use.node for value in instead for use in value.uses())
-    return all(_accepts(reader, instead, opsets) for reader in readers)
+    return all(_accepts(reader, instead, opset) for reader in readers)
 
 
-def _accepts(
-    node: ir.Node, instead: Mapping[ir.Value, ir.Value], opsets: Mapping[str, int]
-) -> bool:
+def _accepts(node: ir.Node, instead: Mapping[ir.Value, ir.Value], opset: int) -> bool:
     arrays = {
         value: array
         for value in node.inputs
@@ -49,8 +47,8 @@ def _accepts(
         and (array := array_of(_origin(instead.get(value, value)))) is not None
     }
     try:
-        _ask(node, arrays, instead, opsets)
-    except (onnx.shape_inference.InferenceError, onnx.checker.ValidationError):
+        node_inference.infer_node(node, opset, known=arrays.get, instead=instead)
+    except node_inference.REFUSALS:
         return False
     return True
 
@@ -61,36 +59,6 @@ def _origin(value: ir.Value) -> ir.Value:
         value = maker.inputs[0]
         maker = value.producer()
     return value
-
-
-def _ask(
-    node: ir.Node,
-    known: Mapping[ir.Value, Array],
-    instead: Mapping[ir.Value, ir.Value],
-    opsets: Mapping[str, int],
-) -> Mapping[str, onnx.TypeProto]:
-    version = opsets.get("", opsets.get("ai.onnx", 0))
-    if not is_standard(node) or not onnx.defs.has(node.op_type, version):
-        return {}
-    # Types of all inputs, and data of the known ones
-    types: dict[str, onnx.TypeProto] = {}
-    data: dict[str, onnx.TensorProto] = {}
-    for value in node.inputs:
-        if value is None:
-            continue
-        source = instead.get(value, value)
-        if source.type is None or not value.name:
-            return {}
-        types[value.name] = ir.serde.serialize_value(source).type
-        if value in known:
-            data[value.name] = onnx.numpy_helper.from_array(known[value], value.name)
-    return onnx.shape_inference.infer_node_outputs(
-        onnx.defs.get_schema(node.op_type, version),
-        ir.serde.serialize_node(node),
-        types,
-        data,
-        opset_imports=[onnx.helper.make_opsetid("", version)],
-    )
 
 
 def _record(

@@ -2,15 +2,15 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, static_shape
-from me2e_compress.graph.nodes import DRAWS
+from me2e_compress.graph.activations import value_bytes
+from me2e_compress.graph.nodes import DRAWS, attribute_values
 from me2e_compress.passes.fold_constants import table
-from me2e_compress.passes.fold_constants.inference import infer_node
+from me2e_compress.passes.fold_constants.inference import learn_shapes
 from me2e_compress.passes.fold_constants.table import NATIVE
 from me2e_compress.rewrite import Array, has_subgraph, is_standard
 
@@ -68,15 +68,14 @@ class Sweep:
 
     def __init__(
         self,
-        opsets: Mapping[str, int],
+        opset: int,
         refused: set[ir.Node],
         fresh: set[ir.Value],
         *,
         through_compute: bool,
         trust_shapes: bool,
     ) -> None:
-        self.opsets = opsets
-        self.opset = opsets.get("", opsets.get("ai.onnx", 0))
+        self.opset = opset
         self.refused = refused
         self.through_compute = through_compute
         self.trust_shapes = trust_shapes
@@ -111,7 +110,7 @@ class Sweep:
         if node.op_type == "Dropout" and not _is_inference(node, self.opset):
             return False
         # Bodies may read outer values
-        if has_subgraph(node) or not node.inputs or _is_answer(node):
+        if has_subgraph(node) or not node.inputs or _is_constant_output(node):
             return False
         return all(value is None or self._known(value) for value in node.inputs)
 
@@ -148,12 +147,14 @@ class Sweep:
             if value is not None:
                 self._known(value)
         arrays, trust = self.known.arrays, self.trust_shapes
-        if infer_node(node, arrays, self.opsets, trust_shapes=trust):
+        if learn_shapes(node, arrays, self.opset, trust_shapes=trust):
             self.learnt.update(outputs)
 
     def _add(self, node: ir.Node) -> None:
         named = [value for value in node.outputs if value.name]
-        if not all(_is_native(each) and _bytes(each) <= LARGEST for each in named):
+        if not all(
+            _is_native(each) and (value_bytes(each) or 0) <= LARGEST for each in named
+        ):
             return
         # Group nodes of equal operator, inputs and attributes
         small = self._evaluate(node)
@@ -161,7 +162,7 @@ class Sweep:
             None if value is None else self.known.canonical(value)
             for value in node.inputs
         )
-        key = _key(node, inputs)
+        key = (node.op_type, inputs, len(node.outputs), attribute_values(node))
         equal = self.keys.get(key)
         if equal is None:
             equal = Expression([], inputs)
@@ -213,7 +214,7 @@ def _shape(node: ir.Node, shape: tuple[int, ...]) -> Array:
     return np.array(shape[start:end], dtype=np.int64)
 
 
-def _is_answer(node: ir.Node) -> bool:
+def _is_constant_output(node: ir.Node) -> bool:
     if node.op_type != "Identity" or not node.outputs[0].is_graph_output():
         return False
     return node.inputs[0] is not None and node.inputs[0].is_initializer()
@@ -225,22 +226,5 @@ def _is_native(value: ir.Value) -> bool:
     return value.dtype in NATIVE
 
 
-def _bytes(value: ir.Value) -> float:
-    shape = static_shape(value)
-    if shape is None or value.dtype is None:
-        return 0
-    return math.prod(shape) * value.dtype.itemsize
-
-
 def _is_inference(node: ir.Node, opset: int) -> bool:
     return opset >= 7 and (len(node.inputs) < 3 or node.inputs[2] is None)
-
-
-def _key(node: ir.Node, inputs: tuple[ir.Value | None, ...]) -> object:
-    attributes = [
-        ir.serde.serialize_attribute(node.attributes[name]).SerializeToString(
-            deterministic=True
-        )
-        for name in sorted(node.attributes)
-    ]
-    return (node.op_type, inputs, len(node.outputs), tuple(attributes))

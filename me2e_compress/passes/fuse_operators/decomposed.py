@@ -18,7 +18,7 @@ from me2e_compress.graph.nodes import (
     producer_of,
     sole_reader,
 )
-from me2e_compress.passes.fuse_operators.digits import (
+from me2e_compress.passes.digits import (
     Digit,
     Digits,
     flat,

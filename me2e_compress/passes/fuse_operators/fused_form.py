@@ -9,6 +9,14 @@ import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
+from me2e_compress.passes.digits import (
+    Digit,
+    Layout,
+    flat,
+    sizes,
+    split_like,
+    whole,
+)
 from me2e_compress.passes.fuse_operators.decomposed import (
     BATCH,
     CHANNEL,
@@ -16,14 +24,6 @@ from me2e_compress.passes.fuse_operators.decomposed import (
     PIXEL,
     XY,
     Decomposed,
-)
-from me2e_compress.passes.fuse_operators.digits import (
-    Digit,
-    Layout,
-    flat,
-    sizes,
-    split_like,
-    whole,
 )
 from me2e_compress.passes.fuse_operators.laid_out import combined, laid_out
 from me2e_compress.passes.fuse_operators.operand_sources import (

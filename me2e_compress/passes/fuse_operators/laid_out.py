@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import onnx_ir as ir
 
 from me2e_compress.operators import FusedCall
-from me2e_compress.passes.fuse_operators.digits import (
+from me2e_compress.passes.digits import (
     Digit,
     Layout,
     flat,

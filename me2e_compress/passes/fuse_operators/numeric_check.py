@@ -9,8 +9,8 @@ from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import array_of, digest, opset_of
 from me2e_compress.graph.nodes import Array
 from me2e_compress.operators import OWN_DOMAIN, expand
+from me2e_compress.passes.digits import flat, sizes
 from me2e_compress.passes.fuse_operators.decomposed import XY
-from me2e_compress.passes.fuse_operators.digits import flat, sizes
 from me2e_compress.passes.fuse_operators.views import View
 from me2e_compress.runtime.session import Session
 

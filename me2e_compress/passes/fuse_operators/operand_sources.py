@@ -4,8 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 
-from me2e_compress.passes.fuse_operators.decomposed import LEVEL, PIXEL, XY
-from me2e_compress.passes.fuse_operators.digits import (
+from me2e_compress.passes.digits import (
     Digit,
     Layout,
     flat,
@@ -14,6 +13,7 @@ from me2e_compress.passes.fuse_operators.digits import (
     split_like,
     whole,
 )
+from me2e_compress.passes.fuse_operators.decomposed import LEVEL, PIXEL, XY
 from me2e_compress.passes.fuse_operators.views import (
     Selection,
     View,

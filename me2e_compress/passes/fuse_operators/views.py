@@ -16,7 +16,7 @@ from me2e_compress.graph.nodes import (
     producer_of,
     sole_reader,
 )
-from me2e_compress.passes.fuse_operators.digits import Digits, Layout, regrouped
+from me2e_compress.passes.digits import Digits, Layout, regrouped
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,6 @@ from me2e_compress.passes.hoist_linear.least_work import Prices
 from me2e_compress.passes.hoist_linear.linear_layers import layer_at
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.repeated_rows import do_before_repeats
-from me2e_compress.passes.hoist_linear.shared_sources import merge_layers
 from me2e_compress.passes.work import BYTES_PER_NODE
 from me2e_compress.rewrite import graphs_of, remove_dead, value_names
 
@@ -31,14 +30,12 @@ class _Tally:
     products: int = 0
     others: int = 0
     operands: int = 0
-    merged: int = 0
     unread: int = 0
     macs: int = 0
 
     @property
     def changes(self) -> int:
-        moved = self.products + self.others + self.operands
-        return moved + self.merged + self.unread
+        return self.products + self.others + self.operands + self.unread
 
     def notes(self) -> tuple[str, ...]:
         found = []
@@ -49,8 +46,6 @@ class _Tally:
             found.append(
                 f"moved {counted(self.others, 'other node')} before repeated rows"
             )
-        if self.merged:
-            found.append(f"merged {counted(self.merged, 'layer')} by a shared input")
         if self.unread:
             found.append(f"removed what nothing reads: {self.unread}")
         return tuple(found)
@@ -75,15 +70,11 @@ class HoistLinear(Pass):
 
     Attributes:
         bytes_per_node: how many bytes of new weights the work of one node may cost.
-        merge_shared: merge the layers of a module that read the same value (queries,
-            keys and values) into one and split the result; off, since onnxruntime is
-            slower that way from 300 rows on, and int8 would share one range.
     """
 
     name: ClassVar[str] = "hoist-linear"
     exact: ClassVar[bool] = True
     bytes_per_node: int = BYTES_PER_NODE
-    merge_shared: bool = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Rewrite every node that has a cheaper form, until none has."""
@@ -95,13 +86,10 @@ class HoistLinear(Pass):
         rewriters = [
             Rewriter(each, names, self.name) for each in graphs_of(model.graph)
         ]
-        # Merge layers only when nothing else moves
         for _ in range(ROUNDS):
             before = tally.changes
             for rewriter in rewriters:
                 self._round(rewriter, opset, tally)
-            if self.merge_shared and tally.changes == before:
-                tally.merged += sum(merge_layers(each, opset) for each in rewriters)
             if tally.changes == before:
                 break
             remove_dead(model.graph)

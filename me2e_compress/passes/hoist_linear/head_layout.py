@@ -11,10 +11,12 @@ import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.nodes import VIEWS, permutation_of
+from me2e_compress.passes.digits import Digit, Layout, flat, regrouped, whole
 from me2e_compress.rewrite import is_standard, scalar_of, sole_maker
 
-Atom = tuple[int, int, int]
-"""A piece of an axis of the rows: axis, number of steps, length of a step."""
+BATCH_OR_TOKENS = ("0", "1")
+CHANNELS = "2"
+"""The axes of the rows, by number."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,13 +70,12 @@ def layout_of(operand: ir.Value) -> HeadLayout | None:
     if not nodes or shape is None or len(shape) != 3:
         return None
     # Then apply the views to the axes of the rows
-    axes = [[(axis, size, 1)] if size > 1 else [] for axis, size in enumerate(shape)]
+    layout: Layout | None = tuple(whole(str(at), size) for at, size in enumerate(shape))
     for node in reversed(nodes):
-        moved = _view(axes, node)
-        if moved is None:
-            return None
-        axes = moved
-    return _read(value, shape, axes, tuple(nodes), scale)
+        layout = None if layout is None else _moved(layout, node)
+    if layout is None:
+        return None
+    return _read(value, shape, layout, tuple(nodes), scale)
 
 
 def _factor(node: ir.Node) -> float | None:
@@ -86,64 +87,42 @@ def _factor(node: ir.Node) -> float | None:
     return right if left is None else left
 
 
-def _view(axes: list[list[Atom]], node: ir.Node) -> list[list[Atom]] | None:
+def _moved(layout: Layout, node: ir.Node) -> Layout | None:
+    """Return the layout after a view; after a scaling it is the same."""
     shape = static_shape(node.outputs[0])
     if node.op_type == "Transpose":
         order = permutation_of(node)
-        return None if order is None else [axes[axis] for axis in order]
-    return None if shape is None else _regroup(axes, shape)
-
-
-def _regroup(axes: list[list[Atom]], shape: tuple[int, ...]) -> list[list[Atom]] | None:
-    atoms = [atom for axis in axes for atom in axis][::-1]
-    found: list[list[Atom]] = []
-    for size in shape:
-        axis: list[Atom] = []
-        # Take atoms from the front, and split the last if it divides
-        while size > 1:
-            if not atoms:
-                return None
-            of, count, step = atoms.pop()
-            if size % count == 0:
-                axis.append((of, count, step))
-                size //= count
-            elif count % size == 0:
-                inner = count // size
-                axis.append((of, size, step * inner))
-                atoms.append((of, inner, step))
-                size = 1
-            else:
-                return None
-        found.append(axis)
-    return None if atoms else found
+        return None if order is None else tuple(layout[axis] for axis in order)
+    return None if shape is None else regrouped(layout, shape)
 
 
 def _read(
     value: ir.Value,
     shape: tuple[int, ...],
-    axes: list[list[Atom]],
+    layout: Layout,
     nodes: tuple[ir.Node, ...],
     scale: float,
 ) -> HeadLayout | None:
-    if len(axes) < 2 or len(axes[-1]) != 1 or len(axes[-2]) != 1:
+    if len(layout) < 2 or len(layout[-1]) != 1 or len(layout[-2]) != 1:
         return None
     # The last two axes must be tokens and channels
-    turned = axes[-2][0][0] == 2
-    channels, tokens = axes[-2 if turned else -1][0], axes[-1 if turned else -2][0]
-    heads = shape[2] // channels[1]
-    batch_axis = 1 - tokens[0]
+    turned = layout[-2][0].axis == CHANNELS
+    channels, tokens = layout[-2 if turned else -1][0], layout[-1 if turned else -2][0]
+    if channels.axis != CHANNELS or tokens.axis not in BATCH_OR_TOKENS:
+        return None
+    heads, batch_axis = shape[2] // channels.size, 1 - int(tokens.axis)
     # The axes before them must be batch and heads
-    lead = [(batch_axis, shape[batch_axis], 1)]
+    lead = whole(str(batch_axis), shape[batch_axis])
     if heads > 1:
-        lead.append((2, heads, channels[1]))
+        lead = (*lead, Digit(CHANNELS, channels.size, heads))
     if (
-        batch_axis not in (0, 1)
-        or channels != (2, channels[1], 1)
-        or tokens != (tokens[0], shape[tokens[0]], 1)
-        or [atom for axis in axes[:-2] for atom in axis] != lead
+        shape[batch_axis] == 1
+        or channels.stride != 1
+        or (tokens,) != whole(tokens.axis, shape[1 - batch_axis])
+        or flat(layout[:-2]) != lead
     ):
         return None
     return HeadLayout(
         value, nodes, scale, batch_axis,
-        shape[batch_axis], heads, tokens[1], channels[1], turned,
+        shape[batch_axis], heads, tokens.size, channels.size, turned,
     )  # fmt: skip

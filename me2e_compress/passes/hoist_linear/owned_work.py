@@ -6,6 +6,7 @@ import math
 import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
+from me2e_compress.graph.activations import value_bytes
 from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
 from me2e_compress.passes.hoist_linear.row_moves import moved_rows
 from me2e_compress.passes.work import work
@@ -84,5 +85,4 @@ class OwnedWork:
 
     def file(self, weight: ir.Value) -> float:
         """Return the price of a constant's bytes in the file."""
-        item = 4.0 if weight.dtype is None else weight.dtype.itemsize
-        return math.prod(static_shape(weight) or ()) * item / self.rate
+        return (value_bytes(weight) or 0) / self.rate

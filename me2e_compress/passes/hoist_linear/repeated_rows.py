@@ -13,6 +13,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import is_standard, rank_of, static_shape
+from me2e_compress.graph.activations import value_bytes
 from me2e_compress.graph.nodes import integers_at
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.row_moves import (
@@ -186,11 +187,7 @@ def _rows(value: ir.Value | None) -> int:
 
 
 def _traffic(values: Sequence[ir.Value | None]) -> float:
-    total = 0.0
-    for value in values:
-        if value is not None and value.dtype is not None:
-            total += math.prod(static_shape(value) or ()) * value.dtype.itemsize
-    return total
+    return sum(value_bytes(value) or 0 for value in values if value is not None)
 
 
 def _rewrite(node: ir.Node, move: Move, rewriter: Rewriter) -> None:

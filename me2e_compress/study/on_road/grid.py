@@ -11,9 +11,8 @@ from me2e_compress import recipe
 from me2e_compress.errors import RecipeError
 from me2e_compress.modules import ModuleMap, assign
 from me2e_compress.passes import Pass
-from me2e_compress.passes.ablate_modules import AblateModules
+from me2e_compress.passes.ablate_modules import PLANNER, AblateModules
 from me2e_compress.passes.fix_shapes import with_sizes
-from me2e_compress.passes.planner_sight import PLANNER
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 

@@ -82,11 +82,11 @@ class MultiheadAttention(nn.Module):
 class FeedForward(nn.Module):
     """Linear, ReLU, linear, residual."""
 
-    def __init__(self) -> None:
+    def __init__(self, width: int = FEED_FORWARD) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Sequential(nn.Linear(EMBED, FEED_FORWARD), nn.ReLU()),
-            nn.Linear(FEED_FORWARD, EMBED),
+            nn.Sequential(nn.Linear(EMBED, width), nn.ReLU()),
+            nn.Linear(width, EMBED),
         )
 
     def forward(self, x: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.bev.attention import PackedAttention
+from me2e_compress.zoo.bev.attention import FeedForward, PackedAttention
 from me2e_compress.zoo.bev.sizes import EMBED, Sampling
 from me2e_compress.zoo.uniad.config import UniadConfig
 from me2e_compress.zoo.uniad.layers import projection
@@ -21,6 +21,7 @@ FUTURES = 5
 """Now and four steps of 0.5 s."""
 
 WIDE_FEED_FORWARD = 2048
+"""Four times as wide as elsewhere."""
 REACH = 0.5
 """Cells of at least this probability belong to an instance."""
 
@@ -44,7 +45,7 @@ class StateLayer(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.attentions = nn.ModuleList([StateAttention(), StateAttention()])
-        self.ffns = nn.ModuleList([WideFeedForward()])
+        self.ffns = nn.ModuleList([FeedForward(WIDE_FEED_FORWARD)])
         self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(3))
 
     def forward(self, x: Tensor, instances: Tensor, ignore: Tensor) -> Tensor:
@@ -52,22 +53,6 @@ class StateLayer(nn.Module):
         x = self.norms[0](self.attentions[0](x, x))
         x = self.norms[1](self.attentions[1](x, instances, ignore))
         out: Tensor = self.norms[2](self.ffns[0](x))
-        return out
-
-
-class WideFeedForward(nn.Module):
-    """Linear, ReLU, linear and residual, four times as wide as elsewhere."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
-            nn.Sequential(nn.Linear(EMBED, WIDE_FEED_FORWARD), nn.ReLU()),
-            nn.Linear(WIDE_FEED_FORWARD, EMBED),
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map [..., 256] to [..., 256]."""
-        out: Tensor = x + self.layers(x)
         return out
 
 

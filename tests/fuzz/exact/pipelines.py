@@ -25,14 +25,13 @@ ORDERS = (
     "fuse-operators, expand-operators",
     "fuse-operators, attach-bodies",
     "fuse-basic, hoist-linear, fold-constants, eliminate-redundant",
-    "hoist-linear, eliminate-redundant, hoist-linear{merge_shared=true}, fuse-basic",
+    "hoist-linear, eliminate-redundant, hoist-linear, fuse-basic",
 )
 """Passes one behind the other, besides the recipes."""
 
 DEAR = (
     "hoist-linear",
     "hoist-linear{bytes_per_node=1000000}",
-    "hoist-linear{bytes_per_node=1000000, merge_shared=true}",
     "fold-constants{bytes_per_node=1000000}, hoist-linear{bytes_per_node=1000000},"
     " fuse-basic, eliminate-redundant",
 )
