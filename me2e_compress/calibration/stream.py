@@ -13,6 +13,7 @@ import onnx_ir.passes.common as common
 
 from me2e_compress.calibration.probes import Probe
 from me2e_compress.errors import GraphError
+from me2e_compress.graph.nodes import bodies_of
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay
@@ -24,8 +25,8 @@ Readings: TypeAlias = npt.NDArray[np.float32]
 """Readings of the probes in one frame: float32 [tensors, width of the probe]."""
 
 
-class FrameSource(Protocol):
-    """Frames with a fingerprint, readable from any index on."""
+class Recording(Protocol):
+    """Recorded frames, readable from any index on: all of a folder, or some."""
 
     @property
     def fingerprint(self) -> str:
@@ -37,21 +38,17 @@ class FrameSource(Protocol):
         """Indices of these frames in the whole recording."""
         ...
 
+    @property
+    def scenes(self) -> Sequence[int]:
+        """Positions among these frames where a scene begins."""
+        ...
+
     def __len__(self) -> int:
         """Count the frames."""
         ...
 
     def __getitem__(self, index: int) -> Frame:
         """Read one frame."""
-        ...
-
-
-class Recording(FrameSource, Protocol):
-    """Recorded frames: all of a folder, some of them, or the inputs of a part."""
-
-    @property
-    def scenes(self) -> Sequence[int]:
-        """Positions among these frames where a scene begins."""
         ...
 
     def __iter__(self) -> Iterator[Frame]:
@@ -61,7 +58,7 @@ class Recording(FrameSource, Protocol):
 
 def stream(
     session: Session,
-    frames: FrameSource,
+    frames: Recording,
     width: int,
     begin: int = 0,
     state: Mapping[str, Array] | None = None,
@@ -227,17 +224,8 @@ def _reads(node: ir.Node) -> Iterator[ir.Value]:
     for value in node.inputs:
         if value is not None:
             yield value
-    for attribute in node.attributes.values():
-        for body in _bodies(attribute):
-            for inner in body.all_nodes():
-                for value in inner.inputs:
-                    if value is not None and value.graph is node.graph:
-                        yield value
-
-
-def _bodies(attribute: ir.Attr) -> Sequence[ir.Graph]:
-    if attribute.type == ir.AttributeType.GRAPH:
-        return (attribute.as_graph(),)
-    if attribute.type == ir.AttributeType.GRAPHS:
-        return tuple(attribute.as_graphs())
-    return ()
+    for body in bodies_of(node):
+        for inner in body.all_nodes():
+            for value in inner.inputs:
+                if value is not None and value.graph is node.graph:
+                    yield value

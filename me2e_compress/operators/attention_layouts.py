@@ -33,14 +33,6 @@ class JoinedHeads(Dialect):
         sizes = (call.size(value, 0), call.size(locations, 1), width)
         return call.reshape(result, sizes)
 
-    def options_from_own(self, attributes: Attributes) -> Attributes:
-        """Add the attributes that only this library has."""
-        return {each.name: each.default for each in self.attributes}
-
-    def options_to_own(self, attributes: Attributes) -> Attributes:
-        """Drop the attributes that only this library has."""
-        return {}
-
     def result_from_own_array(self, result: NdArray) -> NdArray:
         """Join the heads."""
         return result.reshape(*result.shape[:2], -1)

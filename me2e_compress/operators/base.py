@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims, open_shape
+from me2e_compress.graph.shapes import Dims, open_shape, product
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values
 
@@ -85,8 +85,8 @@ def bytes_of(values: Sequence[ir.Value | None]) -> int | None:
         if value is None:
             continue
         shape = open_shape(value)
-        if shape is None or None in shape or value.dtype is None:
+        count = None if shape is None else product(shape)
+        if count is None or value.dtype is None:
             return None
-        count = math.prod(dim for dim in shape if dim is not None)
         total += math.ceil(count * value.dtype.itemsize)
     return total

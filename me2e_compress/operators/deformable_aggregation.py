@@ -1,14 +1,13 @@
 """Deformable feature aggregation (Sparse4D, arXiv 2211.10581; SparseDrive)."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims
+from me2e_compress.graph.shapes import Dims, product
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall
@@ -184,7 +183,6 @@ class DeformableAggregation(Operator):
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
         """Count four neighbours and a weight for each sample of C numbers."""
         feature, weights = shapes[0], shapes[4]
-        if feature is None or weights is None or feature[2] is None:
+        if feature is None or weights is None:
             return None
-        known = [dim for dim in weights[:5] if dim is not None]
-        return 4 * math.prod(known) * feature[2] if len(known) == 5 else None
+        return product((4, *weights[:5], feature[2]))

@@ -1,14 +1,13 @@
 """Multi-scale deformable attention (Deformable DETR, arXiv 2010.04159, equation 3)."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims
+from me2e_compress.graph.shapes import Dims, product
 from me2e_compress.operators.attention_layouts import JoinedHeads, RawAttention, five
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
@@ -78,7 +77,7 @@ class DeformableAttention(Operator):
         JoinedHeads("autoware", _JOINED, "", _operands(INT32), "Autoware"),
         JoinedHeads(
             "mmdeploy", _MMCV, "mmdeploy", _operands(INT32), "mmdeploy",
-            (Attribute("im2col_step", 64, required=False),),
+            (Attribute("im2col_step", 64, required=False, own=""),),
         ),
         RawAttention("derryhub", _DERRYHUB_NAME, "", _RAW, _DERRYHUB),
         RawAttention("derryhub-trt2", f"{_DERRYHUB_NAME}2", "", _RAW, _DERRYHUB),
@@ -124,9 +123,6 @@ class DeformableAttention(Operator):
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
         """Count four neighbours for each of N * Q * M * L * P samples of D numbers."""
         value, weights = shapes[0], shapes[4]
-        if value is None or weights is None or value[3] is None:
+        if value is None or weights is None:
             return None
-        known = [dim for dim in weights if dim is not None]
-        if len(known) < len(weights):
-            return None
-        return 4 * math.prod(known) * value[3]
+        return product((4, *weights, value[3]))

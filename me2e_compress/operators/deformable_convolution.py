@@ -9,7 +9,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph.shapes import Dims
+from me2e_compress.graph.shapes import Dims, product
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall, Size
@@ -28,7 +28,6 @@ from me2e_compress.operators.dialect import (
     numbers,
     present,
 )
-from me2e_compress.operators.renamed_attributes import RenamedAttributes
 
 DEFORM_CONV_OPSET = 19
 """The first opset of ONNX's DeformConv."""
@@ -41,8 +40,8 @@ def _options(groups: str, offset_groups: str) -> tuple[Attribute, ...]:
         Attribute("stride", (1, 1)),
         Attribute("padding", (0, 0)),
         Attribute("dilation", (1, 1)),
-        Attribute(groups, 1),
-        Attribute(offset_groups, 1),
+        Attribute(groups, 1, own="groups"),
+        Attribute(offset_groups, 1, own="deform_groups"),
     )
 
 
@@ -57,13 +56,6 @@ def _operands(types: tuple[ir.DataType, ...]) -> tuple[Operand, ...]:
 
 
 _OWN = _options("groups", "deform_groups")
-
-
-@dataclasses.dataclass(frozen=True)
-class NamedGroups(RenamedAttributes):
-    """A library with its own names for the two counts of groups, in the same order."""
-
-    own_attributes: ClassVar[tuple[Attribute, ...]] = _OWN
 
 
 _OSS = _options("group", "deformable_group")
@@ -86,16 +78,16 @@ class DeformableConvolution(Operator):
     """
 
     name: ClassVar[str] = "deformable-convolution"
-    own: ClassVar[Dialect] = NamedGroups(
+    own: ClassVar[Dialect] = Dialect(
         "me2e", _CONV, OWN_DOMAIN, _operands(FLOATS), "me2e", _OWN
     )
     dialects: ClassVar[tuple[Dialect, ...]] = (
-        NamedGroups("tensorrt", _CONV, *_LIBRARY, _OSS),
-        NamedGroups("tensorrt-v2", _CONV, *_LIBRARY, _OSS, "2"),
-        NamedGroups("mmdeploy", _MMCV, "mmdeploy", *_MMDEPLOY, _OWN),
-        NamedGroups("mmcv", _MMCV, "mmcv", *_MMDEPLOY, _OWN),
-        NamedGroups("derryhub", _TRT, *_DERRYHUB, _OWN),
-        NamedGroups("derryhub-trt2", f"{_TRT}2", *_DERRYHUB, _OWN),
+        Dialect("tensorrt", _CONV, *_LIBRARY, _OSS),
+        Dialect("tensorrt-v2", _CONV, *_LIBRARY, _OSS, "2"),
+        Dialect("mmdeploy", _MMCV, "mmdeploy", *_MMDEPLOY, _OWN),
+        Dialect("mmcv", _MMCV, "mmcv", *_MMDEPLOY, _OWN),
+        Dialect("derryhub", _TRT, *_DERRYHUB, _OWN),
+        Dialect("derryhub-trt2", f"{_TRT}2", *_DERRYHUB, _OWN),
     )
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
@@ -157,9 +149,9 @@ class DeformableConvolution(Operator):
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
         """Count the convolution: output elements times the numbers of a kernel."""
         shape, weight = self.output_shape(shapes, attributes), shapes[3]
-        dims = [*(shape or (None,)), *(weight or (None,))[1:]]
-        known = [dim for dim in dims if dim is not None]
-        return math.prod(known) if len(known) == 7 else None
+        if shape is None or weight is None:
+            return None
+        return product((*shape, *weight[1:]))
 
 
 def kernel_positions(

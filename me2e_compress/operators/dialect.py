@@ -72,12 +72,20 @@ class Attribute:
         default: the value of its type that a conversion writes if it knows none.
         required: whether the plugin refuses a node without it.
         choices: the allowed values; empty for any.
+        own: its name in the own form; None where that is the same, empty where the own
+            form lacks it.
     """
 
     name: str
     default: int | float | str | tuple[int, ...]
     required: bool = True
     choices: tuple[int | str, ...] = ()
+    own: str | None = None
+
+    @property
+    def own_name(self) -> str:
+        """Its name in the own form; empty if that lacks it."""
+        return self.name if self.own is None else self.own
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,11 +134,12 @@ class Dialect:
 
     def options_to_own(self, attributes: Attributes) -> Attributes:
         """Convert this dialect's attributes to the own form's."""
-        return attributes
+        known = [each for each in self.attributes if each.name in attributes]
+        return {e.own_name: attributes[e.name] for e in known if e.own_name}
 
     def options_from_own(self, attributes: Attributes) -> Attributes:
         """Convert the own form's attributes to this dialect's."""
-        return attributes
+        return {e.name: attributes.get(e.own_name, e.default) for e in self.attributes}
 
     def result_to_own(self, call: FusedCall, result: ir.Value, own: Values) -> ir.Value:
         """Write the conversion of this dialect's output to the own form's."""

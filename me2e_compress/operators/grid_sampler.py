@@ -1,13 +1,12 @@
 """Sample an image or a volume at a grid of positions (torch's ``grid_sample``)."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims
+from me2e_compress.graph.shapes import Dims, product
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
@@ -25,7 +24,6 @@ from me2e_compress.operators.dialect import (
     present,
 )
 from me2e_compress.operators.grid_positions import grid_by_gather, grid_sample_array
-from me2e_compress.operators.renamed_attributes import RenamedAttributes
 
 _SCALE = 10.0
 """BEVFormer_tensorrt multiplies a grid by this for a better int8 range."""
@@ -33,7 +31,7 @@ _SCALE = 10.0
 
 def _options(first: str, *, required: bool = True) -> tuple[Attribute, ...]:
     return (
-        Attribute(first, 0, required, (0, 1, 2)),
+        Attribute(first, 0, required, (0, 1, 2), own="interpolation_mode"),
         Attribute("padding_mode", 0, required, (0, 1, 2)),
         Attribute("align_corners", 0, required, (0, 1)),
     )
@@ -43,14 +41,7 @@ _OWN = _options("interpolation_mode")
 
 
 @dataclasses.dataclass(frozen=True)
-class Sampler(RenamedAttributes):
-    """A library with its own names for the three attributes, in the same order."""
-
-    own_attributes: ClassVar[tuple[Attribute, ...]] = _OWN
-
-
-@dataclasses.dataclass(frozen=True)
-class ScaledGrid(Sampler):
+class ScaledGrid(Dialect):
     """A library whose grid is [N, 2 or 3, ...] and multiplied by 10."""
 
     def inputs_to_own(
@@ -95,7 +86,7 @@ def _operands(
 
 
 def _own(dims: int) -> Dialect:
-    return Sampler(
+    return Dialect(
         "me2e", f"GridSampler{dims}D", OWN_DOMAIN, _operands(dims, FLOATS), "me2e", _OWN
     )
 
@@ -132,7 +123,7 @@ class GridSampler2D(Operator):
     own: ClassVar[Dialect] = _own(2)
     dialects: ClassVar[tuple[Dialect, ...]] = (
         *_scaled(2),
-        Sampler(
+        Dialect(
             "mmdeploy",
             "grid_sampler",
             "mmdeploy",
@@ -177,15 +168,12 @@ class GridSampler2D(Operator):
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
         """Count the neighbours of each element: 2, 1 or 4 along each axis."""
         shape = self.output_shape(shapes, attributes)
-        known = [dim for dim in shape or () if dim is not None]
-        if shape is None or len(known) < len(shape):
-            return None
-        # Nearest moves data only
         mode = number(attributes, "interpolation_mode")
-        if mode == 1:
+        if shape is None or None in shape:
+            return None
+        if mode == 1:  # nearest moves data only
             return 0
-        each: int = (4 if mode == 2 else 2) ** (len(known) - 2)
-        return math.prod(known) * each
+        return product((*shape, (4 if mode == 2 else 2) ** (len(shape) - 2)))
 
 
 _MODES, _NEW_MODES = ("bilinear", "nearest", "bicubic"), ("linear", "nearest", "cubic")

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims
+from me2e_compress.graph.shapes import Dims, product
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
@@ -76,7 +76,6 @@ class FusedMultiHeadAttention(Operator):
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
         """Count both products."""
         query, key = shapes[0], shapes[1]
-        known = [dim for dim in query or () if dim is not None]
-        if len(known) < 3 or key is None or key[1] is None:
+        if query is None or key is None:
             return None
-        return 2 * math.prod(known) * key[1]
+        return product((2, *query, key[1]))

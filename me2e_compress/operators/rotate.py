@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims
+from me2e_compress.graph.shapes import Dims, product
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall
@@ -161,5 +161,4 @@ class Rotate(Operator):
         """Count four neighbours for each element; none for the nearest."""
         if attributes["interpolation"] == 1:
             return 0
-        known = [dim for dim in shapes[0] or () if dim is not None]
-        return 4 * math.prod(known) if len(known) == 3 else None
+        return None if shapes[0] is None else product((4, *shapes[0]))
