@@ -141,8 +141,10 @@ class Overrides(_Strict):
     @classmethod
     def parse(cls, text: str | bytes, origin: str = "overrides") -> Self:
         """Read TOML; ``origin`` is its name in error messages."""
+        with documents.reading(origin, RecipeError, "not TOML"):
+            content = documents.from_toml(text)
         with documents.reading(origin, RecipeError, "not overrides"):
-            return cls.model_validate(documents.from_toml(text))
+            return cls.model_validate(content)
 
     def bind(self, model: ir.Model) -> "Pins":
         """Find the nodes of a graph that they apply to.

@@ -66,15 +66,15 @@ def _write_pairs(
     Other readers of such a tensor keep the float one, if it exists.
     """
     for value, grid in grids.items():
-        born = value in region.born
+        written = value in region.written
         # A tensor that a kernel writes as uint8 has no float version.
         uses = [
             (use.node, use.idx)
             for use in value.uses()
-            if born or region.reads(use.node, use.idx)
+            if written or region.reads(use.node, use.idx)
         ]
         producer = value.producer()
-        source = producer if born and producer is not None else uses[0][0]
+        source = producer if written and producer is not None else uses[0][0]
         # Insert the pair, and reconnect the readers.
         name = str(value.name)
         constants = (
@@ -86,7 +86,7 @@ def _write_pairs(
         for reader, index in uses:
             reader.replace_input_with(index, dequantize.outputs[0])
         # A graph output keeps its name.
-        if born and value.is_graph_output():
+        if written and value.is_graph_output():
             rewrite.replace_value(value, dequantize.outputs[0])
             quantize.replace_input_with(0, value)
 

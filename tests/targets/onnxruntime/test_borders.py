@@ -16,7 +16,7 @@ def test_a_sum_that_a_layer_reads_is_of_the_region() -> None:
 
     found = find_region(model.graph, {"z1", "z2", "z3", "y"})
 
-    assert {str(value.name) for value in found.born} == {
+    assert {str(value.name) for value in found.written} == {
         "a1", "p1", "a2", "z3", "a3", "y", "mean", "pooled",
     }  # fmt: skip
     assert {node.op_type for node in found.readers} == {
@@ -29,7 +29,7 @@ def test_joined_maps_that_only_a_sampler_reads_are_of_the_region() -> None:
 
     found = find_region(model.graph, {"c1", "c2", "y"})
 
-    assert "maps" in {str(value.name) for value in found.born}
+    assert "maps" in {str(value.name) for value in found.written}
     assert "Concat" in {node.op_type for node in found.readers}
 
 
