@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims, product
+from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall
@@ -83,6 +83,8 @@ class DeformableAggregation(Operator):
     """
 
     name: ClassVar[str] = "deformable-aggregation"
+    output: ClassVar[str] = "N A C"
+    work: ClassVar[str] = "4 N A P V L C"
     int8_inputs: ClassVar[tuple[int, ...]] = (0,)
     own: ClassVar[Dialect] = Dialect(
         "me2e", _OP, OWN_DOMAIN, _operands(INTEGERS, (*FLOAT32, ir.DataType.FLOAT16)),
@@ -171,18 +173,3 @@ class DeformableAggregation(Operator):
             shares.transpose(0, 1, 5, 3, 4, 2).reshape(*shape[:3], -1, points),
         )
         return result.reshape(batch, anchors, -1)
-
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
-        """Return [N, A, C]."""
-        feature, weights = shapes[0] or (None,) * 3, shapes[4] or (None,) * 6
-        batch = feature[0] if feature[0] is not None else weights[0]
-        return (batch, weights[1], feature[2])
-
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count four neighbours and a weight for each sample of C numbers."""
-        feature, weights = shapes[0], shapes[4]
-        if feature is None or weights is None:
-            return None
-        return product((4, *weights[:5], feature[2]))

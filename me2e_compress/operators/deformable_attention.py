@@ -1,13 +1,11 @@
 """Multi-scale deformable attention (Deformable DETR, arXiv 2010.04159, equation 3)."""
 
 import dataclasses
-from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims, product
 from me2e_compress.operators.attention_layouts import JoinedHeads, RawAttention, five
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
@@ -63,6 +61,8 @@ class DeformableAttention(Operator):
     """
 
     name: ClassVar[str] = "deformable-attention"
+    output: ClassVar[str] = "N Q M D"
+    work: ClassVar[str] = "4 N Q M L P D"
     int8_inputs: ClassVar[tuple[int, ...]] = (0,)
     own: ClassVar[Dialect] = Dialect(
         "me2e", "MultiScaleDeformableAttention", OWN_DOMAIN, _operands(INTEGERS), "me2e"
@@ -107,22 +107,3 @@ class DeformableAttention(Operator):
             locations.astype(np.float64),
             weights.astype(np.float64),
         )
-
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
-        """Return [N, Q, M, D]."""
-        value, locations = shapes[0], shapes[3]
-        if value is None and locations is None:
-            return None
-        value, locations = value or (None,) * 4, locations or (None,) * 6
-        batch = value[0] if value[0] is not None else locations[0]
-        heads = value[2] if value[2] is not None else locations[2]
-        return (batch, locations[1], heads, value[3])
-
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count four neighbours for each of N * Q * M * L * P samples of D numbers."""
-        value, weights = shapes[0], shapes[4]
-        if value is None or weights is None:
-            return None
-        return product((4, *weights, value[3]))

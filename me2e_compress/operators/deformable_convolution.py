@@ -2,14 +2,12 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph.shapes import Dims, product
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall, Size
@@ -50,7 +48,7 @@ def _operands(types: tuple[ir.DataType, ...]) -> tuple[Operand, ...]:
         Operand("input", "N C H W", types),
         Operand("offset", "N * F G", types, positions=True),
         Operand("mask", "N * F G", types),
-        Operand("weight", "O * * *", types),
+        Operand("weight", "O I R S", types),
         Operand("bias", "O", types, optional=True),
     )
 
@@ -78,6 +76,8 @@ class DeformableConvolution(Operator):
     """
 
     name: ClassVar[str] = "deformable-convolution"
+    output: ClassVar[str] = "N O F G"
+    work: ClassVar[str] = "N O F G I R S"
     own: ClassVar[Dialect] = Dialect(
         "me2e", _CONV, OWN_DOMAIN, _operands(FLOATS), "me2e", _OWN
     )
@@ -138,20 +138,6 @@ class DeformableConvolution(Operator):
         result: NdArray = np.einsum("gock,npkgc->ngop", matrix, taken)
         result = result.reshape(batch, out, down, across)
         return np.add(result, bias[0].reshape(-1, 1, 1)) if bias else result
-
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
-        """Return [N, O, F, G]."""
-        offset, weight = shapes[1] or (None,) * 4, shapes[3] or (None,)
-        return (offset[0], weight[0], offset[2], offset[3])
-
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count the convolution: output elements times the numbers of a kernel."""
-        shape, weight = self.output_shape(shapes, attributes), shapes[3]
-        if shape is None or weight is None:
-            return None
-        return product((*shape, *weight[1:]))
 
 
 def kernel_positions(

@@ -52,9 +52,14 @@ class Operand:
     scores: bool = False
 
     @property
+    def letters(self) -> list[str]:
+        """Its dimensions one by one; none where any number is accepted."""
+        return [] if self.dims is None else self.dims.split()
+
+    @property
     def rank(self) -> int | None:
         """The number of dimensions; None where any number is accepted."""
-        return None if self.dims is None else len(self.dims.split())
+        return None if self.dims is None else len(self.letters)
 
     def takes(self, kind: ir.DataType | None) -> bool:
         """Return whether an element type is accepted, float64 counting as float32."""
@@ -248,7 +253,7 @@ class Dialect:
     ) -> None:
         if operand.dims is None or shape is None:
             return
-        wanted = operand.dims.split()
+        wanted = operand.letters
         fits = len(wanted) == len(shape)
         # A letter stands for one size in all operands
         for letter, size in zip(wanted, shape, strict=False):

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims, product
+from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
@@ -120,6 +120,8 @@ class GridSampler2D(Operator):
     """
 
     name: ClassVar[str] = "grid-sampler-2d"
+    output: ClassVar[str] = "N C F G"
+    work: ClassVar[str] = "N C F G"
     own: ClassVar[Dialect] = _own(2)
     dialects: ClassVar[tuple[Dialect, ...]] = (
         *_scaled(2),
@@ -156,24 +158,15 @@ class GridSampler2D(Operator):
         """Compute it in numpy, [N, C, ...] float64."""
         return grid_sample_array(inputs, attributes)
 
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
-        """Return batch and channels of the input, then the sizes of the grid."""
-        image, grid = shapes
-        if grid is None:
-            return None
-        return (*((None, None) if image is None else image[:2]), *grid[1:-1])
-
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
         """Count the neighbours of each element: 2, 1 or 4 along each axis."""
-        shape = self.output_shape(shapes, attributes)
         mode = number(attributes, "interpolation_mode")
-        if shape is None or None in shape:
+        whole = super().macs(shapes, attributes)
+        if whole is None:
             return None
-        if mode == 1:  # nearest moves data only
-            return 0
-        return product((*shape, (4 if mode == 2 else 2) ** (len(shape) - 2)))
+        along = (2, 0, 4)[mode]  # nearest moves data only
+        each: int = along ** len(self.output.split()[2:])
+        return whole * each
 
 
 _MODES, _NEW_MODES = ("bilinear", "nearest", "bicubic"), ("linear", "nearest", "cubic")
@@ -192,6 +185,8 @@ class GridSampler3D(GridSampler2D):
     """
 
     name: ClassVar[str] = "grid-sampler-3d"
+    output: ClassVar[str] = "N C E F G"
+    work: ClassVar[str] = "N C E F G"
     own: ClassVar[Dialect] = _own(3)
     dialects: ClassVar[tuple[Dialect, ...]] = _scaled(3)
     native_opset: ClassVar[int] = _RENAMED

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims, product
+from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall
@@ -54,6 +54,8 @@ class Rotate(Operator):
     """
 
     name: ClassVar[str] = "rotate"
+    output: ClassVar[str] = "C H W"
+    work: ClassVar[str] = "4 C H W"
     own: ClassVar[Dialect] = _dialect("me2e", "Rotate", OWN_DOMAIN, "me2e")
     dialects: ClassVar[tuple[Dialect, ...]] = (
         _dialect("derryhub", "RotateTRT", "", _DERRYHUB),
@@ -151,14 +153,7 @@ class Rotate(Operator):
         )
         return result.reshape(height, width, channels).transpose(2, 0, 1)
 
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
-        """Return [C, H, W]."""
-        return shapes[0]
-
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
         """Count four neighbours for each element; none for the nearest."""
-        if attributes["interpolation"] == 1:
-            return 0
-        return None if shapes[0] is None else product((4, *shapes[0]))
+        nearest = attributes["interpolation"] == 1
+        return 0 if nearest else super().macs(shapes, attributes)
