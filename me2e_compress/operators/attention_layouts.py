@@ -11,7 +11,7 @@ from me2e_compress.graph import array_of
 from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.before_softmax import before_softmax
 from me2e_compress.operators.call import Attributes, FusedCall
-from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values
+from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values, present
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +20,7 @@ class JoinedHeads(Dialect):
 
     def result_to_own(self, call: FusedCall, result: ir.Value, own: Values) -> ir.Value:
         """Split the heads."""
-        value, _, _, locations, _ = five(own)
+        value, _, _, locations, _ = present(own)
         sizes = (call.size(value, 0), call.size(locations, 1))
         return call.reshape(result, (*sizes, call.size(value, 2), call.size(value, 3)))
 
@@ -28,7 +28,7 @@ class JoinedHeads(Dialect):
         self, call: FusedCall, result: ir.Value, own: Values
     ) -> ir.Value:
         """Join the heads."""
-        value, _, _, locations, _ = five(own)
+        value, _, _, locations, _ = present(own)
         width = call.product(call.size(value, 2), call.size(value, 3))
         sizes = (call.size(value, 0), call.size(locations, 1), width)
         return call.reshape(result, sizes)
@@ -56,7 +56,7 @@ class RawAttention(Dialect):
         self, call: FusedCall, inputs: Values, attributes: Attributes
     ) -> Values:
         """Write the locations, the softmax and the start of each level."""
-        value, shapes, reference, offsets, weights = five(inputs)
+        value, shapes, reference, offsets, weights = present(inputs)
         # Offsets are in pixels of each level
         levels, group = _levels_and_group(call, shapes, reference, offsets, weights)
         batch, queries, heads = (call.size(offsets, axis) for axis in range(3))
@@ -75,7 +75,7 @@ class RawAttention(Dialect):
         self, call: FusedCall, inputs: Values, attributes: Attributes
     ) -> Values:
         """Write offsets from a reference point at 0; weights must be of a softmax."""
-        value, shapes, _, locations, weights = five(inputs)
+        value, shapes, _, locations, weights = present(inputs)
         batch, queries, heads = (call.size(locations, axis) for axis in range(3))
         # Positions 0..1 become pixels
         scale = _columns_and_rows(call, shapes, locations)
@@ -138,12 +138,6 @@ class RawAttention(Dialect):
         points = None if both is None or not levels else both // levels
         own = (*offsets[:3], levels, points)
         return (value, sizes, (levels,), (*own, 2), own)
-
-
-def five(inputs: Values) -> tuple[ir.Value, ir.Value, ir.Value, ir.Value, ir.Value]:
-    """Return the five inputs of a call, none of which may be omitted."""
-    one, two, three, four, five = (each for each in inputs if each is not None)
-    return one, two, three, four, five
 
 
 def _tail(value: ir.Value, count: int) -> list[int | None]:

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.operators.attention_layouts import JoinedHeads, RawAttention, five
+from me2e_compress.operators.attention_layouts import JoinedHeads, RawAttention
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall
@@ -21,6 +21,7 @@ from me2e_compress.operators.dialect import (
     NdArray,
     Operand,
     Values,
+    present,
 )
 
 
@@ -94,7 +95,7 @@ class DeformableAttention(Operator):
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
         """Sample every level, with GridSample where sizes are constant, else Gather."""
-        return sample_levels(call, *five(inputs))
+        return sample_levels(call, *present(inputs))
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [N, Q, M, D] float64."""

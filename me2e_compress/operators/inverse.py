@@ -80,7 +80,7 @@ class Inverse(Operator):
         flat = call.reshape(matrix, (*outer, size * size))
         minors = call.add("Gather", [flat, call.constant(_minors(size))], {"axis": -1})
         parity = np.indices((size, size)).sum(axis=0) % 2
-        signs = call.numbers_of(1 - 2 * parity, matrix)
+        signs = call.numbers(1 - 2 * parity, matrix)
         adjugate = call.add("Mul", [call.add("Det", [minors]), signs])
         whole = call.unsqueeze(call.add("Det", [matrix]), (rank - 2, rank - 1))
         return call.cast(call.add("Div", [adjugate, whole]), kind)

@@ -105,10 +105,11 @@ class Rotate(Operator):
         (across, x), (down, y) = middles
         down = call.unsqueeze(down, (1,))
         # Rotate, and move back
-        turned = (
-            call.add("Sub", self._products(call, (cosine, across), (sine, down))),
-            call.add("Add", self._products(call, (sine, across), (cosine, down))),
-        )
+        products = [
+            [call.add("Mul", [one, across]), call.add("Mul", [two, down])]
+            for one, two in ((cosine, sine), (sine, cosine))
+        ]
+        turned = call.add("Sub", products[0]), call.add("Add", products[1])
         half = call.numbers(0.5, angle)
         moved = (call.add("Sub", [at, half]) for at in (x, y))
         one, two = (
@@ -116,14 +117,6 @@ class Rotate(Operator):
             for at, start in zip(turned, moved, strict=True)
         )
         return one, two
-
-    def _products(
-        self,
-        call: FusedCall,
-        one: tuple[ir.Value, ir.Value],
-        two: tuple[ir.Value, ir.Value],
-    ) -> list[ir.Value]:
-        return [call.add("Mul", list(pair)) for pair in (one, two)]
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [C, H, W] float64."""
