@@ -130,7 +130,12 @@ def _by_gather(
     # Pixels around each position, along both axes
     heads, width = call.size(value, 2), call.size(value, 3)
     sizes = call.cast(sizes, ir.DataType.INT64)
-    height, columns = (call.unsqueeze(each, (1,)) for each in call.split_last(sizes, 2))
+    height, columns = (
+        call.unsqueeze(
+            call.add("Gather", [sizes, call.integers(axis)], {"axis": 1}), (1,)
+        )
+        for axis in (0, 1)
+    )
     x, y = call.split_last(locations, 2)
     axes = [_neighbours(call, at, count) for at, count in ((x, columns), (y, height))]
     # Row 0 is the row of zeros

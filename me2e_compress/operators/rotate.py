@@ -105,11 +105,16 @@ class Rotate(Operator):
         (across, x), (down, y) = middles
         down = call.unsqueeze(down, (1,))
         # Rotate, and move back
-        products = [
-            [call.add("Mul", [one, across]), call.add("Mul", [two, down])]
-            for one, two in ((cosine, sine), (sine, cosine))
-        ]
-        turned = call.add("Sub", products[0]), call.add("Add", products[1])
+        turned = (
+            call.add(
+                "Sub",
+                [call.add("Mul", [cosine, across]), call.add("Mul", [sine, down])],
+            ),
+            call.add(
+                "Add",
+                [call.add("Mul", [sine, across]), call.add("Mul", [cosine, down])],
+            ),
+        )
         half = call.numbers(0.5, angle)
         moved = (call.add("Sub", [at, half]) for at in (x, y))
         one, two = (
