@@ -39,12 +39,12 @@ class MalformedError(ValueError):
 
 @contextmanager
 def reading(
-    path: Path, error: Callable[[str], Exception], otherwise: str
+    path: Path | str, error: Callable[[str], Exception], otherwise: str
 ) -> Iterator[None]:
     """Turn what is wrong with a file that is read here into one line that names it.
 
     Args:
-        path: the file.
+        path: the file, or what a text came from.
         error: what is raised.
         otherwise: what the line says of a file that is there and does not fit.
 

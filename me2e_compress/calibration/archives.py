@@ -1,6 +1,7 @@
-"""Read arrays from ``.npz`` files, checking their sizes first."""
+"""Write ``.npz`` files, and read them, checking their sizes first."""
 
 import dataclasses
+import io
 import math
 import zipfile
 from collections.abc import Mapping
@@ -9,6 +10,7 @@ from typing import IO
 
 import numpy as np
 
+from me2e_compress import marks
 from me2e_compress.display import reason
 from me2e_compress.documents import check_regular
 from me2e_compress.errors import FramesError
@@ -58,6 +60,17 @@ def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
             return {name: np.asarray(content[name]) for name in content}
     except UNREADABLE as error:
         raise FramesError(f"{path}: not {what} ({reason(error)})") from error
+
+
+def archive_of(arrays: Mapping[str, Array]) -> bytes:
+    """Return an ``.npz`` of arrays; equal arrays give equal bytes."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        archive.comment = marks.BYTES
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, np.asanyarray(array))
+    return content.getvalue()
 
 
 def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[str, Declared]:

@@ -15,8 +15,8 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
 from me2e_compress.calibration.statistics import BINS, Statistics, no_element
 from me2e_compress.calibration.stream import (
-    FrameSource,
     Readings,
+    Recording,
     probed_session,
     stream,
 )
@@ -54,7 +54,7 @@ class Calibrator:
         self,
         model: ir.Model,
         tensors: Sequence[str],
-        frames: FrameSource,
+        frames: Recording,
         progress: Progress | None = None,
     ) -> Ranges:
         """Collect statistics and compute ranges; see :meth:`collect`."""
@@ -66,7 +66,7 @@ class Calibrator:
         self,
         model: ir.Model,
         tensors: Sequence[str],
-        frames: FrameSource,
+        frames: Recording,
         progress: Progress | None = None,
     ) -> Statistics:
         """Run the model over the frames, its recurrent state fed forward.
@@ -117,7 +117,7 @@ class _Job:
         settings: Calibrator,
         model: ir.Model,
         blank: Statistics,
-        frames: FrameSource,
+        frames: Recording,
         progress: Progress | None,
         passes: int,
     ) -> None:

@@ -110,10 +110,10 @@ class CalibrationSet(Displayed):
         It uses the checksums in every .npz (CRC-32 and size of each array), so that the
         arrays need not be read.
         """
-        seal = hashlib.blake2b(digest_size=16)
-        seal.update(repr(self.scenes).encode())
+        digest = hashlib.blake2b(digest_size=16)
+        digest.update(repr(self.scenes).encode())
         if self.pixels:
-            seal.update(repr(sorted(self.pixels.items())).encode())
+            digest.update(repr(sorted(self.pixels.items())).encode())
         # The directory of each archive has its checksums.
         for path in self.files:
             try:
@@ -125,8 +125,8 @@ class CalibrationSet(Displayed):
             except (OSError, zipfile.BadZipFile) as error:
                 line = reason(error)
                 raise FramesError(f"{path}: not a readable .npz ({line})") from error
-            seal.update(repr(entries).encode())
-        return seal.hexdigest()
+            digest.update(repr(entries).encode())
+        return digest.hexdigest()
 
     def check(self, model: ir.Model) -> None:
         """Read every frame once and check it against a model's inputs.

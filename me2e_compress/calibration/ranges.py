@@ -93,14 +93,9 @@ class Ranges(Displayed):
         """Read what :meth:`save` wrote, and check the bounds."""
         if not path.is_file():
             raise FramesError(f"{path}: no such ranges file")
-        try:
-            with documents.reading(path, FramesError, "not ranges"):
-                content = documents.content(path)
+        with documents.reading(path, FramesError, "not ranges"):
+            content = documents.content(path)
             found = pydantic.TypeAdapter(cls).validate_json(content)
-        except pydantic.ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"]) or "file"
-            raise FramesError(f"{path}: not ranges: {where}: {first['msg']}") from error
         # Bounds must be finite and in order.
         for name, (low, high) in found.tensors.items():
             if not -LARGEST <= low <= high <= LARGEST:  # NaN too

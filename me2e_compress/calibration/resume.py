@@ -1,16 +1,14 @@
 """Checkpoints of a long calibration, so that it can resume after a kill."""
 
 import dataclasses
-import io
 import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from me2e_compress import documents, marks
-from me2e_compress.calibration.archives import load_arrays
+from me2e_compress import documents
+from me2e_compress.calibration.archives import archive_of, load_arrays
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.frames import Array
@@ -66,18 +64,8 @@ class CalibrationCheckpoint:
             return
         state = {_STATE + name: array for name, array in progress.state.items()}
         # The state shares the archive, under a prefix.
-        content = io.BytesIO()
-        with zipfile.ZipFile(content, "w") as archive:
-            archive.comment = marks.BYTES
-            for name, array in {
-                "key": np.array(json.dumps(self.key)),
-                "done": np.array(progress.done),
-                **progress.results,
-                **state,
-            }.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                    np.lib.format.write_array(entry, np.asanyarray(array))
-        write_bytes(self.path, content.getvalue())
+        head = {"key": np.array(json.dumps(self.key)), "done": np.array(progress.done)}
+        write_bytes(self.path, archive_of({**head, **progress.results, **state}))
 
     def due(self, done: int, total: int) -> bool:
         """Return whether it is time to write."""

@@ -44,7 +44,7 @@ def check_static(name: str, array: Array, digest: str, where: str) -> None:
 
 def digest_of(array: Array) -> str:
     """Return a digest of an array's type, shape and content."""
-    seal = hashlib.blake2b(digest_size=16)
-    seal.update(repr((array.dtype.str, array.shape)).encode())
-    seal.update(array.tobytes())
-    return seal.hexdigest()
+    digest = hashlib.blake2b(digest_size=16)
+    digest.update(repr((array.dtype.str, array.shape)).encode())
+    digest.update(array.tobytes())
+    return digest.hexdigest()

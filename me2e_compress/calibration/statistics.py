@@ -2,9 +2,7 @@
 
 import dataclasses
 import functools
-import io
 import itertools
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self, TypeAlias
@@ -12,8 +10,7 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress import marks
-from me2e_compress.calibration.archives import load_arrays
+from me2e_compress.calibration.archives import archive_of, load_arrays
 from me2e_compress.calibration.shares import Share, check_whole
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes
@@ -108,20 +105,16 @@ class Statistics:
 
     def save(self, path: Path) -> None:
         """Write an ``.npz`` atomically; equal statistics give equal bytes."""
-        content = io.BytesIO()
-        np.savez(
-            content,
-            model=np.array(self.model),
-            source=np.array(self.source),
-            tensors=np.array(self.tensors, np.str_),
-            frames=np.array(self.frames, np.int64),
-            measured=self.measured,
-            counts=np.empty(0, np.int64) if self.counts is None else self.counts,
-            share=np.array(_listed(self.share), np.int64),
-        )
-        with zipfile.ZipFile(content, "a") as archive:
-            archive.comment = marks.BYTES
-        write_bytes(path, content.getvalue())
+        arrays = {
+            "model": np.array(self.model),
+            "source": np.array(self.source),
+            "tensors": np.array(self.tensors, np.str_),
+            "frames": np.array(self.frames, np.int64),
+            "measured": self.measured,
+            "counts": np.empty(0, np.int64) if self.counts is None else self.counts,
+            "share": np.array(_listed(self.share), np.int64),
+        }
+        write_bytes(path, archive_of(arrays))
 
     @classmethod
     def load(cls, path: Path) -> Self:

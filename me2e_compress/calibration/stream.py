@@ -25,8 +25,8 @@ Readings: TypeAlias = npt.NDArray[np.float32]
 """Readings of the probes in one frame: float32 [tensors, width of the probe]."""
 
 
-class FrameSource(Protocol):
-    """Frames with a fingerprint, readable from any index on."""
+class Recording(Protocol):
+    """Recorded frames, readable from any index on: all of a folder, or some."""
 
     @property
     def fingerprint(self) -> str:
@@ -38,21 +38,17 @@ class FrameSource(Protocol):
         """Indices of these frames in the whole recording."""
         ...
 
+    @property
+    def scenes(self) -> Sequence[int]:
+        """Positions among these frames where a scene begins."""
+        ...
+
     def __len__(self) -> int:
         """Count the frames."""
         ...
 
     def __getitem__(self, index: int) -> Frame:
         """Read one frame."""
-        ...
-
-
-class Recording(FrameSource, Protocol):
-    """Recorded frames: all of a folder, some of them, or the inputs of a part."""
-
-    @property
-    def scenes(self) -> Sequence[int]:
-        """Positions among these frames where a scene begins."""
         ...
 
     def __iter__(self) -> Iterator[Frame]:
@@ -62,7 +58,7 @@ class Recording(FrameSource, Protocol):
 
 def stream(
     session: Session,
-    frames: FrameSource,
+    frames: Recording,
     width: int,
     begin: int = 0,
     state: Mapping[str, Array] | None = None,

@@ -238,8 +238,8 @@ def extent(node: ir.Node, *, weight: bool) -> Extent:
     columns, depth = (None, None) if right is None else _sides(right)
     if not left:
         return Extent(None, columns, depth)
-    shared = weight and right is not None and _product(right[:-2]) == 1
-    rows = _product(left[:-1]) if shared or len(left) == 1 else left[-2]
+    shared = weight and right is not None and product(right[:-2]) == 1
+    rows = product(left[:-1]) if shared or len(left) == 1 else left[-2]
     return Extent(rows, columns, depth if left[-1] is None else left[-1])
 
 
@@ -256,7 +256,7 @@ def is_one_matrix(product: ir.Node) -> bool:
     return len(right) == 2 or (math.prod(right[:-2]) == 1 and len(right) <= rank)
 
 
-def _product(dims: Dims) -> int | None:
+def product(dims: Dims) -> int | None:
     """Multiply dimensions; None if one of them is open."""
     known = [dim for dim in dims if dim is not None]
     return math.prod(known) if len(known) == len(dims) else None
@@ -264,7 +264,7 @@ def _product(dims: Dims) -> int | None:
 
 def _sides(right: Dims) -> tuple[int | None, int | None]:
     """Return N and K of a right operand; a vector is one column."""
-    return (right[-1], right[-2]) if len(right) > 1 else (1, _product(right))
+    return (right[-1], right[-2]) if len(right) > 1 else (1, product(right))
 
 
 def _gemm(node: ir.Node, left: Dims | None, right: Dims | None) -> Extent:

@@ -1,6 +1,7 @@
 """Two layouts of deformable attention that differ from TensorRT OSS's."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -8,10 +9,10 @@ import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import array_of
-from me2e_compress.graph.shapes import Dims
-from me2e_compress.operators.before_softmax import before_softmax
+from me2e_compress.graph.nodes import maker, permutation_of
+from me2e_compress.graph.shapes import Dims, static_shape
 from me2e_compress.operators.call import Attributes, FusedCall
-from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values
+from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values, present
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +21,7 @@ class JoinedHeads(Dialect):
 
     def result_to_own(self, call: FusedCall, result: ir.Value, own: Values) -> ir.Value:
         """Split the heads."""
-        value, _, _, locations, _ = five(own)
+        value, _, _, locations, _ = present(own)
         sizes = (call.size(value, 0), call.size(locations, 1))
         return call.reshape(result, (*sizes, call.size(value, 2), call.size(value, 3)))
 
@@ -28,18 +29,10 @@ class JoinedHeads(Dialect):
         self, call: FusedCall, result: ir.Value, own: Values
     ) -> ir.Value:
         """Join the heads."""
-        value, _, _, locations, _ = five(own)
+        value, _, _, locations, _ = present(own)
         width = call.product(call.size(value, 2), call.size(value, 3))
         sizes = (call.size(value, 0), call.size(locations, 1), width)
         return call.reshape(result, sizes)
-
-    def options_from_own(self, attributes: Attributes) -> Attributes:
-        """Add the attributes that only this library has."""
-        return {each.name: each.default for each in self.attributes}
-
-    def options_to_own(self, attributes: Attributes) -> Attributes:
-        """Drop the attributes that only this library has."""
-        return {}
 
     def result_from_own_array(self, result: NdArray) -> NdArray:
         """Join the heads."""
@@ -64,7 +57,7 @@ class RawAttention(Dialect):
         self, call: FusedCall, inputs: Values, attributes: Attributes
     ) -> Values:
         """Write the locations, the softmax and the start of each level."""
-        value, shapes, reference, offsets, weights = five(inputs)
+        value, shapes, reference, offsets, weights = present(inputs)
         # Offsets are in pixels of each level
         levels, group = _levels_and_group(call, shapes, reference, offsets, weights)
         batch, queries, heads = (call.size(offsets, axis) for axis in range(3))
@@ -83,7 +76,7 @@ class RawAttention(Dialect):
         self, call: FusedCall, inputs: Values, attributes: Attributes
     ) -> Values:
         """Write offsets from a reference point at 0; weights must be of a softmax."""
-        value, shapes, _, locations, weights = five(inputs)
+        value, shapes, _, locations, weights = present(inputs)
         batch, queries, heads = (call.size(locations, axis) for axis in range(3))
         # Positions 0..1 become pixels
         scale = _columns_and_rows(call, shapes, locations)
@@ -103,7 +96,7 @@ class RawAttention(Dialect):
         return self.in_types(call, given)
 
     def _before_softmax(self, call: FusedCall, weights: ir.Value) -> ir.Value:
-        found = before_softmax(call, weights, 2)
+        found = _before_softmax(call, weights, 2)
         if found is None:
             raise PreconditionError(
                 f"node {call.node.name}: {self.op_type} of {self.source} takes weights"
@@ -146,12 +139,6 @@ class RawAttention(Dialect):
         points = None if both is None or not levels else both // levels
         own = (*offsets[:3], levels, points)
         return (value, sizes, (levels,), (*own, 2), own)
-
-
-def five(inputs: Values) -> tuple[ir.Value, ir.Value, ir.Value, ir.Value, ir.Value]:
-    """Return the five inputs of a call, none of which may be omitted."""
-    one, two, three, four, five = (each for each in inputs if each is not None)
-    return one, two, three, four, five
 
 
 def _tail(value: ir.Value, count: int) -> list[int | None]:
@@ -211,3 +198,56 @@ def _starts(call: FusedCall, shapes: ir.Value) -> ir.Value:
     wide = call.cast(shapes, ir.DataType.INT64)
     areas = call.add("Mul", call.split_last(wide, 2))
     return call.add("CumSum", [areas, call.integers(0)], {"exclusive": 1})
+
+
+_LAYOUT = ("Expand", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze")
+
+
+def _before_softmax(call: FusedCall, weights: ir.Value, axes: int) -> ir.Value | None:
+    """Write the scores of a softmax in the layout of its weights, if there is one.
+
+    The last ``axes`` axes of ``weights`` are one row of the softmax.
+    """
+    shape = static_shape(weights)
+    if shape is None:
+        return None
+    # Walk back over layout operators that keep rows whole
+    row, chain, source = math.prod(shape[-axes:]), list[ir.Node](), weights
+    while node := maker(source, *_LAYOUT):
+        read = node.inputs[0]
+        if read is None or not _keeps_rows(node, row):
+            return None
+        chain.append(node)
+        source = read
+    # The softmax must be over the last axis
+    softmax = maker(source, "Softmax")
+    scores = None if softmax is None else softmax.inputs[0]
+    made = static_shape(source)
+    if softmax is None or scores is None or not made or made[-1] != row:
+        return None
+    if softmax.attributes.get_int("axis", -1) not in (-1, len(made) - 1):
+        return None
+    # Repeat the layout operators on its input
+    for node in reversed(chain):
+        attributes = {name: each.value for name, each in node.attributes.items()}
+        scores = call.add(node.op_type, [scores, *node.inputs[1:]], attributes)
+    return scores
+
+
+def _keeps_rows(node: ir.Node, row: int) -> bool:
+    read, made = static_shape(node.inputs[0]), static_shape(node.outputs[0])
+    if read is None or made is None:
+        return False
+    if node.op_type not in ("Expand", "Transpose"):
+        return True
+    # A row consists of the last axes of the input
+    kept = next(
+        (at for at in range(len(read) + 1) if math.prod(read[len(read) - at :]) == row),
+        None,
+    )
+    if kept is None:
+        return False
+    if node.op_type == "Expand":
+        return read[len(read) - kept :] == made[len(made) - kept :]
+    order = permutation_of(node) or []
+    return order[len(read) - kept :] == list(range(len(read) - kept, len(read)))

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims, open_shape
+from me2e_compress.graph.shapes import Dims, open_shape, product
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values
 
@@ -32,12 +32,17 @@ class Operator(abc.ABC):
             first.
         int8_inputs: indices of the inputs that may be int8, in the own form and every
             dialect: only features; positions and attention weights lose too much.
+        output: the dimensions of the output in the own form: letters of the operands,
+            integer attributes by name, and numbers.
+        work: what to multiply for the multiply-accumulates of a call, likewise.
     """
 
     name: ClassVar[str]
     own: ClassVar[Dialect]
     dialects: ClassVar[tuple[Dialect, ...]]
     int8_inputs: ClassVar[tuple[int, ...]] = ()
+    output: ClassVar[str] = ""
+    work: ClassVar[str] = ""
 
     @abc.abstractmethod
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
@@ -47,15 +52,32 @@ class Operator(abc.ABC):
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute the operator in the own form, in numpy and float64."""
 
-    @abc.abstractmethod
     def output_shape(
         self, shapes: Sequence[Dims | None], attributes: Attributes
     ) -> Dims | None:
-        """Return the output's shape in the own form, with None for open dimensions."""
+        """Return the output's shape in the own form, None for what is not known."""
+        letters = set(self.output.split())
+        pairs = zip(self.own.operands, shapes, strict=False)
+        if not any(shape and letters & set(each.letters) for each, shape in pairs):
+            return None
+        return self._sizes(self.output, shapes, attributes)
 
-    @abc.abstractmethod
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
         """Count the multiply-accumulates of a call in the own form, if known."""
+        sizes = self._sizes(self.work, shapes, attributes)
+        return product(sizes) if self.work else None
+
+    def _sizes(
+        self, dims: str, shapes: Sequence[Dims | None], attributes: Attributes
+    ) -> Dims:
+        """Return numbers for letters of operands, names of attributes and numbers."""
+        known = {k: value for k, value in attributes.items() if isinstance(value, int)}
+        for operand, shape in zip(self.own.operands, shapes, strict=False):
+            if shape is not None and operand.rank == len(shape):
+                for letter, size in zip(operand.letters, shape, strict=True):
+                    if size is not None:
+                        known.setdefault(letter, size)
+        return tuple(int(d) if d.isdigit() else known.get(d) for d in dims.split())
 
     def all_dialects(self) -> tuple[Dialect, ...]:
         """Return the own form, then every library's."""
@@ -85,8 +107,8 @@ def bytes_of(values: Sequence[ir.Value | None]) -> int | None:
         if value is None:
             continue
         shape = open_shape(value)
-        if shape is None or None in shape or value.dtype is None:
+        count = None if shape is None else product(shape)
+        if count is None or value.dtype is None:
             return None
-        count = math.prod(dim for dim in shape if dim is not None)
         total += math.ceil(count * value.dtype.itemsize)
     return total

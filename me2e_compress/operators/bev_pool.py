@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims
+from me2e_compress.graph.shapes import Dims, product
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
@@ -119,6 +119,6 @@ class BEVPool(Operator):
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
         """Count one for each of the K points and C channels."""
         feature, ranks = shapes[1], shapes[2]
-        if feature is None or ranks is None or feature[-1] is None or ranks[0] is None:
+        if feature is None or ranks is None:
             return None
-        return ranks[0] * feature[-1]
+        return product((ranks[0], feature[-1]))

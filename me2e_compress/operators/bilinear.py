@@ -131,7 +131,9 @@ def _by_gather(
     heads, width = call.size(value, 2), call.size(value, 3)
     sizes = call.cast(sizes, ir.DataType.INT64)
     height, columns = (
-        _by_level(call, call.add("Gather", [sizes, call.integers(axis)], {"axis": 1}))
+        call.unsqueeze(
+            call.add("Gather", [sizes, call.integers(axis)], {"axis": 1}), (1,)
+        )
         for axis in (0, 1)
     )
     x, y = call.split_last(locations, 2)
@@ -158,19 +160,11 @@ def _by_gather(
     return functools.reduce(lambda one, two: call.add("Add", [one, two]), parts)
 
 
-def _by_level(call: FusedCall, numbers: ir.Value) -> ir.Value:
-    return call.unsqueeze(numbers, (1,))
-
-
-def _as(call: FusedCall, count: ir.Value, like: ir.Value) -> ir.Value:
-    return call.cast(count, like.dtype or ir.DataType.FLOAT)
-
-
 def _neighbours(
     call: FusedCall, position: ir.Value, count: ir.Value
 ) -> list[tuple[ir.Value, ir.Value, ir.Value]]:
     """Write index, inside and share of the two pixels around a position on one axis."""
-    size = _as(call, count, position)
+    size = call.cast(count, position.dtype or ir.DataType.FLOAT)
     # The pixel below the position, and the distance to it
     scaled = call.add("Mul", [position, size])
     pixel = call.add("Sub", [scaled, call.numbers(0.5, position)])

@@ -78,15 +78,12 @@ class FusedCall:
         _infer(made, self.opset)
         return made.outputs[0]
 
-    def numbers(self, values: float | Sequence[float], like: ir.Value) -> ir.Value:
+    def numbers(
+        self, values: float | Sequence[float] | Array, like: ir.Value
+    ) -> ir.Value:
         """Add a constant of another value's element type."""
         kind = like.dtype or ir.DataType.FLOAT
         return self.constant(np.asarray(values, kind.numpy()))
-
-    def numbers_of(self, array: Array, like: ir.Value) -> ir.Value:
-        """Add an array in another value's element type."""
-        kind = like.dtype or ir.DataType.FLOAT
-        return self.constant(array.astype(kind.numpy()))
 
     def integers(self, values: int | Sequence[int]) -> ir.Value:
         """Add an int64 constant."""

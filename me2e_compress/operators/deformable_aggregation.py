@@ -1,7 +1,6 @@
 """Deformable feature aggregation (Sparse4D, arXiv 2211.10581; SparseDrive)."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -84,6 +83,8 @@ class DeformableAggregation(Operator):
     """
 
     name: ClassVar[str] = "deformable-aggregation"
+    output: ClassVar[str] = "N A C"
+    work: ClassVar[str] = "4 N A P V L C"
     int8_inputs: ClassVar[tuple[int, ...]] = (0,)
     own: ClassVar[Dialect] = Dialect(
         "me2e", _OP, OWN_DOMAIN, _operands(INTEGERS, (*FLOAT32, ir.DataType.FLOAT16)),
@@ -172,19 +173,3 @@ class DeformableAggregation(Operator):
             shares.transpose(0, 1, 5, 3, 4, 2).reshape(*shape[:3], -1, points),
         )
         return result.reshape(batch, anchors, -1)
-
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
-        """Return [N, A, C]."""
-        feature, weights = shapes[0] or (None,) * 3, shapes[4] or (None,) * 6
-        batch = feature[0] if feature[0] is not None else weights[0]
-        return (batch, weights[1], feature[2])
-
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count four neighbours and a weight for each sample of C numbers."""
-        feature, weights = shapes[0], shapes[4]
-        if feature is None or weights is None or feature[2] is None:
-            return None
-        known = [dim for dim in weights[:5] if dim is not None]
-        return 4 * math.prod(known) * feature[2] if len(known) == 5 else None

@@ -1,15 +1,12 @@
 """Multi-scale deformable attention (Deformable DETR, arXiv 2010.04159, equation 3)."""
 
 import dataclasses
-import math
-from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims
-from me2e_compress.operators.attention_layouts import JoinedHeads, RawAttention, five
+from me2e_compress.operators.attention_layouts import JoinedHeads, RawAttention
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall
@@ -24,6 +21,7 @@ from me2e_compress.operators.dialect import (
     NdArray,
     Operand,
     Values,
+    present,
 )
 
 
@@ -64,6 +62,8 @@ class DeformableAttention(Operator):
     """
 
     name: ClassVar[str] = "deformable-attention"
+    output: ClassVar[str] = "N Q M D"
+    work: ClassVar[str] = "4 N Q M L P D"
     int8_inputs: ClassVar[tuple[int, ...]] = (0,)
     own: ClassVar[Dialect] = Dialect(
         "me2e", "MultiScaleDeformableAttention", OWN_DOMAIN, _operands(INTEGERS), "me2e"
@@ -78,7 +78,7 @@ class DeformableAttention(Operator):
         JoinedHeads("autoware", _JOINED, "", _operands(INT32), "Autoware"),
         JoinedHeads(
             "mmdeploy", _MMCV, "mmdeploy", _operands(INT32), "mmdeploy",
-            (Attribute("im2col_step", 64, required=False),),
+            (Attribute("im2col_step", 64, required=False, own=""),),
         ),
         RawAttention("derryhub", _DERRYHUB_NAME, "", _RAW, _DERRYHUB),
         RawAttention("derryhub-trt2", f"{_DERRYHUB_NAME}2", "", _RAW, _DERRYHUB),
@@ -95,7 +95,7 @@ class DeformableAttention(Operator):
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
         """Sample every level, with GridSample where sizes are constant, else Gather."""
-        return sample_levels(call, *five(inputs))
+        return sample_levels(call, *present(inputs))
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [N, Q, M, D] float64."""
@@ -108,25 +108,3 @@ class DeformableAttention(Operator):
             locations.astype(np.float64),
             weights.astype(np.float64),
         )
-
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
-        """Return [N, Q, M, D]."""
-        value, locations = shapes[0], shapes[3]
-        if value is None and locations is None:
-            return None
-        value, locations = value or (None,) * 4, locations or (None,) * 6
-        batch = value[0] if value[0] is not None else locations[0]
-        heads = value[2] if value[2] is not None else locations[2]
-        return (batch, locations[1], heads, value[3])
-
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count four neighbours for each of N * Q * M * L * P samples of D numbers."""
-        value, weights = shapes[0], shapes[4]
-        if value is None or weights is None or value[3] is None:
-            return None
-        known = [dim for dim in weights if dim is not None]
-        if len(known) < len(weights):
-            return None
-        return 4 * math.prod(known) * value[3]

@@ -2,17 +2,15 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
-from me2e_compress.operators.call import Attributes, FusedCall, Size
+from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
     FLOAT32,
     FLOATS,
@@ -28,7 +26,6 @@ from me2e_compress.operators.dialect import (
     numbers,
     present,
 )
-from me2e_compress.operators.renamed_attributes import RenamedAttributes
 
 DEFORM_CONV_OPSET = 19
 """The first opset of ONNX's DeformConv."""
@@ -41,8 +38,8 @@ def _options(groups: str, offset_groups: str) -> tuple[Attribute, ...]:
         Attribute("stride", (1, 1)),
         Attribute("padding", (0, 0)),
         Attribute("dilation", (1, 1)),
-        Attribute(groups, 1),
-        Attribute(offset_groups, 1),
+        Attribute(groups, 1, own="groups"),
+        Attribute(offset_groups, 1, own="deform_groups"),
     )
 
 
@@ -51,19 +48,12 @@ def _operands(types: tuple[ir.DataType, ...]) -> tuple[Operand, ...]:
         Operand("input", "N C H W", types),
         Operand("offset", "N * F G", types, positions=True),
         Operand("mask", "N * F G", types),
-        Operand("weight", "O * * *", types),
+        Operand("weight", "O I R S", types),
         Operand("bias", "O", types, optional=True),
     )
 
 
 _OWN = _options("groups", "deform_groups")
-
-
-@dataclasses.dataclass(frozen=True)
-class NamedGroups(RenamedAttributes):
-    """A library with its own names for the two counts of groups, in the same order."""
-
-    own_attributes: ClassVar[tuple[Attribute, ...]] = _OWN
 
 
 _OSS = _options("group", "deformable_group")
@@ -86,16 +76,18 @@ class DeformableConvolution(Operator):
     """
 
     name: ClassVar[str] = "deformable-convolution"
-    own: ClassVar[Dialect] = NamedGroups(
+    output: ClassVar[str] = "N O F G"
+    work: ClassVar[str] = "N O F G I R S"
+    own: ClassVar[Dialect] = Dialect(
         "me2e", _CONV, OWN_DOMAIN, _operands(FLOATS), "me2e", _OWN
     )
     dialects: ClassVar[tuple[Dialect, ...]] = (
-        NamedGroups("tensorrt", _CONV, *_LIBRARY, _OSS),
-        NamedGroups("tensorrt-v2", _CONV, *_LIBRARY, _OSS, "2"),
-        NamedGroups("mmdeploy", _MMCV, "mmdeploy", *_MMDEPLOY, _OWN),
-        NamedGroups("mmcv", _MMCV, "mmcv", *_MMDEPLOY, _OWN),
-        NamedGroups("derryhub", _TRT, *_DERRYHUB, _OWN),
-        NamedGroups("derryhub-trt2", f"{_TRT}2", *_DERRYHUB, _OWN),
+        Dialect("tensorrt", _CONV, *_LIBRARY, _OSS),
+        Dialect("tensorrt-v2", _CONV, *_LIBRARY, _OSS, "2"),
+        Dialect("mmdeploy", _MMCV, "mmdeploy", *_MMDEPLOY, _OWN),
+        Dialect("mmcv", _MMCV, "mmcv", *_MMDEPLOY, _OWN),
+        Dialect("derryhub", _TRT, *_DERRYHUB, _OWN),
+        Dialect("derryhub-trt2", f"{_TRT}2", *_DERRYHUB, _OWN),
     )
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
@@ -147,20 +139,6 @@ class DeformableConvolution(Operator):
         result = result.reshape(batch, out, down, across)
         return np.add(result, bias[0].reshape(-1, 1, 1)) if bias else result
 
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
-        """Return [N, O, F, G]."""
-        offset, weight = shapes[1] or (None,) * 4, shapes[3] or (None,)
-        return (offset[0], weight[0], offset[2], offset[3])
-
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count the convolution: output elements times the numbers of a kernel."""
-        shape, weight = self.output_shape(shapes, attributes), shapes[3]
-        dims = [*(shape or (None,)), *(weight or (None,))[1:]]
-        known = [dim for dim in dims if dim is not None]
-        return math.prod(known) if len(known) == 7 else None
-
 
 def kernel_positions(
     out: tuple[int, int], kernel: tuple[int, int], attributes: Attributes
@@ -178,43 +156,6 @@ def kernel_positions(
     return grid.reshape(out[0] * out[1], kernel[0] * kernel[1], 1, 2)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Sizes:
-    """The sizes of one call, in the order (channels,) height, width."""
-
-    batch: Size
-    image: tuple[int, int, int]
-    out: tuple[int, int, int]
-    part: int
-    kernel: tuple[int, int]
-
-    @classmethod
-    def of(
-        cls, call: FusedCall, image: ir.Value, offset: ir.Value, weight: ir.Value
-    ) -> "_Sizes":
-        batch, *sizes = (call.size(image, axis) for axis in range(4))
-        sizes += (call.size(offset, axis) for axis in (2, 3))
-        sizes += (call.size(weight, axis) for axis in range(4))
-        known = [size for size in sizes if isinstance(size, int)]
-        if len(known) < len(sizes):
-            raise PreconditionError(
-                f"node {call.node.name}: below opset {DEFORM_CONV_OPSET} the shapes of"
-                f" {image.name}, {offset.name} and {weight.name} must be known"
-            )
-        deep, high, wide, down, across, out, part, *kernel = known
-        return cls(
-            batch, (deep, high, wide), (out, down, across), part, (kernel[0], kernel[1])
-        )
-
-    @property
-    def count(self) -> int:
-        return math.prod(self.kernel)
-
-    @property
-    def places(self) -> int:
-        return math.prod(self.out[1:])
-
-
 def _by_samples(
     call: FusedCall,
     image: ir.Value,
@@ -223,14 +164,25 @@ def _by_samples(
     weight: ir.Value,
     attributes: Attributes,
 ) -> ir.Value:
-    sizes = _Sizes.of(call, image, offset, weight)
-    (deep, high, wide), part, count = sizes.image, sizes.part, sizes.count
-    batch, places = sizes.batch, sizes.places
+    # All sizes but that of the batch must be known
+    batch = call.size(image, 0)
+    asked = [(image, (1, 2, 3)), (offset, (2, 3)), (weight, (0, 1, 2, 3))]
+    found = [call.known_size(value, axis) for value, axes in asked for axis in axes]
+    known = [size for size in found if size is not None]
+    if len(known) < len(found):
+        raise PreconditionError(
+            f"node {call.node.name}: below opset {DEFORM_CONV_OPSET} the shapes of"
+            f" {image.name}, {offset.name} and {weight.name} must be known"
+        )
+    deep, high, wide, down, across, out, part, *kernel = known
+    count, places = math.prod(kernel), down * across
     parts, groups = number(attributes, "deform_groups"), deep // part
     # The image as one level, with deform groups as heads
     value = call.reshape(image, (batch, parts, deep // parts, high * wide))
     value = call.transpose(value, (0, 3, 1, 2))  # [N, H*W, parts, C / parts]
-    locations = _locations(call, offset, sizes, attributes)
+    grid = kernel_positions((down, across), (kernel[0], kernel[1]), attributes)
+    moved = call.reshape(offset, (batch, parts, count, 2, places))
+    locations = _locations(call, moved, grid, (high, wide))
     shape = (batch, places * count, parts, 1, 1)
     shares = call.reshape(mask, (batch, parts, count, places))
     shares = call.reshape(call.transpose(shares, (0, 3, 2, 1)), shape)
@@ -247,27 +199,25 @@ def _by_samples(
     taken = call.reshape(taken, (batch, places, count, groups, part))
     taken = call.transpose(taken, (0, 3, 4, 2, 1))
     taken = call.reshape(taken, (batch, groups, part * count, places))
-    matrix = call.reshape(weight, (groups, sizes.out[0] // groups, part * count))
-    return call.reshape(call.add("MatMul", [matrix, taken]), (batch, *sizes.out))
+    matrix = call.reshape(weight, (groups, out // groups, part * count))
+    result = call.add("MatMul", [matrix, taken])
+    return call.reshape(result, (batch, out, down, across))
 
 
 def _locations(
-    call: FusedCall, offset: ir.Value, sizes: _Sizes, attributes: Attributes
+    call: FusedCall, offsets: ir.Value, grid: NdArray, image: tuple[int, int]
 ) -> ir.Value:
     """Write x and y of each kernel element in 0..1 of the image.
 
-    The shape is [N, F * G, elements, deform_groups, 2].
+    ``offsets`` is [N, deform_groups, elements, 2, F * G], ``grid`` what
+    :func:`kernel_positions` gives; the result [N, F * G, elements, deform_groups, 2].
     """
-    parts = number(attributes, "deform_groups")
-    shape = (sizes.batch, parts, sizes.count, 2, sizes.places)
-    moved = call.transpose(call.reshape(offset, shape), (0, 4, 2, 1, 3))
-    grid = kernel_positions(sizes.out[1:], sizes.kernel, attributes)
-    at = call.add("Add", [moved, call.numbers_of(grid, moved)])
+    moved = call.transpose(offsets, (0, 4, 2, 1, 3))
+    at = call.add("Add", [moved, call.numbers(grid, moved)])
     y, x = call.split_last(at, 2)
     half = call.numbers(0.5, at)
-    _, high, wide = sizes.image
     edges = []
-    for axis, size in ((x, wide), (y, high)):
+    for axis, size in ((x, image[1]), (y, image[0])):
         centre = call.add("Add", [axis, half])
         share = call.add("Div", [centre, call.numbers(float(size), axis)])
         edges.append(call.unsqueeze(share, (-1,)))

@@ -52,9 +52,14 @@ class Operand:
     scores: bool = False
 
     @property
+    def letters(self) -> list[str]:
+        """Its dimensions one by one; none where any number is accepted."""
+        return [] if self.dims is None else self.dims.split()
+
+    @property
     def rank(self) -> int | None:
         """The number of dimensions; None where any number is accepted."""
-        return None if self.dims is None else len(self.dims.split())
+        return None if self.dims is None else len(self.letters)
 
     def takes(self, kind: ir.DataType | None) -> bool:
         """Return whether an element type is accepted, float64 counting as float32."""
@@ -72,12 +77,20 @@ class Attribute:
         default: the value of its type that a conversion writes if it knows none.
         required: whether the plugin refuses a node without it.
         choices: the allowed values; empty for any.
+        own: its name in the own form; None where that is the same, empty where the own
+            form lacks it.
     """
 
     name: str
     default: int | float | str | tuple[int, ...]
     required: bool = True
     choices: tuple[int | str, ...] = ()
+    own: str | None = None
+
+    @property
+    def own_name(self) -> str:
+        """Its name in the own form; empty if that lacks it."""
+        return self.name if self.own is None else self.own
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,11 +139,12 @@ class Dialect:
 
     def options_to_own(self, attributes: Attributes) -> Attributes:
         """Convert this dialect's attributes to the own form's."""
-        return attributes
+        known = [each for each in self.attributes if each.name in attributes]
+        return {e.own_name: attributes[e.name] for e in known if e.own_name}
 
     def options_from_own(self, attributes: Attributes) -> Attributes:
         """Convert the own form's attributes to this dialect's."""
-        return attributes
+        return {e.name: attributes.get(e.own_name, e.default) for e in self.attributes}
 
     def result_to_own(self, call: FusedCall, result: ir.Value, own: Values) -> ir.Value:
         """Write the conversion of this dialect's output to the own form's."""
@@ -239,7 +253,7 @@ class Dialect:
     ) -> None:
         if operand.dims is None or shape is None:
             return
-        wanted = operand.dims.split()
+        wanted = operand.letters
         fits = len(wanted) == len(shape)
         # A letter stands for one size in all operands
         for letter, size in zip(wanted, shape, strict=False):

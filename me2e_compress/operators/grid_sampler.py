@@ -1,7 +1,6 @@
 """Sample an image or a volume at a grid of positions (torch's ``grid_sample``)."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -25,7 +24,6 @@ from me2e_compress.operators.dialect import (
     present,
 )
 from me2e_compress.operators.grid_positions import grid_by_gather, grid_sample_array
-from me2e_compress.operators.renamed_attributes import RenamedAttributes
 
 _SCALE = 10.0
 """BEVFormer_tensorrt multiplies a grid by this for a better int8 range."""
@@ -33,7 +31,7 @@ _SCALE = 10.0
 
 def _options(first: str, *, required: bool = True) -> tuple[Attribute, ...]:
     return (
-        Attribute(first, 0, required, (0, 1, 2)),
+        Attribute(first, 0, required, (0, 1, 2), own="interpolation_mode"),
         Attribute("padding_mode", 0, required, (0, 1, 2)),
         Attribute("align_corners", 0, required, (0, 1)),
     )
@@ -43,14 +41,7 @@ _OWN = _options("interpolation_mode")
 
 
 @dataclasses.dataclass(frozen=True)
-class Sampler(RenamedAttributes):
-    """A library with its own names for the three attributes, in the same order."""
-
-    own_attributes: ClassVar[tuple[Attribute, ...]] = _OWN
-
-
-@dataclasses.dataclass(frozen=True)
-class ScaledGrid(Sampler):
+class ScaledGrid(Dialect):
     """A library whose grid is [N, 2 or 3, ...] and multiplied by 10."""
 
     def inputs_to_own(
@@ -95,7 +86,7 @@ def _operands(
 
 
 def _own(dims: int) -> Dialect:
-    return Sampler(
+    return Dialect(
         "me2e", f"GridSampler{dims}D", OWN_DOMAIN, _operands(dims, FLOATS), "me2e", _OWN
     )
 
@@ -129,10 +120,12 @@ class GridSampler2D(Operator):
     """
 
     name: ClassVar[str] = "grid-sampler-2d"
+    output: ClassVar[str] = "N C F G"
+    work: ClassVar[str] = "N C F G"
     own: ClassVar[Dialect] = _own(2)
     dialects: ClassVar[tuple[Dialect, ...]] = (
         *_scaled(2),
-        Sampler(
+        Dialect(
             "mmdeploy",
             "grid_sampler",
             "mmdeploy",
@@ -165,27 +158,15 @@ class GridSampler2D(Operator):
         """Compute it in numpy, [N, C, ...] float64."""
         return grid_sample_array(inputs, attributes)
 
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
-        """Return batch and channels of the input, then the sizes of the grid."""
-        image, grid = shapes
-        if grid is None:
-            return None
-        return (*((None, None) if image is None else image[:2]), *grid[1:-1])
-
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
         """Count the neighbours of each element: 2, 1 or 4 along each axis."""
-        shape = self.output_shape(shapes, attributes)
-        known = [dim for dim in shape or () if dim is not None]
-        if shape is None or len(known) < len(shape):
-            return None
-        # Nearest moves data only
         mode = number(attributes, "interpolation_mode")
-        if mode == 1:
-            return 0
-        each: int = (4 if mode == 2 else 2) ** (len(known) - 2)
-        return math.prod(known) * each
+        whole = super().macs(shapes, attributes)
+        if whole is None:
+            return None
+        along = (2, 0, 4)[mode]  # nearest moves data only
+        each: int = along ** len(self.output.split()[2:])
+        return whole * each
 
 
 _MODES, _NEW_MODES = ("bilinear", "nearest", "bicubic"), ("linear", "nearest", "cubic")
@@ -204,6 +185,8 @@ class GridSampler3D(GridSampler2D):
     """
 
     name: ClassVar[str] = "grid-sampler-3d"
+    output: ClassVar[str] = "N C E F G"
+    work: ClassVar[str] = "N C E F G"
     own: ClassVar[Dialect] = _own(3)
     dialects: ClassVar[tuple[Dialect, ...]] = _scaled(3)
     native_opset: ClassVar[int] = _RENAMED

@@ -1,7 +1,6 @@
 """The inverse of small matrices, for example of cameras."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -9,7 +8,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph.shapes import Dims
+from me2e_compress.graph.shapes import Dims, product
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
@@ -81,7 +80,7 @@ class Inverse(Operator):
         flat = call.reshape(matrix, (*outer, size * size))
         minors = call.add("Gather", [flat, call.constant(_minors(size))], {"axis": -1})
         parity = np.indices((size, size)).sum(axis=0) % 2
-        signs = call.numbers_of(1 - 2 * parity, matrix)
+        signs = call.numbers(1 - 2 * parity, matrix)
         adjugate = call.add("Mul", [call.add("Det", [minors]), signs])
         whole = call.unsqueeze(call.add("Det", [matrix]), (rank - 2, rank - 1))
         return call.cast(call.add("Div", [adjugate, whole]), kind)
@@ -99,10 +98,7 @@ class Inverse(Operator):
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
         """Count n cubed for each matrix, the work of an elimination."""
         shape = shapes[0]
-        known = [dim for dim in shape or () if dim is not None]
-        if shape is None or len(known) < len(shape):
-            return None
-        return math.prod(known) * known[-1]
+        return None if shape is None else product((*shape, shape[-1]))
 
 
 def _minors(size: int) -> NdArray:

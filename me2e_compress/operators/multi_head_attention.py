@@ -2,13 +2,11 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
@@ -43,6 +41,8 @@ class FusedMultiHeadAttention(Operator):
     """
 
     name: ClassVar[str] = "multi-head-attention"
+    output: ClassVar[str] = "B Q C"
+    work: ClassVar[str] = "2 B Q C K"
     own: ClassVar[Dialect] = _dialect("me2e", "MultiHeadAttention", OWN_DOMAIN, "me2e")
     dialects: ClassVar[tuple[Dialect, ...]] = (
         _dialect("derryhub", "QKVTRT", "", "BEVFormer_tensorrt"),
@@ -66,17 +66,3 @@ class FusedMultiHeadAttention(Operator):
         weights = np.exp(scores - scores.max(axis=-1, keepdims=True))
         result: NdArray = (weights / weights.sum(axis=-1, keepdims=True)) @ value
         return result
-
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
-        """Return [B, Q, C]."""
-        return shapes[0]
-
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count both products."""
-        query, key = shapes[0], shapes[1]
-        known = [dim for dim in query or () if dim is not None]
-        if len(known) < 3 or key is None or key[1] is None:
-            return None
-        return 2 * math.prod(known) * key[1]

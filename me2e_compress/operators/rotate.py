@@ -54,6 +54,8 @@ class Rotate(Operator):
     """
 
     name: ClassVar[str] = "rotate"
+    output: ClassVar[str] = "C H W"
+    work: ClassVar[str] = "4 C H W"
     own: ClassVar[Dialect] = _dialect("me2e", "Rotate", OWN_DOMAIN, "me2e")
     dialects: ClassVar[tuple[Dialect, ...]] = (
         _dialect("derryhub", "RotateTRT", "", _DERRYHUB),
@@ -104,8 +106,14 @@ class Rotate(Operator):
         down = call.unsqueeze(down, (1,))
         # Rotate, and move back
         turned = (
-            call.add("Sub", self._products(call, (cosine, across), (sine, down))),
-            call.add("Add", self._products(call, (sine, across), (cosine, down))),
+            call.add(
+                "Sub",
+                [call.add("Mul", [cosine, across]), call.add("Mul", [sine, down])],
+            ),
+            call.add(
+                "Add",
+                [call.add("Mul", [sine, across]), call.add("Mul", [cosine, down])],
+            ),
         )
         half = call.numbers(0.5, angle)
         moved = (call.add("Sub", [at, half]) for at in (x, y))
@@ -114,14 +122,6 @@ class Rotate(Operator):
             for at, start in zip(turned, moved, strict=True)
         )
         return one, two
-
-    def _products(
-        self,
-        call: FusedCall,
-        one: tuple[ir.Value, ir.Value],
-        two: tuple[ir.Value, ir.Value],
-    ) -> list[ir.Value]:
-        return [call.add("Mul", list(pair)) for pair in (one, two)]
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [C, H, W] float64."""
@@ -151,15 +151,7 @@ class Rotate(Operator):
         )
         return result.reshape(height, width, channels).transpose(2, 0, 1)
 
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
-        """Return [C, H, W]."""
-        return shapes[0]
-
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
         """Count four neighbours for each element; none for the nearest."""
-        if attributes["interpolation"] == 1:
-            return 0
-        known = [dim for dim in shapes[0] or () if dim is not None]
-        return 4 * math.prod(known) if len(known) == 3 else None
+        nearest = attributes["interpolation"] == 1
+        return 0 if nearest else super().macs(shapes, attributes)

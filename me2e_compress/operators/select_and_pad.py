@@ -1,13 +1,11 @@
 """The flagged rows of a table, padded to a fixed number."""
 
 import dataclasses
-from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
@@ -52,6 +50,8 @@ class SelectAndPad(Operator):
     """
 
     name: ClassVar[str] = "select-and-pad"
+    output: ClassVar[str] = "B P C"
+    work: ClassVar[str] = "0"
     own: ClassVar[Dialect] = _dialect(
         "me2e", "SelectAndPad", OWN_DOMAIN, "me2e", FLOATS, INTEGERS
     )
@@ -95,14 +95,3 @@ class SelectAndPad(Operator):
             chosen = rows[flag[index] > 0][:count]
             result[index, : len(chosen)] = chosen
         return result
-
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
-        """Return [B, P, C]."""
-        feature = shapes[0] or (None,) * 3
-        return (feature[0], number(attributes, "P"), feature[2])
-
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count none: rows are moved."""
-        return 0

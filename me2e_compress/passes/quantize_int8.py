@@ -27,9 +27,9 @@ from me2e_compress.quantization.plan import (
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS, LintFinding, Target
-from me2e_compress.targets.onnxruntime.writer import BY, Writer
 from me2e_compress.targets.quantized import describe_quantized
 from me2e_compress.targets.weights import QuantizedWeight, weights_of
+from me2e_compress.targets.writer import BY, Writer
 
 _SHOWN = 5
 """Number of items of a kind that a note lists."""

@@ -1,7 +1,7 @@
 """Find the layers that produce positions."""
 
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 
 import onnx_ir as ir
 
@@ -57,23 +57,13 @@ def find_coordinates(
     is linear in the graph. Sampling weights whose layer reads the same tensor as such a
     layer are mapped too. ``constants`` are values that no input changes.
     """
-    found: dict[ir.Node, str] = {}
-    # back from the readers of positions, each node once
-    queue = deque(_positions(model.graph))
-    seen: set[ir.Node] = set()
-    while queue:
-        value, reader = queue.popleft()
-        node = value.producer()
-        if node is None or node in seen or value in constants:
-            continue
-        seen.add(node)
-        if node.op_type in _LAYERS:
-            found[node] = f"positions that {reader} reads come from it"
-        if node.op_type in _LAYERS and is_few(depth(node)):  # a matrix by points
-            queue.extend((each, reader) for each in node.inputs if each is not None)
-        elif node.op_type in _ARITHMETIC:
-            data = node.inputs[: _DATA_ONLY.get(node.op_type, len(node.inputs))]
-            queue.extend((each, reader) for each in data if each is not None)
+    found = {
+        node: f"positions that {reader} reads come from it"
+        for node, reader in _behind_positions(
+            model.graph, lambda layer: is_few(depth(layer)), constants
+        )
+        if node.op_type in _LAYERS
+    }
     return {**found, **_companions(model, found, constants)}
 
 
@@ -86,20 +76,43 @@ def position_arithmetic(
     on through other products, which are projections: of two computed operands, or of a
     camera's matrix and a table of points.
     """
-    # back from the readers of positions, through products without weights
-    found: set[ir.Node] = set()
-    queue = deque(value for value, _ in _positions(model.graph))
+    behind_positions = _behind_positions(
+        model.graph, lambda layer: not _has_weight(layer, constants)
+    )
+    return frozenset(
+        node
+        for node, _ in behind_positions
+        if node.op_type in _ARITHMETIC or node.op_type in _LAYERS
+    )
+
+
+def _behind_positions(
+    graph: ir.Graph,
+    goes_through: Callable[[ir.Node], bool],
+    known: Collection[ir.Value] = (),
+) -> Iterator[tuple[ir.Node, str]]:
+    """Walk back from the readers of positions; yield each node once, and its reader.
+
+    The walk goes on through arithmetic, and through the layers that the test names; it
+    ends at ``known`` values.
+    """
+    queue = deque(_positions(graph))
+    seen: set[ir.Node] = set()
     while queue:
-        node = queue.popleft().producer()
-        if node is None or node in found:
+        value, reader = queue.popleft()
+        node = value.producer()
+        if node is None or node in seen or value in known:
             continue
-        if node.op_type not in _ARITHMETIC and node.op_type not in _LAYERS:
-            continue
-        found.add(node)
-        if node.op_type in _ARITHMETIC or not _has_weight(node, constants):
+        seen.add(node)
+        yield node, reader
+        # Indices and bounds are looked at on their own
+        if node.op_type in _ARITHMETIC:
             data = node.inputs[: _DATA_ONLY.get(node.op_type, len(node.inputs))]
-            queue.extend(each for each in data if each is not None)
-    return frozenset(found)
+        elif node.op_type in _LAYERS and goes_through(node):
+            data = node.inputs
+        else:
+            continue
+        queue.extend((each, reader) for each in data if each is not None)
 
 
 def _has_weight(layer: ir.Node, constants: Collection[ir.Value]) -> bool:

@@ -84,17 +84,17 @@ def find_geometry(
     One sweep over the graph, which is in topological order. ``constants`` are values
     that no input changes.
     """
-    flow = _Flow(constants)
+    walk = _GeometryWalk(constants)
     for value in model.graph.inputs:
         source = _source(value)
         if source is not None and value not in constants:
-            flow.sources[value] = source
-    for node in model.graph if flow.sources else ():
-        flow.enter(node)
-    return flow.found
+            walk.sources[value] = source
+    for node in model.graph if walk.sources else ():
+        walk.enter(node)
+    return walk.found
 
 
-class _Flow:
+class _GeometryWalk:
     """Geometry on its way through a graph.
 
     ``sources`` are those of the values that are geometry, ``found`` the products that

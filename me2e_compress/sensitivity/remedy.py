@@ -1,7 +1,6 @@
 """Find the nodes or modules that restore quality when kept in float."""
 
 import dataclasses
-import math
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
@@ -20,7 +19,6 @@ from me2e_compress.quantization.plan.overrides import (
 )
 from me2e_compress.runtime.session import Session
 from me2e_compress.sensitivity.analysis import bisect
-from me2e_compress.sensitivity.suffix import Suffix
 
 MOST_TRIALS = 12
 """Variants built and run in one search: one node among a thousand, confirmed."""
@@ -73,9 +71,11 @@ class Remedy:
         )
 
 
-Measure: TypeAlias = Callable[[Sequence[Int8Node], Sequence[Int8Node]], Fidelity]
-"""Builds the variant in which some nodes are float, and compares it; that, and the
-group that is being narrowed down: everything else is float. Without group: none is."""
+Measure: TypeAlias = Callable[[Sequence[Int8Node]], Fidelity]
+"""Builds the variant in which some nodes are float, and compares it."""
+
+Build: TypeAlias = Callable[[Sequence[Override]], ir.Model]
+"""Builds the int8 graph again, with overrides behind those that it was built with."""
 
 
 def int8_nodes(plan: QuantPlan) -> tuple[Int8Node, ...]:
@@ -96,31 +96,41 @@ def int8_nodes(plan: QuantPlan) -> tuple[Int8Node, ...]:
 def find_remedy(
     plan: QuantPlan,
     made: ir.Model,
-    trials: "RemedyTrials",
+    build: Build,
+    reference: Reference,
     floor: Floor,
     *,
     unsteady: Collection[str] = (),
     progress: Callable[[int, int, str], None] = lambda done, most, what: None,
 ) -> Remedy:
-    """Search what must be float in a graph that was made by a plan, on few frames."""
-    start = trials.begin(made, floor, unsteady)
-    nodes, measure = int8_nodes(plan), trials.measure
-    return search_remedy(
-        nodes, start, measure, floor, unsteady=unsteady, progress=progress
+    """Search what must be float in a graph that was made by a plan, on few frames.
+
+    The first frame alone is compared if it shows the loss.
+    """
+
+    def compare(model: ir.Model) -> Fidelity:
+        provider = reference.session.provider
+        return used.compare(Session(model, release=True, provider=provider))
+
+    first = tuple(islice(reference.frames, 1))
+    used = Reference(reference.session, first, reference.answers[:1])
+    start = compare(made)
+    if not floor.shortfalls(start, unsteady):
+        used = reference
+        start = compare(made)
+    search = RemedySearch(
+        int8_nodes(plan),
+        lambda floats: compare(build([keep_float(each.name, "") for each in floats])),
+        floor,
+        unsteady,
+        progress=progress,
     )
+    return search.run(start)
 
 
-def search_remedy(
-    nodes: Sequence[Int8Node],
-    start: Fidelity,
-    measure: Measure,
-    floor: Floor,
-    *,
-    unsteady: Collection[str] = (),
-    most_trials: int = MOST_TRIALS,
-    progress: Callable[[int, int, str], None] = lambda done, most, what: None,
-) -> Remedy:
-    """Search the nodes that must be float for every output to be above the floor.
+@dataclasses.dataclass
+class RemedySearch:
+    """A search of the nodes that must be float for every output to be above the floor.
 
     The noise of the worst output is followed by bisection: half of the nodes is int8 at
     a time, one trial a step; the other half makes what is left of the noise, as a sum
@@ -128,59 +138,47 @@ def search_remedy(
     there is no such node, the module from which most of the noise comes is. Then the
     whole is measured again, and the next one is looked for.
 
-    ``nodes`` are the int8 ones in graph order, ``start`` is the fidelity with all of
-    them; ``unsteady`` outputs are not judged; ``progress`` is called as
-    ``progress(trials done, most trials, words)``.
+    ``nodes`` are the int8 ones in graph order; ``unsteady`` outputs are not judged;
+    ``progress`` is called as ``progress(trials done, most trials, words)``; ``done``
+    counts trials, ``alone`` and ``modules`` are kept float so far.
     """
-    search = _Search(nodes, measure, floor, unsteady, most_trials, progress)
-    return search.run(start)
 
-
-class _Search:
-    """One search: what is float so far, and how many trials are left."""
-
-    def __init__(
-        self,
-        nodes: Sequence[Int8Node],
-        measure: Measure,
-        floor: Floor,
-        unsteady: Collection[str],
-        most_trials: int,
-        progress: Callable[[int, int, str], None],
-    ) -> None:
-        self._nodes = tuple(nodes)
-        self._run = measure
-        self._floor = floor
-        self._unsteady = unsteady
-        self._most = most_trials
-        self._progress = progress
-        self._done = 0
-        self._alone: list[Int8Node] = []
-        self._modules: list[str] = []
+    nodes: Sequence[Int8Node]
+    measure: Measure
+    floor: Floor
+    unsteady: Collection[str] = ()
+    most_trials: int = MOST_TRIALS
+    progress: Callable[[int, int, str], None] = lambda done, most, what: None
+    done: int = 0
+    alone: list[Int8Node] = dataclasses.field(default_factory=list)
+    modules: list[str] = dataclasses.field(default_factory=list)
 
     def run(self, start: Fidelity) -> Remedy:
-        """Follow the worst output until none is below the floor, or trials run out."""
+        """Follow the worst output until none is below the floor, or trials run out.
+
+        ``start`` is the fidelity with all nodes in int8.
+        """
         found = start
-        while below := self._floor.shortfalls(found, self._unsteady):
+        while below := self.floor.shortfalls(found, self.unsteady):
             # A step of the bisection, and the trial that confirms it.
             if not self._has_left(2) or not self._keep(below[0]):
                 break
-            found = self._measure(self._floats(), ())
-        nodes = [each for each in self._alone if each.module not in self._modules]
-        return Remedy(tuple(nodes), tuple(self._modules), found, below, self._done)
+            found = self._try(self._floats())
+        nodes = [each for each in self.alone if each.module not in self.modules]
+        return Remedy(tuple(nodes), tuple(self.modules), found, below, self.done)
 
     def _keep(self, worst: Shortfall) -> bool:
         """Keep more nodes float; False if nothing is left that would help."""
-        left = [each for each in self._nodes if each not in self._floats()]
+        left = [each for each in self.nodes if each not in self._floats()]
         group = self._narrow(left, worst)
         if len(group) == 1:
-            self._alone += group
+            self.alone += group
             return True
         modules = Counter(each.module for each in group if each.module)
         inside = {each.module for each in left}
         if not modules or len(inside) == 1:
             return False  # all that is left would be float
-        self._modules.append(modules.most_common(1)[0][0])
+        self.modules.append(modules.most_common(1)[0][0])
         return True
 
     def _narrow(
@@ -192,9 +190,8 @@ class _Search:
             halves: tuple[Sequence[Int8Node], Sequence[Int8Node]], noise: float
         ) -> list[tuple[Sequence[Int8Node], float]]:
             first, second = halves
-            floats = [each for each in self._nodes if each not in first]
-            found = self._measure(floats, [*first, *second])
-            one = self._floor.excess(found, worst.output)
+            found = self._try([e for e in self.nodes if e not in first])
+            one = self.floor.excess(found, worst.output)
             other = max(noise**2 - one**2, 0.0) ** 0.5
             return [(first, one) if one >= other else (second, other)]
 
@@ -202,92 +199,16 @@ class _Search:
         return next(bisect(group, worst.excess, louder, may_go_on)).items
 
     def _has_left(self, trials: int) -> bool:
-        return self._done + trials <= self._most
+        return self.done + trials <= self.most_trials
 
     def _floats(self) -> list[Int8Node]:
         return [
             each
-            for each in self._nodes
-            if each in self._alone or each.module in self._modules
+            for each in self.nodes
+            if each in self.alone or each.module in self.modules
         ]
 
-    def _measure(
-        self, floats: Sequence[Int8Node], group: Sequence[Int8Node]
-    ) -> Fidelity:
-        self._progress(self._done, self._most, "")
-        self._done += 1
-        return self._run(floats, group)
-
-
-Build: TypeAlias = Callable[[Sequence[Override]], ir.Model]
-"""Builds the int8 graph again, with overrides behind those that it was built with."""
-
-
-class RemedyTrials:
-    """Variants of one quantization, compared with the float graph.
-
-    While a group is narrowed down, everything before it is float and answers as it did:
-    where that saves more MACs than it costs, only what is behind the group is run
-    again. ``before`` is the float graph whose answers ``reference`` holds.
-    """
-
-    def __init__(self, before: ir.Model, build: Build, reference: Reference) -> None:
-        self._before = before
-        self._build = build
-        self._reference = reference
-        self._suffix: tuple[Suffix, Reference] | None = None
-        self._within: frozenset[str] = frozenset()
-
-    def begin(
-        self, made: ir.Model, floor: Floor, unsteady: Collection[str]
-    ) -> Fidelity:
-        """Compare the int8 graph, on its first frame alone if that shows the loss."""
-        whole = self._reference
-        first = tuple(islice(whole.frames, 1))
-        self._reference = Reference(whole.session, first, whole.answers[:1])
-        found = self._compare(made)
-        if not floor.shortfalls(found, unsteady):
-            self._reference = whole
-            found = self._compare(made)
-        return found
-
-    def measure(
-        self, floats: Sequence[Int8Node], group: Sequence[Int8Node] = ()
-    ) -> Fidelity:
-        """Build a variant and compare it.
-
-        ``floats`` become float; ``group`` holds every node that is int8 then, or is
-        empty.
-        """
-        made = self._build([keep_float(each.name, "") for each in floats])
-        # run only what is behind the group, if that can be cut out of the variant
-        found = self._narrowed(group)
-        if found is not None:
-            suffix, reference = found
-            part = suffix.cut(made)
-            if part is not None:
-                return reference.compare(self._session(part))
-        return self._compare(made)
-
-    def _compare(self, model: ir.Model) -> Fidelity:
-        return self._reference.compare(self._session(model))
-
-    def _session(self, model: ir.Model) -> Session:
-        provider = self._reference.session.provider
-        return Session(model, release=True, provider=provider)
-
-    def _narrowed(self, group: Sequence[Int8Node]) -> tuple[Suffix, Reference] | None:
-        """Return what is behind a group, if running only that is worth its capture."""
-        if not group or len(self._reference.answers) > 1:
-            return None  # of several frames the state would be another
-        names = frozenset(each.name for each in group)
-        known = self._suffix if names <= self._within else None
-        whole = 1.0 if known is None else known[0].share
-        found = Suffix.behind(self._before, names)
-        if found is None or not found.outputs:
-            return None
-        # Each trial saves the difference; capturing costs a run of the graph.
-        if math.log2(len(names)) * (whole - found.share) > 1:
-            known = found, found.capture(self._before, self._reference)
-            self._suffix, self._within = known, names
-        return known
+    def _try(self, floats: Sequence[Int8Node]) -> Fidelity:
+        self.progress(self.done, self.most_trials, "")
+        self.done += 1
+        return self.measure(floats)

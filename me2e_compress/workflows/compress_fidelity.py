@@ -22,7 +22,7 @@ from me2e_compress.quantization.plan import plan_of
 from me2e_compress.quantization.plan.overrides import Override, overrides_text
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.session import Session
-from me2e_compress.sensitivity.remedy import Remedy, RemedyTrials, find_remedy
+from me2e_compress.sensitivity.remedy import Remedy, find_remedy
 from me2e_compress.workflows.listener import Listener
 
 KEPT_OUT = "kept out of calibration"
@@ -180,13 +180,13 @@ class _Measurement:
         if plan is None or "overrides" not in quantizer.applied.option_names():
             return guilty
         build = partial(self._with_overrides, quantizer)
-        trials = RemedyTrials(quantizer.before, build, reference)
         progress = partial(self.listener.on_progress, "search")
         try:
             remedy = find_remedy(
                 plan,
                 self.report.model,
-                trials,
+                build,
+                reference,
                 self.floor,
                 unsteady=found.unsteady,
                 progress=progress,

@@ -157,35 +157,46 @@ def node_of(dialect: str, **changed: npt.NDArray[Any]) -> ir.Node:
     return graph_of(row, {**arrays, **changed}, opset=17, constants=SHAPES[:1]).graph[0]
 
 
-def test_an_unknown_attribute_is_named() -> None:
-    node = node_of("mmdeploy")
-    node.attributes["im2col"] = ir.AttrInt64("im2col", 64)
-    told = "fused: .*: no attribute 'im2col'; there are im2col_step"
-    with pytest.raises(PreconditionError, match=told):
-        expand(node, opset=17, by="test")
-
-
-def test_an_attribute_of_another_type_is_named() -> None:
-    node = node_of("mmdeploy")
-    node.attributes["im2col_step"] = ir.AttrString("im2col_step", "64")
-    with pytest.raises(PreconditionError, match="im2col_step is '64', not int"):
-        expand(node, opset=17, by="test")
-
-
-def test_shapes_of_another_dialect_are_named() -> None:
-    locations = np.zeros((1, 3, 2, 8), np.float32)  # as the raw dialect has offsets
-    node = node_of("tensorrt", sampling_locations=locations)
-    with pytest.raises(
-        PreconditionError,
-        match=r"fused: MultiscaleDeformableAttnPlugin_TRT of TensorRT OSS:"
-        r" sampling_locations is \[1, 3, 2, 8\], not \[N=1, Q=3, M=2, L=2",
-    ):
-        expand(node, opset=17, by="test")
-
-
-def test_levels_that_do_not_go_with_the_offsets_are_named() -> None:
-    node = node_of("derryhub", spatial_shapes=np.ones((3, 2), np.int32))
-    with pytest.raises(PreconditionError, match="do not go with 3 levels"):
+@pytest.mark.parametrize(
+    ("dialect", "attribute", "arrays", "message"),
+    [
+        (
+            "mmdeploy",
+            ir.AttrInt64("im2col", 64),
+            {},
+            "fused: .*: no attribute 'im2col'; there are im2col_step",
+        ),
+        (
+            "mmdeploy",
+            ir.AttrString("im2col_step", "64"),
+            {},
+            "im2col_step is '64', not int",
+        ),
+        (
+            "tensorrt",
+            None,
+            {"sampling_locations": np.zeros((1, 3, 2, 8), np.float32)},
+            r"fused: MultiscaleDeformableAttnPlugin_TRT of TensorRT OSS:"
+            r" sampling_locations is \[1, 3, 2, 8\], not \[N=1, Q=3, M=2, L=2",
+        ),
+        (
+            "derryhub",
+            None,
+            {"spatial_shapes": np.ones((3, 2), np.int32)},
+            "do not go with 3 levels",
+        ),
+    ],
+)
+def test_what_a_dialect_does_not_take_is_named(
+    dialect: str,
+    attribute: ir.Attr | None,
+    arrays: dict[str, npt.NDArray[Any]],
+    message: str,
+) -> None:
+    node = node_of(dialect, **arrays)
+    if attribute is not None:
+        node.attributes.add(attribute)
+    with pytest.raises(PreconditionError, match=message):
         expand(node, opset=17, by="test")
 
 

@@ -72,7 +72,10 @@ def test_nodes_that_only_one_plan_has_are_differences() -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("{}", "not a plan: scheme: Field required"), ("no", "not a plan: file: Invalid")],
+    [
+        ("{}", "not a plan: scheme: Field required"),
+        ("no", "not a plan: the file: Invalid"),
+    ],
 )
 def test_not_a_plan(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "plan.json").write_text(text)

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from me2e_compress.fidelity.compare import Fidelity, OutputFidelity
 from me2e_compress.fidelity.floor import Floor
 from me2e_compress.quantization.plan.overrides import Overrides
-from me2e_compress.sensitivity.remedy import Int8Node, Measure, Remedy, search_remedy
+from me2e_compress.sensitivity.remedy import Int8Node, Measure, Remedy, RemedySearch
 
 NODES = [
     Int8Node(f"/m{at // 16}/n{at}[x]", "MatMul", f"m{at // 16}") for at in range(64)
@@ -14,7 +14,7 @@ NODES = [
 def made(noise: Mapping[int, float]) -> Measure:
     """Independent errors: the noise of each node, squares added; signal 1."""
 
-    def measure(floats: Sequence[Int8Node], group: Sequence[Int8Node]) -> Fidelity:
+    def measure(floats: Sequence[Int8Node]) -> Fidelity:
         power = 1e-9 + sum(
             noise.get(at, 0.0) ** 2
             for at, node in enumerate(NODES)
@@ -28,7 +28,8 @@ def made(noise: Mapping[int, float]) -> Measure:
 
 def search(noise: Mapping[int, float], most: int = 14) -> Remedy:
     measure = made(noise)
-    return search_remedy(NODES, measure([], []), measure, Floor(20.0), most_trials=most)
+    search = RemedySearch(NODES, measure, Floor(20.0), most_trials=most)
+    return search.run(measure([]))
 
 
 def test_one_node_among_many_is_found_in_a_trial_a_halving() -> None:

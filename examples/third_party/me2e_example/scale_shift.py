@@ -1,14 +1,11 @@
 """A plugin that scales and shifts every channel."""
 
 import dataclasses
-import math
-from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators import Attribute, Dialect, FusedCall, Operand, Operator
 from me2e_compress.operators.call import Attributes
 from me2e_compress.operators.dialect import Arrays, NdArray, Values, present
@@ -22,6 +19,8 @@ class ScaleShift(Operator):
     """Scale and shift every channel of x [N, C, H, W]; relu=1 cuts off below zero."""
 
     name: ClassVar[str] = "scale-shift"
+    output: ClassVar[str] = "N C H W"
+    work: ClassVar[str] = "N C H W"
     own: ClassVar[Dialect] = Dialect("me2e", "ScaleShift", "me2e", OPERANDS, "", RELU)
     dialects: ClassVar[tuple[Dialect, ...]] = (
         Dialect("acme", "ScaleShiftPlugin", "acme.plugins", OPERANDS, "ACME", RELU),
@@ -39,14 +38,3 @@ class ScaleShift(Operator):
         x, scale, shift = (np.asarray(each, np.float64) for each in inputs)
         shifted = x * scale[:, None, None] + shift[:, None, None]
         return np.maximum(shifted, 0) if attributes["relu"] else shifted
-
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
-        """Return the shape of x."""
-        return shapes[0]
-
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count one for each element."""
-        known = [dim for dim in shapes[0] or () if dim is not None]
-        return math.prod(known) if len(known) == 4 else None

@@ -54,9 +54,6 @@ class Bench2DriveLog(DriveLog):
         scenes: clips by their folder below the root; empty means all.
         cameras: in the order of the image input; empty means front first.
         every: takes every n-th of 10 pictures a second; UniAD and VAD take 5.
-        size: rows and columns of the image input, where the model leaves them open.
-        width: columns of the image input that a picture takes, the others are zeros;
-            None takes the stack's value, else all.
     """
 
     name: ClassVar[str] = "bench2drive"
@@ -120,13 +117,13 @@ class _Clip(Sequence[LogMoment]):
         if not number.isdigit():
             raise FramesError(f"{path}: is not named by its number")
         try:
-            return self._of(about, path, number)
+            return self._parse(about, path, number)
         except (LookupError, TypeError, ValueError, OverflowError) as error:
             line = " ".join(str(error).split())[:100]
             said = f"{path}: not an annotation of Bench2Drive ({line})"
             raise FramesError(said) from error
 
-    def _of(self, about: Mapping[str, Any], path: Path, number: str) -> LogMoment:
+    def _parse(self, about: Mapping[str, Any], path: Path, number: str) -> LogMoment:
         sensors = about["sensors"]
         world_to_lidar = _matrix(sensors["LIDAR_TOP"], "world2lidar", path)
         lidar_to_ego = _matrix(sensors["LIDAR_TOP"], "lidar2ego", path)

@@ -87,7 +87,36 @@ class LoggedInputs:
         self, log: DriveLog, scene: LogScene, at: int, before: int | None
     ) -> dict[str, Array]:
         """Return the model's inputs at a moment."""
-        return _arrays(log, self, scene, at, before)
+        now = scene[at]
+        back = np.linalg.inv(self.ground(now))
+        to_world = now.lidar_to_world @ back
+        turn = to_world[:3, :3]
+        # All inputs are relative to the model's ground frame.
+        made: dict[str, Array] = {
+            "can_bus": changes(now, None if before is None else scene[before]),
+            "command": np.asarray(command_at(log, scene, at)),
+            "timestamp": np.asarray((now.time_us - scene[0].time_us) / 1e6),
+            "l2g_r_mat": turn.T if now.l2g_rows else turn,
+            "l2g_t": to_world[:3, 3],
+        }
+        # Projections follow the scaling and cropping of pictures.
+        projections = [now.lidar_to_image[camera] @ back for camera in log.seen]
+        if self.image is not None:
+            columns = self.columns(log, self.image)
+            pictures = [
+                read_picture(now.pictures[camera], self.image, columns)
+                for camera in log.seen
+            ]
+            if len({each.planes.shape for each in pictures}) > 1:
+                sizes = [list(each.planes.shape) for each in pictures]
+                raise FramesError(
+                    f"{now.pictures[log.seen[0]]}: pictures of several sizes: {sizes}"
+                )
+            made["img"] = np.stack([each.planes for each in pictures])
+            places = [each.place for each in pictures]
+            projections = [p @ m for p, m in zip(places, projections, strict=True)]
+        made["lidar2img"] = np.stack(projections)
+        return {name: _fed(made[name], form, name) for name, form in self.forms.items()}
 
     def columns(self, log: DriveLog, image: PixelInput) -> int:
         """Return the columns of the image that a picture takes."""
@@ -150,41 +179,6 @@ def log_frames(
             before, done = at, done + 1
         if done == count:
             return
-
-
-def _arrays(
-    log: DriveLog, model: LoggedInputs, scene: LogScene, at: int, before: int | None
-) -> dict[str, Array]:
-    now = scene[at]
-    back = np.linalg.inv(model.ground(now))
-    to_world = now.lidar_to_world @ back
-    turn = to_world[:3, :3]
-    # All inputs are relative to the model's ground frame.
-    made: dict[str, Array] = {
-        "can_bus": changes(now, None if before is None else scene[before]),
-        "command": np.asarray(command_at(log, scene, at)),
-        "timestamp": np.asarray((now.time_us - scene[0].time_us) / 1e6),
-        "l2g_r_mat": turn.T if now.l2g_rows else turn,
-        "l2g_t": to_world[:3, 3],
-    }
-    # Projections follow the scaling and cropping of pictures.
-    projections = [now.lidar_to_image[camera] @ back for camera in log.seen]
-    if model.image is not None:
-        columns = model.columns(log, model.image)
-        pictures = [
-            read_picture(now.pictures[camera], model.image, columns)
-            for camera in log.seen
-        ]
-        if len({each.planes.shape for each in pictures}) > 1:
-            sizes = [list(each.planes.shape) for each in pictures]
-            raise FramesError(
-                f"{now.pictures[log.seen[0]]}: pictures of several sizes: {sizes}"
-            )
-        made["img"] = np.stack([each.planes for each in pictures])
-        places = [each.place for each in pictures]
-        projections = [p @ m for p, m in zip(places, projections, strict=True)]
-    made["lidar2img"] = np.stack(projections)
-    return {name: _fed(made[name], form, name) for name, form in model.forms.items()}
 
 
 def changes(now: LogMoment, before: LogMoment | None) -> Floats:

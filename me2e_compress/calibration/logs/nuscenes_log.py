@@ -57,9 +57,6 @@ class NuScenesLog(DriveLog):
         scenes: by name, such as scene-0061; empty means all.
         cameras: in the order of the image input; empty means all, as in `layout`.
         every: takes every n-th key frame.
-        size: rows and columns of the image input, where the model leaves them open.
-        width: columns of the image input that a picture takes, the others are zeros;
-            None takes the stack's value, else all.
     """
 
     name: ClassVar[str] = "nuscenes"

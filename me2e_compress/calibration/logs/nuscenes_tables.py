@@ -136,11 +136,11 @@ class NuScenesTables:
 
     def sensor(self, data: Row) -> Row:
         """Return the calibration of the sensor of a sample_data row."""
-        return self._of(self.sensors, data, "calibrated_sensor")
+        return self._named(self.sensors, data, "calibrated_sensor")
 
     def ego(self, data: Row) -> Row:
         """Return the vehicle's pose of a sample_data row."""
-        return self._of(self.poses, data, "ego_pose")
+        return self._named(self.poses, data, "ego_pose")
 
     def pose_of(self, row: Row) -> Floats:
         """Return the [4, 4] of a row with translation and rotation."""
@@ -149,7 +149,7 @@ class NuScenesTables:
         translation = matrix_of(row["translation"], (3,), f"{what}: translation")
         return pose(rotation.tolist(), translation.tolist(), what)
 
-    def _of(self, table: Mapping[str, Row], data: Row, name: str) -> Row:
+    def _named(self, table: Mapping[str, Row], data: Row, name: str) -> Row:
         found = table.get(data[f"{name}_token"])
         if found is None:
             raise FramesError(

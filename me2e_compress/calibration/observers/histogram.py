@@ -1,5 +1,6 @@
 """Observers that use histograms of magnitudes, and may clip rare values."""
 
+import abc
 import dataclasses
 from collections.abc import Callable
 from typing import ClassVar, TypeAlias
@@ -28,7 +29,25 @@ _STRIDE = BINS // 256
 
 
 @dataclasses.dataclass(frozen=True)
-class Percentile(Observer):
+class HistogramObserver(Observer):
+    """Base of observers that clip every tensor at an edge between two bins."""
+
+    counts: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def edge(self, counts: Counts) -> int:
+        """Return the number of bins of a histogram that stay in the range."""
+
+    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
+        """Clip every tensor at the edge of its histogram."""
+        # A tensor without elements keeps all bins
+        edges = [self.edge(each) if each.any() else BINS for each in seen.counted()]
+        reach = np.ldexp(np.array(edges, np.float64) / BINS, seen.exponents)
+        return within(seen, reach.astype(np.float32))
+
+
+@dataclasses.dataclass(frozen=True)
+class Percentile(HistogramObserver):
     """The magnitude that ``percent`` of all elements of all frames do not exceed.
 
     Attributes:
@@ -37,36 +56,31 @@ class Percentile(Observer):
     """
 
     name: ClassVar[str] = "percentile"
-    counts: ClassVar[bool] = True
     percent: float = 99.99
 
     def __post_init__(self) -> None:
         check_option(self.name, "percent", self.percent, 100.0)
 
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        """Clip every tensor at its percentile, rounded up to the edge of a bin."""
-        return within(seen, _reaches(seen, self._edge))
-
-    def _edge(self, counts: Counts) -> int:
+    def edge(self, counts: Counts) -> int:
+        """Return the percentile, rounded up to the edge of a bin."""
         total = np.cumsum(counts)
         share = total[-1] * (self.percent / 100)
         return int(np.searchsorted(total, share)) + 1
 
 
 @dataclasses.dataclass(frozen=True)
-class MeanSquaredError(Observer):
+class MeanSquaredError(HistogramObserver):
     """The threshold whose int8 grid has the least mean squared error."""
 
     name: ClassVar[str] = "mse"
-    counts: ClassVar[bool] = True
 
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        """Clip every tensor where rounding and clipping cost least."""
-        return within(seen, _reaches(seen, lambda counts: _best(counts, _noise)))
+    def edge(self, counts: Counts) -> int:
+        """Return the edge at which rounding and clipping cost least."""
+        return _best(counts, _noise)
 
 
 @dataclasses.dataclass(frozen=True)
-class Entropy(Observer):
+class Entropy(HistogramObserver):
     """The threshold whose int8 grid keeps the distribution best: least KL divergence.
 
     Migacz's method. Zero is on every grid, so the bin of zeros is set to its
@@ -74,19 +88,10 @@ class Entropy(Observer):
     """
 
     name: ClassVar[str] = "entropy"
-    counts: ClassVar[bool] = True
 
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        """Clip every tensor where the KL divergence is least."""
-        return within(seen, _reaches(seen, lambda counts: _best(counts, _divergence)))
-
-
-def _reaches(seen: Statistics, edge: Callable[[Counts], int]) -> Bounds:
-    """Convert the chosen bin edge of every histogram to a magnitude."""
-    edges = [edge(counts) if counts.any() else BINS for counts in seen.counted()]
-    return np.ldexp(np.array(edges, np.float64) / BINS, seen.exponents).astype(
-        np.float32
-    )
+    def edge(self, counts: Counts) -> int:
+        """Return the edge at which the KL divergence is least."""
+        return _best(counts, _divergence)
 
 
 def _best(counts: Counts, cost: Callable[[Counts, int], float]) -> int:

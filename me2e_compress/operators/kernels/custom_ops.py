@@ -39,13 +39,13 @@ def register(
         OSError: no shared object can be opened; see :mod:`trampoline`.
         ImportError: Numba is not installed, or does not work here.
     """
-    door = trampoline()
+    library = trampoline()
     _asked.code = {
         each: load_or_compile(each.op_type, each.module, default_folder(), begins)
         for each in kernels
     }
-    door.fill(_address(_register))
-    options.register_custom_ops_library(door.path)
+    library.fill(_address(_register))
+    options.register_custom_ops_library(library.path)
 
 
 def register_named(options: ort.SessionOptions, names: Iterable[str]) -> None:
@@ -90,7 +90,7 @@ def _operator(kernel: CompiledKernel, compute: int, block: int, base: int) -> An
         ctypes.create_string_buffer(f"{kernel.op_type}: {each}".encode())
         for each in kernel.messages
     ]
-    door = trampoline()
+    library = trampoline()
     # Callbacks that describe the operator, called only on opening
     callbacks: dict[str, Any] = {
         "GetName": ctypes.CFUNCTYPE(_POINTER, _POINTER)(
@@ -120,7 +120,7 @@ def _operator(kernel: CompiledKernel, compute: int, block: int, base: int) -> An
     for field, callback in callbacks.items():
         written[abi.FIELDS.index(field)] = _address(callback)
     for field in ("CreateKernel", "KernelDestroy"):
-        written[abi.FIELDS.index(field)] = door.address(field)
+        written[abi.FIELDS.index(field)] = library.address(field)
     written[abi.FIELDS.index("KernelComputeV2")] = compute
     # The state of its kernels follows the struct
     api = _api(base)

@@ -192,8 +192,7 @@ def load_plan(path: Path) -> QuantPlan:
     if not path.is_file():
         raise RecipeError(f"{path}: no such plan")
     with documents.reading(path, RecipeError, "not a plan"):
-        content = documents.content(path)
-    return _parse(content, str(path))
+        return pydantic.TypeAdapter(QuantPlan).validate_json(documents.content(path))
 
 
 def stamp_plan(model: ir.Model, plan: QuantPlan) -> None:
@@ -208,7 +207,12 @@ def plan_of(model: ir.Model) -> QuantPlan | None:
         RecipeError: what it carries is not a plan.
     """
     text = model.metadata_props.get(METADATA)
-    return None if text is None else _parse(text, "the plan in the model's metadata")
+    if text is None:
+        return None
+    with documents.reading(
+        "the plan in the model's metadata", RecipeError, "not a plan"
+    ):
+        return pydantic.TypeAdapter(QuantPlan).validate_json(text)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -230,22 +234,9 @@ def differences(old: QuantPlan, new: QuantPlan) -> Iterator[PlanDifference]:
     after = {each.output: each for each in new.decisions}
     for output in (*after, *(name for name in before if name not in after)):
         left, right = before.get(output), after.get(output)
-        if left is None or right is None or _key(left) != _key(right):
+        if _short(left) != _short(right):
             yield PlanDifference(left, right)
-
-
-def _key(decision: Decision) -> tuple[str, str]:
-    return decision.dtype, decision.rule
 
 
 def _short(decision: Decision | None) -> str:
     return "none" if decision is None else f"{decision.dtype} ({decision.rule})"
-
-
-def _parse(text: str | bytes, origin: str) -> QuantPlan:
-    try:
-        return pydantic.TypeAdapter(QuantPlan).validate_json(text)
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "file"
-        raise RecipeError(f"{origin}: not a plan: {where}: {first['msg']}") from error

@@ -111,7 +111,7 @@ def _decide(
         return decision(rule="body", reason="in the body of an If, Loop or Scan")
     # the first rule that objects decides, unless the user has and it is not firm
     close = _borderline(node, facts, rules)
-    pin = pins.of(node)
+    pin = pins.get(node)
     for rule in rules:
         objection = rule.objection(node, facts)
         if objection is None or (pin is not None and not rule.firm):
@@ -119,10 +119,10 @@ def _decide(
         return decision(rule=rule.name, reason=objection, borderline=close)
     # the user's float, else int8
     if pin is not None and pin.dtype == FLOAT:
-        return decision(rule="override", reason=pin.reason, borderline=close)
+        return decision(rule="override", reason=pin.why, borderline=close)
     rule_id, reason, layout = _int8(node, facts)
     if pin is not None:
-        rule_id, reason = "override", pin.reason
+        rule_id, reason = "override", pin.why
     elif node in facts.ego_layers:
         close = f"ego-input: {_EGO.format(facts.ego_layers[node])}"
     activations, weight = layout
@@ -153,7 +153,7 @@ def _second_thoughts(
             axis=None,
         )
         for node, reason in rule.objections(int8, facts).items()
-        if node in int8 and (rule.firm or pins.of(node) is None)
+        if node in int8 and (rule.firm or pins.get(node) is None)
     }
 
 
@@ -218,9 +218,9 @@ def _residuals(
 
 
 def _residual(old: Decision, node: ir.Node, residual: int, pins: Pins) -> Decision:
-    pin = pins.of(node)
+    pin = pins.get(node)
     if pin is not None and pin.dtype == FLOAT:
-        return dataclasses.replace(old, rule="override", reason=pin.reason)
+        return dataclasses.replace(old, rule="override", reason=pin.why)
     main, branch = node.inputs[1 - residual], node.inputs[residual]
     return dataclasses.replace(
         old,

@@ -72,6 +72,11 @@ class Override(_Strict):
             and (self.reads is None or _reads(node, self.reads))
         )
 
+    @property
+    def why(self) -> str:
+        """The reason that the user gave, else the override itself."""
+        return self.reason or f"override: {self}"
+
     def __str__(self) -> str:
         return ", ".join(f"{key} {value!r}" for key, value in self._given().items())
 
@@ -114,14 +119,6 @@ class ConcatScale(_Strict):
     scale: Literal["own"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Pin:
-    """The user's decision for one node: ``int8`` or ``float``, and why."""
-
-    dtype: str
-    reason: str
-
-
 class Overrides(_Strict):
     """A file of exceptions."""
 
@@ -144,14 +141,10 @@ class Overrides(_Strict):
     @classmethod
     def parse(cls, text: str | bytes, origin: str = "overrides") -> Self:
         """Read TOML; ``origin`` is its name in error messages."""
-        try:
-            return cls.model_validate(documents.from_toml(text))
-        except documents.MalformedError as error:
-            raise RecipeError(f"{origin}: not TOML ({error})") from error
-        except pydantic.ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"]) or "file"
-            raise RecipeError(f"{origin}: {where}: {first['msg']}") from error
+        with documents.reading(origin, RecipeError, "not TOML"):
+            content = documents.from_toml(text)
+        with documents.reading(origin, RecipeError, "not overrides"):
+            return cls.model_validate(content)
 
     def bind(self, model: ir.Model) -> "Pins":
         """Find the nodes of a graph that they apply to.
@@ -180,24 +173,19 @@ class Overrides(_Strict):
 NONE = Overrides()
 
 
+@dataclasses.dataclass(frozen=True)
 class Pins:
     """Overrides bound to the nodes of one graph.
 
     ``apart`` holds the Concats whose inputs keep scales of their own.
     """
 
-    def __init__(
-        self, pinned: Mapping[ir.Node, Override], apart: frozenset[ir.Node]
-    ) -> None:
-        self._pinned = pinned
-        self.apart = apart
+    pinned: Mapping[ir.Node, Override]
+    apart: frozenset[ir.Node]
 
-    def of(self, node: ir.Node) -> Pin | None:
+    def get(self, node: ir.Node) -> Override | None:
         """Return the user's decision for a node, if any."""
-        found = self._pinned.get(node)
-        if found is None:
-            return None
-        return Pin(found.dtype, found.reason or f"override: {found}")
+        return self.pinned.get(node)
 
     def check(self, decided: Mapping[ir.Node, Decision]) -> None:
         """Refuse overrides to int8 that no node could follow.
@@ -207,7 +195,7 @@ class Pins:
         # overrides to int8 that some node follows, and those that one refuses
         refused: dict[Override, Decision] = {}
         followed: dict[Override, None] = {}
-        for node, override in self._pinned.items():
+        for node, override in self.pinned.items():
             if override.dtype != INT8:
                 continue
             if decided[node].dtype == INT8:

@@ -185,8 +185,6 @@ class SafeRules(PaperRules):
     Attributes:
         attention_limit: longest attention that the paper's stage 1 would make int8, in
             tokens; without ``attention-weights`` it counts.
-        without: names of rules that are switched off, e.g. ``gemv``.
-        extra: more rules, asked last.
     """
 
     name: ClassVar[str] = "safe"
@@ -205,13 +203,6 @@ class SafeRules(PaperRules):
 
 @dataclasses.dataclass(frozen=True)
 class TensorRTRules(SafeRules):
-    """The rule set ``safe`` by its former name: the same plan.
-
-    Attributes:
-        attention_limit: longest attention that the paper's stage 1 would make int8,
-            in tokens; without ``attention-weights`` it counts.
-        without: names of rules that are switched off, e.g. ``gemv``.
-        extra: more rules, asked last.
-    """
+    """The rule set ``safe`` by its former name: the same plan."""
 
     name: ClassVar[str] = "tensorrt"

@@ -117,8 +117,8 @@ def costs_of(
             gain = machine.float_sampled_mac - machine.int8_sampled_mac
             saved[node] = 1e-9 * gain * macs
     # Each uint8 tensor may cost a conversion at its border.
-    flow = _Flow(region)
-    borders = tuple(flow.border(value, machine) for value in region.grids)
+    around = _Surroundings(region)
+    borders = tuple(around.border(value, machine) for value in region.grids)
     return Costs(machine.machine, saved, borders)
 
 
@@ -185,7 +185,7 @@ def _is_convolved(value: ir.Value) -> bool:
     return node is not None and node.op_type in (*_BLOCKED, "Clip", "Relu")
 
 
-class _Flow:
+class _Surroundings:
     """Follows the uint8 tensors of a region to the layers before and after them."""
 
     def __init__(self, region: Region) -> None:
@@ -230,7 +230,7 @@ class _Flow:
         return self._makers[value]
 
     def _find_makers(self, value: ir.Value) -> Layers:
-        if value in self._layers and value in self._region.born:
+        if value in self._layers and value in self._region.written:
             return frozenset({self._layers[value]})
         node = self._carriers.get(value)
         if node is None:

@@ -9,8 +9,8 @@ import onnx_ir as ir
 from me2e_compress import graph, rewrite
 from me2e_compress.errors import PreconditionError
 from me2e_compress.targets.onnxruntime.kernels import biased_end
-from me2e_compress.targets.onnxruntime.writer import Writer
 from me2e_compress.targets.weights import QuantizedWeight
+from me2e_compress.targets.writer import Writer
 
 BIAS_MAX = 2**30
 """Largest int32 bias: half the accumulator is left for the products, which need at most

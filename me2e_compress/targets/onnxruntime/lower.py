@@ -6,13 +6,13 @@ from collections.abc import Collection, Mapping
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import rewrite
+from me2e_compress import graph, rewrite
 from me2e_compress.errors import FramesError
 from me2e_compress.targets.onnxruntime.layer_forms import write_layer
 from me2e_compress.targets.onnxruntime.region import Grid, Region, find_region
-from me2e_compress.targets.onnxruntime.screens import screen_products
-from me2e_compress.targets.onnxruntime.writer import Writer
+from me2e_compress.targets.quantized import QUANTIZE, is_dequantized
 from me2e_compress.targets.weights import QuantizedWeight
+from me2e_compress.targets.writer import Writer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +53,7 @@ def lower(draft: Draft) -> ir.Model:
     _write_pairs(writer, region, grids)
     for layer, weight, step in jobs:
         write_layer(writer, layer, weight, step)
-    screen_products(writer)
+    _screen_products(writer)
     rewrite.sweep(draft.model)
     return draft.model
 
@@ -66,51 +66,81 @@ def _write_pairs(
     Other readers of such a tensor keep the float one, if it exists.
     """
     for value, grid in grids.items():
-        born = value in region.born
+        written = value in region.written
         # A tensor that a kernel writes as uint8 has no float version.
         uses = [
             (use.node, use.idx)
             for use in value.uses()
-            if born or region.reads(use.node, use.idx)
+            if written or region.reads(use.node, use.idx)
         ]
         producer = value.producer()
-        source = producer if born and producer is not None else uses[0][0]
+        source = producer if written and producer is not None else uses[0][0]
         # Insert the pair, and reconnect the readers.
-        quantize, dequantize = _pair(writer, value, grid, source)
-        if producer is None:
-            writer.graph.insert_before(writer.graph[0], [quantize, dequantize])
-        else:
-            writer.graph.insert_after(producer, [quantize, dequantize])
+        name = str(value.name)
+        constants = (
+            writer.constant(np.array(grid.scale), f"{name}_scale"),
+            writer.constant(np.array(grid.zero, np.uint8), f"uint8_{grid.zero}"),
+        )
+        names = f"{name}_uint8", f"{name}_float"
+        quantize, dequantize = writer.pair(value, constants, names, source)
         for reader, index in uses:
             reader.replace_input_with(index, dequantize.outputs[0])
         # A graph output keeps its name.
-        if born and value.is_graph_output():
-            _hand_over(value, dequantize.outputs[0], quantize)
+        if written and value.is_graph_output():
+            rewrite.replace_value(value, dequantize.outputs[0])
+            quantize.replace_input_with(0, value)
 
 
-def _pair(
-    writer: Writer, value: ir.Value, grid: Grid, source: ir.Node
-) -> tuple[ir.Node, ir.Node]:
-    name = str(value.name)
-    scale = writer.constant(np.array(grid.scale), f"{name}_scale")
-    zero = writer.constant(np.array(grid.zero, np.uint8), f"uint8_{grid.zero}")
-    # Both nodes share scale and zero point.
-    quantize = writer.node(
-        "QuantizeLinear", [value, scale, zero], f"{name}_uint8", [source]
+def _screen_products(writer: Writer) -> None:
+    """Insert a Reshape without effect after products that would run in float.
+
+    Given:   y = Relu(Gemm(DequantizeLinear(x), DequantizeLinear(w)))
+    Result:  y = Relu(Reshape(Gemm(DequantizeLinear(x), DequantizeLinear(w)), [0, 0]))
+
+    onnxruntime (1.31) silently finds no int8 kernel for a Gemm or MatMul,
+
+    * whose only reader is a Relu or Clip that something else than a QuantizeLinear
+      reads: it looks for the QuantizeLinear after that one, or fuses the two;
+    * that both a QuantizeLinear and something else read;
+    * that is a MatMul whose only reader is an Add: the two become a float Gemm first.
+
+    Convolutions are not affected: their output is read only through its pair.
+    """
+    products = [
+        node
+        for node in writer.graph
+        if node.op_type in ("Gemm", "MatMul")
+        and all(map(is_dequantized, node.inputs[:2]))
+    ]
+    for node in products:
+        if _would_run_in_float(node):
+            _screen(writer, node)
+
+
+def _would_run_in_float(product: ir.Node) -> bool:
+    value = product.outputs[0]
+    readers = list(value.consumers())
+    if any(each.op_type == QUANTIZE for each in readers):
+        return len(value.uses()) > 1 or value.is_graph_output()
+    if len(readers) != 1:
+        return False
+    if product.op_type == "MatMul" and readers[0].op_type == "Add":
+        return True
+    # A Relu or Clip hides the layer, unless only pairs follow.
+    clipped = readers[0].outputs[0]
+    return readers[0].op_type in ("Relu", "Clip") and (
+        clipped.is_graph_output()
+        or any(each.op_type != QUANTIZE for each in clipped.consumers())
     )
-    dequantize = writer.node(
-        "DequantizeLinear",
-        [quantize.outputs[0], scale, zero],
-        f"{name}_float",
-        [source],
-    )
-    quantize.outputs[0].dtype = ir.DataType.UINT8
-    dequantize.outputs[0].dtype = ir.DataType.FLOAT
-    quantize.outputs[0].shape = dequantize.outputs[0].shape = value.shape
-    return quantize, dequantize
 
 
-def _hand_over(value: ir.Value, heir: ir.Value, quantize: ir.Node) -> None:
-    """Make the dequantized tensor the graph output, under the old name."""
-    rewrite.replace_value(value, heir)
-    quantize.replace_input_with(0, value)
+def _screen(writer: Writer, product: ir.Node) -> None:
+    """Insert a Reshape to its own shape between a product and its readers."""
+    value = product.outputs[0]
+    rank = max(graph.rank_of(each) or 2 for each in product.inputs[:2])
+    same = writer.constant(np.zeros(rank, np.int64), f"same_{rank}")
+    node = writer.node("Reshape", [value, same], f"{value.name}_screened", [product])
+    writer.graph.insert_after(product, node)
+    node.outputs[0].shape, node.outputs[0].type = value.shape, value.type
+    rewrite.replace_value(value, node.outputs[0])
+    node.replace_input_with(0, value)

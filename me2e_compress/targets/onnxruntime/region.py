@@ -31,14 +31,14 @@ class Region:
     Attributes:
         grids: the uint8 tensors, and the tensor whose range each one uses: usually its
             own, or the first of a chain that only moves elements.
-        born: tensors that an int8 kernel writes, so that no float version exists.
+        written: tensors that an int8 kernel writes, so that no float version exists.
         readers: nodes that read uint8, other than layers.
         sampled: fused operators that sample uint8, by the first node that reads it.
     """
 
     layers: dict[ir.Node, ir.Value]
     grids: dict[ir.Value, ir.Value]
-    born: frozenset[ir.Value]
+    written: frozenset[ir.Value]
     readers: frozenset[ir.Node]
     sampled: dict[ir.Node, ir.Node] = dataclasses.field(default_factory=dict)
 
@@ -79,7 +79,7 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
     }
     # Layers read uint8 in any case; the walk adds what follows.
     grids = {value: value for value in layers.values()}
-    born: set[ir.Value] = set()
+    written: set[ir.Value] = set()
     readers: set[ir.Node] = set()
     sampled: dict[ir.Node, ir.Node] = {}
     sampling = {n for n in graph if n.outputs[0].name in chosen and int8_inputs(n)}
@@ -91,32 +91,32 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
         end = end_of(node)
         if node in convolutions:
             grids[end] = end
-            born.add(end)
-        elif first is not None and first in born and is_move(node):
+            written.add(end)
+        elif first is not None and first in written and is_move(node):
             grids[node.outputs[0]] = grids[first]
-            born.add(node.outputs[0])
+            written.add(node.outputs[0])
             readers.add(node)
         elif (
             node.op_type in JOINS
             and (end in grids or end in wanted)
-            and _joins(node, grids, born)
+            and _joins(node, grids, written)
         ):
             grids[end] = end
-            born.add(end)
+            written.add(end)
             readers.add(node)
         elif node in sampling:
-            value, reader = _sampled(node, born)
+            value, reader = _sampled(node, written)
             grids.setdefault(value, value)
             sampled[reader] = node
-    return Region(layers, grids, frozenset(born), frozenset(readers), sampled)
+    return Region(layers, grids, frozenset(written), frozenset(readers), sampled)
 
 
-def _sampled(node: ir.Node, born: Collection[ir.Value]) -> tuple[ir.Value, ir.Node]:
+def _sampled(node: ir.Node, written: Collection[ir.Value]) -> tuple[ir.Value, ir.Node]:
     """Return what a fused operator samples through reshapes, and its reader."""
     value = node.inputs[0]
     assert value is not None
     # Look through reshapes with one reader.
-    while value not in born and len(value.uses()) == 1:
+    while value not in written and len(value.uses()) == 1:
         made = value.producer()
         if made is None or made.op_type != "Reshape" or made.inputs[0] is None:
             break
@@ -125,10 +125,10 @@ def _sampled(node: ir.Node, born: Collection[ir.Value]) -> tuple[ir.Value, ir.No
 
 
 def _joins(
-    node: ir.Node, grids: Collection[ir.Value], born: Collection[ir.Value]
+    node: ir.Node, grids: Collection[ir.Value], written: Collection[ir.Value]
 ) -> bool:
     return all(each in grids for each in node.inputs) and any(
-        each in born for each in node.inputs
+        each in written for each in node.inputs
     )
 
 

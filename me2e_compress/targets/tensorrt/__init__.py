@@ -12,13 +12,12 @@ from collections.abc import Collection
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress import rewrite
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.graph import input_at, provenance, static_shape
+from me2e_compress.graph import input_at, static_shape
 from me2e_compress.operators import find, int8_inputs
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import (
@@ -31,10 +30,9 @@ from me2e_compress.targets.base import LintRule, Target
 from me2e_compress.targets.tensorrt.costs import MACHINES, costs_of
 from me2e_compress.targets.tensorrt.lint import RULES
 from me2e_compress.targets.weights import QuantizedWeight, weights_of
+from me2e_compress.targets.writer import Writer
 
 __all__ = ["TensorRT"]
-
-BY = "quantize-int8"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,9 +69,9 @@ class TensorRT(Target):
         weights = weights_of(model, plan.chosen)
         copy = model.clone()
         nodes = {str(node.outputs[0].name): node for node in copy.graph}
-        writer = _Writer(copy.graph, share_scales(plan, ranges))
+        pairs = _Pairs(copy.graph, share_scales(plan, ranges))
         for decision in plan.chosen:
-            writer.apply(nodes[decision.output], decision, weights.get(decision.output))
+            pairs.apply(nodes[decision.output], decision, weights.get(decision.output))
         rewrite.sweep(copy)
         return copy
 
@@ -106,16 +104,15 @@ class TensorRT(Target):
         return RULES
 
 
-class _Writer:
+class _Pairs:
     """Writes pairs into one graph, once for each tensor and each weight."""
 
     def __init__(self, where: ir.Graph, ranges: Ranges) -> None:
-        self._graph = where
+        self._write = Writer(where, share=False)
         self._ranges = ranges
         self._activations: dict[str, ir.Value] = {}
         self._weights: dict[tuple[str, int | None], ir.Value] = {}
         self._zero: ir.Value | None = None
-        self._names = rewrite.value_names(where)
 
     def apply(
         self, node: ir.Node, decision: Decision, weight: QuantizedWeight | None
@@ -147,30 +144,20 @@ class _Writer:
         # The plugin reads the integers before the DequantizeLinear.
         plugin.replace_input_with(index, dequantize.inputs[0])
         step = scale_of(*self._ranges.tensors[str(value.name)])
-        scales = self._constant(np.full(channels, step), f"{value.name}_scales")
+        scales = self._write.constant(np.full(channels, step), f"{value.name}_scales")
         plugin.resize_inputs(at + 1)
         plugin.replace_input_with(at, scales)
 
     def _activation(self, value: ir.Value, reader: ir.Node) -> ir.Value:
+        """Return the dequantized tensor that all int8 readers of a value share."""
         name = str(value.name)
         if name not in self._activations:
             step = np.array(scale_of(*self._ranges.tensors[name]), _numpy(value))
-            scale = self._constant(step, f"{name}_scale")
+            scale = self._write.constant(step, f"{name}_scale")
             if self._zero is None:
-                self._zero = self._constant(np.array(0, np.int8), "int8_zero")
-            pair = [scale, self._zero]
-            # Build the pair.
-            quantize = self._node("QuantizeLinear", [value, *pair], name, value, reader)
-            quantize.outputs[0].type = ir.TensorType(ir.DataType.INT8)
-            dequantize = self._node(
-                "DequantizeLinear", [quantize.outputs[0], *pair], name, value, reader
-            )
-            # All int8 readers share the pair after the producer.
-            producer = value.producer()
-            if producer is None:
-                self._graph.insert_before(self._graph[0], [quantize, dequantize])
-            else:
-                self._graph.insert_after(producer, [quantize, dequantize])
+                self._zero = self._write.constant(np.array(0, np.int8), "int8_zero")
+            names = f"{name}_QuantizeLinear", f"{name}_DequantizeLinear"
+            _, dequantize = self._write.pair(value, [scale, self._zero], names, reader)
             self._activations[name] = dequantize.outputs[0]
         return self._activations[name]
 
@@ -179,37 +166,15 @@ class _Writer:
     ) -> ir.Value:
         key = weight.name, weight.axis
         if key not in self._weights:
-            name, scales = weight.name, weight.scales
-            inputs = [
-                self._constant(weight.integers, f"{name}_int8"),
-                self._constant(scales.astype(_numpy(like)), f"{name}_scale"),
-                self._constant(np.zeros(scales.shape, np.int8), f"{name}_zero"),
-            ]
-            dequantize = self._node("DequantizeLinear", inputs, name, like, reader)
-            dequantize.outputs[0].shape = ir.Shape(weight.integers.shape)
-            if weight.axis is not None:
-                dequantize.attributes.add(ir.AttrInt64("axis", weight.axis))
-            self._graph.insert_before(reader, dequantize)
-            self._weights[key] = dequantize.outputs[0]
+            self._weights[key] = self._write.dequantized(
+                weight.name,
+                weight.integers,
+                weight.scales.astype(_numpy(like)),
+                weight.axis,
+                reader,
+                f"{weight.name}_DequantizeLinear",
+            )
         return self._weights[key]
-
-    def _constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
-        return rewrite.add_constant(self._graph, array, name, self._names)
-
-    def _node(
-        self,
-        op: str,
-        inputs: list[ir.Value],
-        name: str,
-        like: ir.Value,
-        reader: ir.Node,
-    ) -> ir.Node:
-        unique = rewrite.fresh_name(f"{name}_{op}", self._names)
-        node = ir.node(op, inputs, name=unique)
-        output = node.outputs[0]
-        output.name, output.shape, output.type = unique, like.shape, like.type
-        provenance.inherit(node, [reader], by=BY)
-        return node
 
 
 def _numpy(value: ir.Value) -> np.dtype[np.generic]:

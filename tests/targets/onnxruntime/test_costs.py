@@ -109,3 +109,31 @@ def test_a_shared_input_is_quantized_once() -> None:
 
     assert len(costs.borders) == 1
     assert costs.borders[0].readers == frozenset(layers)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "reader", "as_float"),
+    [
+        ("", "", False),
+        (", float[1,4,8,8] p", "", True),
+        (", float[1,4,8,8] z", "z = Sigmoid(p)", True),
+        (", float[1,4,8,8] p, float[1,4,8,8] z", "z = Sigmoid(p)", True),
+    ],
+    ids=["a layer alone", "an output", "another operator", "both"],
+)
+def test_what_is_read_as_float(outputs: str, reader: str, as_float: bool) -> None:
+    model = net(
+        f"""<ir_version: 9, opset_import: ["" : 17]>
+        c (float[1,4,8,8] x, float[4,4,1,1] w, float[4,4,1,1] v)
+            => (float[1,4,8,8] y{outputs}) {{
+            p = Conv(x, w) {reader} y = Conv(p, v)
+        }}""",
+        {"w": np.ones((4, 4, 1, 1)), "v": np.ones((4, 4, 1, 1))},
+    )
+    layers: list[ir.Node] = [n for n in model.graph if n.op_type == "Conv"]
+
+    borders = OnnxRuntime().costs(model, layers).borders
+
+    (between,) = (each for each in borders if each.makers == {layers[0]})
+    assert between.readers == {layers[1]}
+    assert between.read_as_float is as_float

@@ -12,8 +12,6 @@ from tests.nets import net
 from tests.profiles import scaled
 from tests.targets.onnxruntime.lowered import (
     FULL,
-    TOKENS,
-    calibrated,
     drawn,
     feeds,
     kernels,
@@ -23,14 +21,6 @@ from tests.targets.onnxruntime.lowered import (
     ran,
     sqnr_db,
 )
-
-
-def test_linear_layers_get_int8_kernels_at_every_rank() -> None:
-    found = kernels(calibrated(linear(), TOKENS))
-
-    assert found["QGemm"] == 2
-    assert found["MatMulIntegerToFloat"] == 1
-    assert not {"Gemm", "MatMul", "Relu"} & set(found)
 
 
 @settings(max_examples=scaled(20))

@@ -7,7 +7,7 @@ from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
 from me2e_compress.targets.onnxruntime import OnnxRuntime
-from tests.nets import MODULES, PAPER, conv_attention, net
+from tests.nets import MODULES, PAPER, net
 
 LAYER = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -82,17 +82,6 @@ def test_opsets_nobody_has_released() -> None:
         "m (float[2] x) => (float[2] y) { y = Relu(x) }"
     )
     assert "opset" in [each.rule for each in OnnxRuntime().lint(model)]
-
-
-def test_what_we_place_for_it_has_no_findings() -> None:
-    model = conv_attention()
-    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
-    target = TARGETS.parse("onnxruntime")
-    ranges = dict.fromkeys(target.tensors(plan, model), (-3.0, 3.0))
-
-    placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
-
-    assert OnnxRuntime().lint(placed) == ()
 
 
 def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:

@@ -196,6 +196,25 @@ PAIR = "<float s = {0.5}, float t = {0.25}, int8 z = {0}, uint8 u = {0}, int32 i
             " e = DequantizeLinear(p, t, z) y = Relu(e) }",
             ("warning", "repeated-pair", "quantizes what was just dequantized"),
         ),
+        (
+            "m (float[1,1,4,4] x, float[1,1,1,1] w) => (float[1,1,4,4] y)"
+            " <int32[1] b = {7}, float s = {0.5}, int32 z = {0}>"
+            " { d = DequantizeLinear(b, s, z) y = Conv(x, w, d) }",
+            ("error", "bias-pair", "the bias is quantized, must be float"),
+        ),
+        (
+            "m (float[2,2] x) => (float[2,2] y) <float[2,2] w = {1.0, 2.0, 3.0, 4.0},"
+            " float s = {0.5}, int8 z = {0}> { q = QuantizeLinear(w, s, z)"
+            " d = DequantizeLinear(q, s, z) y = MatMul(x, d) }",
+            ("warning", "float-weight", "the weight is stored as float"),
+        ),
+        (
+            "m (float[1,1,4,4] x, float[1,1,1,1] w) => (float[1,1,4,4] y) "
+            + PAIR
+            + "{ c = Conv(x, w) q = QuantizeLinear(c, s, z)"
+            " d = DequantizeLinear(q, s, z) y = Add(d, x) }",
+            ("warning", "residual-branch", "a pair between a convolution and its Add"),
+        ),
     ],
 )
 def test_pairs_that_are_wrong(text: str, expected: tuple[str, str, str]) -> None:
@@ -204,33 +223,6 @@ def test_pairs_that_are_wrong(text: str, expected: tuple[str, str, str]) -> None
         (each[0], each[1]) == (severity, rule) and message in each[2]
         for each in found(text)
     )
-
-
-def test_a_quantized_bias_is_an_error() -> None:
-    text = """m (float[1,1,4,4] x, float[1,1,1,1] w) => (float[1,1,4,4] y)
-    <int32[1] b = {7}, float s = {0.5}, int32 z = {0}>
-    { d = DequantizeLinear(b, s, z) y = Conv(x, w, d) }"""
-    rules = [each[1] for each in found(text)]
-
-    assert "bias-pair" in rules
-    assert "quantized-type" in rules
-
-
-def test_float_weights_behind_a_pair_are_a_warning() -> None:
-    text = """m (float[2,2] x) => (float[2,2] y)
-    <float[2,2] w = {1.0, 2.0, 3.0, 4.0}, float s = {0.5}, int8 z = {0}>
-    { q = QuantizeLinear(w, s, z) d = DequantizeLinear(q, s, z) y = MatMul(x, d) }"""
-
-    assert ("warning", "float-weight", "the weight is stored as float") in found(text)
-
-
-def test_a_pair_between_a_convolution_and_its_add_is_a_warning() -> None:
-    text = """m (float[1,1,4,4] x, float[1,1,1,1] w) => (float[1,1,4,4] y)
-    <float s = {0.5}, int8 z = {0}>
-    { c = Conv(x, w) q = QuantizeLinear(c, s, z) d = DequantizeLinear(q, s, z)
-      y = Add(d, x) }"""
-
-    assert "residual-branch" in [each[1] for each in found(text)]
 
 
 def test_a_rounded_projection_is_a_residual_branch() -> None:

@@ -16,16 +16,17 @@ from typing import Any
 
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import graph, rewrite
 from me2e_compress.errors import (
     BrokenPackageError,
     GraphError,
     MissingExtraError,
+    PreconditionError,
     RecipeError,
 )
+from me2e_compress.graph.nodes import is_plugin
 from me2e_compress.quantization.plan import INT8, QuantPlan, plan_of
 from me2e_compress.runtime.children import run_script
-from me2e_compress.targets.tensorrt.rtx.cut import cut
 
 SM = (75, 80, 86, 89, 120, 121)
 """GPU generations that TensorRT-RTX 1.7 builds for: Turing, Ampere, Ada, Blackwell."""
@@ -117,7 +118,8 @@ def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> BuildResult:
         answer, plan = _ask(part, Path(scratch), sm, build=build)
     # Confirm that the planned nodes are int8 kernels.
     kernels = () if plan is None else read_kernels(plan)
-    errors = [*answer["errors"], *answer["log"]] if not _went_well(answer) else []
+    well = answer["parsed"] and answer["built"] is not False
+    errors = [] if well else [*answer["errors"], *answer["log"]]
     return BuildResult(
         str(answer["version"]),
         gone,
@@ -147,10 +149,6 @@ def _ask(
         )
     found = json.loads(answer.read_text(encoding="utf-8"))
     return found, plan.read_bytes() if plan.is_file() else None
-
-
-def _went_well(answer: dict[str, Any]) -> bool:
-    return bool(answer["parsed"]) and answer["built"] is not False
 
 
 def _missing(
@@ -184,3 +182,56 @@ def without_int8(nodes: Iterable[str], kernels: Iterable[Kernel]) -> tuple[str, 
     """Return the nodes that no int8 kernel of the plan computes."""
     done = {name for kernel in kernels if kernel.is_int8 for name in kernel.nodes}
     return tuple(name for name in nodes if name not in done)
+
+
+LACKING = frozenset({"DeformConv", "NonMaxSuppression", "NonZero", "RoiAlign"})
+"""Operators that TensorRT supports by its own plugins, and TensorRT-RTX does not."""
+
+
+def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:
+    """Cut a graph at plugins: tport outputs become inputs, tport inputs outputs.
+
+    Nodes with a local function are not plugins: the parser reads the function. Types
+    and shapes must be known. Returns the copy, and the names of the nodes that were cut
+    out.
+    """
+    copy = model.clone()
+    copy.metadata_props.clear()  # it speaks of inputs and outputs that change
+    gone = [node for node in copy.graph if _is_missing(node, copy)]
+    names = tuple(node.name or str(node.outputs[0].name) for node in gone)
+    for node in gone:
+        _detach(copy.graph, node)
+    rewrite.sweep(copy)
+    return copy, names
+
+
+def _is_missing(node: ir.Node, model: ir.Model) -> bool:
+    if is_plugin(node):
+        return node.op_identifier() not in model.functions
+    return node.op_type in LACKING
+
+
+def _detach(where: ir.Graph, node: ir.Node) -> None:
+    for value in node.outputs:
+        if value.is_graph_output():
+            where.outputs.remove(value)
+        if not value.uses():
+            continue
+        # A new graph input needs a type and a shape.
+        if value.dtype is None or graph.static_shape(value) is None:
+            raise PreconditionError(
+                f"{node.op_type} {node.name!r}: the type or shape of its output"
+                f" {value.name} is not known, so the graph cannot be cut there"
+            )
+        name = str(value.name)
+        value.name = f"{name}_cut"
+        port = ir.Value(name=name, shape=value.shape, type=value.type)
+        value.replace_all_uses_with(port)
+        where.inputs.append(port)
+    # What the node read must still be computed.
+    for index, read in enumerate(node.inputs):
+        computed = read is not None and read.producer() is not None
+        if read is not None and computed and not read.is_graph_output():
+            where.outputs.append(read)
+        node.replace_input_with(index, None)
+    where.remove(node)

@@ -1,4 +1,4 @@
-"""Write constants and new nodes into a graph during lowering."""
+"""Write int8 into a graph: constants, nodes, and pairs of quantization nodes."""
 
 import hashlib
 from collections.abc import Sequence
@@ -14,15 +14,18 @@ BY = "quantize-int8"
 
 
 class Writer:
-    """Writes into one graph; equal constants are stored once."""
+    """Writes into one graph; with ``share`` equal constants are stored once."""
 
-    def __init__(self, where: ir.Graph) -> None:
+    def __init__(self, where: ir.Graph, *, share: bool = True) -> None:
         self.graph = where
+        self._share = share
         self._constants: dict[tuple[str, bytes], ir.Value] = {}
         self._names = rewrite.value_names(where)
 
     def constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
         """Return the initializer of an array, or add one."""
+        if not self._share:
+            return rewrite.add_constant(self.graph, array, name, self._names)
         kind = f"{array.dtype}{array.shape}"
         key = (kind, hashlib.sha256(array.tobytes()).digest())
         if key not in self._constants:
@@ -46,28 +49,58 @@ class Writer:
         provenance.inherit(node, sources, by=BY)
         return node
 
+    def pair(
+        self,
+        value: ir.Value,
+        grid: Sequence[ir.Value],
+        names: tuple[str, str],
+        source: ir.Node,
+    ) -> tuple[ir.Node, ir.Node]:
+        """Insert QuantizeLinear and DequantizeLinear behind the producer of a value.
+
+        ``grid`` is scale and zero point, ``source`` gives the provenance.
+        """
+        scale, zero = grid
+        quantize = self.node("QuantizeLinear", [value, *grid], names[0], [source])
+        integers = quantize.outputs[0]
+        dequantize = self.node(
+            "DequantizeLinear", [integers, *grid], names[1], [source]
+        )
+        # Both have the shape of the value
+        integers.type = zero.type
+        dequantize.outputs[0].type = scale.type
+        integers.shape = dequantize.outputs[0].shape = value.shape
+        producer = value.producer()
+        if producer is None:
+            self.graph.insert_before(self.graph[0], [quantize, dequantize])
+        else:
+            self.graph.insert_after(producer, [quantize, dequantize])
+        return quantize, dequantize
+
     def dequantized(
         self,
         name: str,
         integers: npt.NDArray[np.generic],
-        scales: npt.NDArray[np.float32],
+        scales: npt.NDArray[np.generic],
         axis: int | None,
         reader: ir.Node,
+        label: str = "",
     ) -> ir.Value:
         """Store integers and insert their DequantizeLinear before the reader.
 
-        ``scales`` is float32 [channels] along ``axis`` of the integers, or a scalar
-        with ``axis`` None. Returns the dequantized tensor.
+        ``scales`` is [channels] along ``axis`` of the integers, or a scalar with
+        ``axis`` None; ``label`` names the node, empty for a name after its reader.
+        Returns the dequantized tensor, of the scales' type.
         """
         zeros = np.zeros(scales.shape, integers.dtype)
         stored = self.constant(integers, f"{name}_{integers.dtype}")
         steps = self.constant(scales, f"{name}_scale")
         inputs = [stored, steps, self.constant(zeros, f"{name}_zero")]
         axes = None if axis is None else {"axis": axis}
-        # The node is named after its reader: weights may be shared.
-        label = f"{reader.name or reader.outputs[0].name}/{name}_float"
+        # Weights may be shared, the name of the reader is not
+        label = label or f"{reader.name or reader.outputs[0].name}/{name}_float"
         node = self.node("DequantizeLinear", inputs, label, [reader], axes)
         node.outputs[0].shape = ir.Shape(integers.shape)
-        node.outputs[0].dtype = ir.DataType.FLOAT
+        node.outputs[0].type = steps.type
         self.graph.insert_before(reader, node)
         return node.outputs[0]
