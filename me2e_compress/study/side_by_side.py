@@ -1,11 +1,13 @@
 """Pictures of the moment at which two drives of a route diverge."""
 
+import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.simulator.cameras import paint_texture
 from me2e_compress.simulator.pictures import Moment, RoutePicture, overlay, write_png
 from me2e_compress.simulator.routes import Route
@@ -14,7 +16,6 @@ from me2e_compress.study.condition import Condition
 from me2e_compress.study.drive_record import Apart, DriveRecord
 from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.prepared import PreparedVariant
-from me2e_compress.study.route_summary import RouteSummary
 
 SCORED, MOVED_M = 1.0, 0.5
 """Two drives whose scores are closer, and that were never farther apart, look alike."""
@@ -135,25 +136,6 @@ def _chosen(baseline: str, drives: Sequence[DriveRecord], limit: int) -> list[_P
     return chosen
 
 
-@dataclass
-class _Film:
-    """Keeps all positions, and the camera images of the latest moment only."""
-
-    until_us: int
-    moments: list[Moment] = field(default_factory=list)
-
-    def see(self, moment: Moment) -> None:
-        if self.moments:
-            self.moments[-1] = replace(self.moments[-1], images=None)
-        self.moments.append(moment)
-        if moment.scene.time_us >= self.until_us:
-            raise _Enough
-
-
-class _Enough(Exception):  # noqa: N818 - it ends a drive, nothing went wrong
-    """Ends a drive once the moment was seen."""
-
-
 def _picture(
     setup: DriveSetup,
     variant: PreparedVariant,
@@ -171,7 +153,7 @@ def _picture(
     points = world.path.points
     texture = paint_texture(world.roadmap, points)
     drives = [
-        RoutePicture(each.variant.name, texture, points, _watched(job, route, time_us))
+        RoutePicture(each.variant.name, texture, points, watch(job, route, time_us))
         for each, job in zip((variant, baseline), jobs, strict=True)
         if job is not None
     ]
@@ -179,10 +161,21 @@ def _picture(
     return path
 
 
-def _watched(job: Job, route: Route, time_us: int) -> list[Moment]:
-    film = _Film(time_us)
-    try:
-        drive(route, job.driver.open(), job.conditions, Listeners(on_moment=film.see))
-    except _Enough:
-        return film.moments
-    return film.moments
+class _Enough(Exception):  # noqa: N818 - it ends a drive, nothing went wrong
+    """Ends a drive once the moment was seen."""
+
+
+def watch(job: Job, route: Route, until_us: int) -> list[Moment]:
+    """Drive a route, and return its moments; only the last one has camera images."""
+    moments = list[Moment]()
+
+    def see(moment: Moment) -> None:
+        if moments:
+            moments[-1] = replace(moments[-1], images=None)
+        moments.append(moment)
+        if moment.scene.time_us >= until_us:
+            raise _Enough
+
+    with contextlib.suppress(_Enough):
+        drive(route, job.driver.open(), job.conditions, Listeners(on_moment=see))
+    return moments

@@ -3,7 +3,7 @@
 No answer is written down: every verdict follows from the drives.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -14,20 +14,11 @@ from me2e_compress.metrics.eer import eer
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.metrics.intervals import intervals, mean_estimate
 from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.route_values import DS, POINTS, RouteColumn
+from me2e_compress.study.cells import MISSING, estimate_cell
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.paper.energy_columns import (
-    Energy,
-    joules_by_variant,
-    measures_by_variant,
-)
+from me2e_compress.study.paper.paper_cells import Energy, measures_by_variant
 from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.study.route_columns import (
-    DS,
-    Column,
-    mean_of,
-    paired,
-)
-from me2e_compress.study.tables import MISSING, estimate_cell
 from me2e_compress.workflows.result import Cell, Table
 
 
@@ -65,10 +56,6 @@ class Finding:
             "estimate": None if self.estimate is None else self.estimate.to_json(),
             "reason": self.reason or None,
         }
-
-
-class UntestedError(Exception):
-    """Data that a test needs are missing; the message names them."""
 
 
 Rule = Callable[[Estimate], Verdict]
@@ -129,40 +116,36 @@ class Evidence:
         """Seed of bootstraps."""
         return self.result.study.seed
 
-    def cell(self, name: CellName) -> DriveRecord:
-        """Return a drive, or raise an `UntestedError` that says why it is missing."""
-        found = self.result.cell(*name)
-        if found is None:
-            raise UntestedError(self.result.why_not(*name))
-        return found
-
-    def mean(self, name: CellName, column: Column) -> float:
-        """Return a mean over the routes of a drive."""
-        found = mean_of(self.cell(name), column, self.seed)
-        if found.value is None:
-            raise UntestedError(found.measure.reason)
-        return found.value
+    def drive(self, name: CellName) -> DriveRecord:
+        """Return a drive; one that was not made says why."""
+        return self.result.drive(*name)
 
     def difference(
-        self, one: CellName, other: CellName, column: Column = DS
+        self, one: CellName, other: CellName, column: RouteColumn = DS
     ) -> Estimate:
         """Return the mean of one minus the other over the same routes."""
-        return paired(self.cell(one), self.cell(other), column, self.seed)
+        return self.drive(one).minus(self.drive(other), column, self.seed)
 
     def change_of_change(
         self, first: CellName, middle: CellName, last: CellName
     ) -> Estimate:
         """Return how much more DS changes from first to middle than to last."""
-        drives = (self.cell(name) for name in (first, middle, last))
-        early, halfway, late = (DS.values(each.routes) for each in drives)
+        drives = [self.drive(name) for name in (first, middle, last)]
+        if why := _missing(drives):
+            return Estimate.missing(POINTS, why)
+        early, halfway, late = (each.values(DS) for each in drives)
         return ((halfway - early) - (late - halfway)).mean(self.seed)
 
     def static_share(self, one: CellName, other: CellName) -> Estimate:
         """Return the increase of the share of collisions with static objects."""
-        drives = self.cell(one), self.cell(other)
+        drives = self.drive(one), self.drive(other)
+        if why := _missing(drives):
+            return Estimate.missing("ratio", why)
         counts = np.array([_static_and_all(drive) for drive in drives], np.float64)
         if not counts[:, :, 1].sum(axis=1).all():
-            raise UntestedError("a drive without a collision has no shares")
+            return Estimate.missing(
+                "ratio", "a drive without a collision has no shares"
+            )
 
         def gap(weights: np.ndarray[Any, np.dtype[np.float64]]) -> Any:
             static, every = (weights @ counts[:, :, at].T for at in (0, 1))
@@ -179,26 +162,26 @@ class Evidence:
         """Return the difference in EER_AV, scored with all of table 5."""
         block = next((b for b in self.result.study.blocks if b.name == "table-5"), None)
         if block is None:
-            raise UntestedError("the study has no block table-5")
-        joules = joules_by_variant(self.result, block.variants, energy)
-        found = eer(measures_by_variant(self.result, joules, condition))
+            return Estimate.missing(POINTS, "the study has no block table-5")
+        variants = measures_by_variant(self.result, block.variants, energy, condition)
+        found = eer(variants)
         for name in (one, other):
             if name not in found.routes:
-                score = found.scores.get(name)
-                why = self.result.why_not(name, condition)
-                raise UntestedError(why if score is None else score.measure.reason)
+                score, drive = found.scores.get(name), self.drive((name, condition))
+                why = drive.reason if score is None else score.measure.reason
+                return Estimate.missing(POINTS, why)
         gaps_by_route = (found.routes[one] - found.routes[other]).tolist()
         if any(found.left_out.values()):
             types = [""] * len(gaps_by_route)
         else:
-            types = [each.scenario for each in self.cell((one, condition)).routes]
-        return mean_estimate(gaps_by_route, types, "points", self.seed)
+            types = [each.scenario for each in self.drive((one, condition)).routes]
+        return mean_estimate(gaps_by_route, types, POINTS, self.seed)
 
     def faster_by(self, one: str, other: str) -> Estimate:
         """Return by how many ms the median latency of one is below the other's."""
         samples = [self.result.fact(name).latency_us for name in (one, other)]
         if not all(samples):
-            raise UntestedError(f"no latencies of {one} and {other}")
+            return Estimate.missing("ms", f"no latencies of {one} and {other}")
         random = np.random.default_rng(self.seed)
         drawn = [
             np.median(random.choice(each, (2_000, len(each))), axis=1)
@@ -207,6 +190,11 @@ class Evidence:
         low, high = np.percentile(drawn[1] - drawn[0], (2.5, 97.5)) / 1e3
         value = float(np.median(samples[1]) - np.median(samples[0])) / 1e3
         return Estimate(Measure(value, "ms"), float(low), float(high), len(samples[0]))
+
+
+def _missing(drives: Sequence[DriveRecord]) -> str:
+    """Say why the first drive is missing, if one is."""
+    return next((each.reason for each in drives if each.reason), "")
 
 
 def _static_and_all(drive: DriveRecord) -> list[tuple[int, int]]:
@@ -227,15 +215,12 @@ class PaperQuestion:
     def answer(self, result: PaperDrives) -> Finding:
         """Compute and judge."""
         evidence = Evidence(result)
-        try:
-            found = self.compute(evidence)
-            if found.value is None:
-                raise UntestedError(found.measure.reason)
-            verdict = self.rule(evidence)(found)
-        except UntestedError as error:
-            words = self.question, self.paper, self.test
-            return Finding(*words, Verdict.NOT_TESTED, reason=str(error))
-        return Finding(self.question, self.paper, self.test, verdict, found)
+        words = self.question, self.paper, self.test
+        found = self.compute(evidence)
+        if found.value is None:
+            reason = found.measure.reason
+            return Finding(*words, Verdict.NOT_TESTED, reason=reason)
+        return Finding(*words, self.rule(evidence)(found), found)
 
 
 def findings_table(found: tuple[Finding, ...], preview: str) -> Table:
@@ -267,6 +252,5 @@ def findings_table(found: tuple[Finding, ...], preview: str) -> Table:
 
 
 def _shown(estimate: Estimate) -> Cell:
-    form = ".1f" if estimate.measure.unit != "ratio" else ".3f"
-    cell = estimate_cell(estimate, form, signed=True)
+    cell = estimate_cell(estimate, signed=True)
     return Cell(f"{cell.text} {estimate.measure.unit}", cell.detail, cell.reason)
