@@ -22,21 +22,8 @@ SCORED, MOVED_M = 1.0, 0.5
 
 
 @dataclass(frozen=True)
-class Contrast:
-    """A PNG of one moment of two drives: the baseline in grey under the variant."""
-
-    route: RouteSummary
-    other: RouteSummary
-    variant: str
-    condition: str
-    time_us: int
-    apart_m: float
-    picture: Path
-
-
-@dataclass(frozen=True)
-class _Pair:
-    """A candidate: one route of two drives."""
+class RoutePair:
+    """One route as two drivers drove it: ``route`` is the baseline's."""
 
     drive: DriveRecord
     route: RouteSummary
@@ -49,6 +36,7 @@ class _Pair:
 
     @property
     def gap(self) -> float:
+        """How far the driving scores differ."""
         return abs(self.route.driving_score - self.other.driving_score)
 
     @property
@@ -58,10 +46,12 @@ class _Pair:
 
     @property
     def differs(self) -> bool:
+        """Whether a reader can see that the two are not alike."""
         return self.gap >= SCORED or self.apart.distance_m > MOVED_M
 
     @property
     def rank(self) -> tuple[float, float]:
+        """Order of pictures: the widest gap first."""
         return -self.gap, -self.apart.distance_m
 
     @property
@@ -77,6 +67,13 @@ class _Pair:
         alone = [us for kind, us in timed if kind not in kinds]
         times = alone or [us for _, us in timed]
         return times[0] if times else min(worse.duration_us, better.duration_us)
+
+
+@dataclass(frozen=True)
+class Contrast(RoutePair):
+    """A PNG of the moment of two drives: the baseline in grey under the variant."""
+
+    picture: Path
 
 
 def take_pictures(
@@ -102,20 +99,17 @@ def take_pictures(
         where = routes[pair.route.route]
         both = by_name[pair.drive.variant], by_name[setup.study.baseline]
         picture = _picture(setup, *both, condition, where, pair.moment_us)
-        found.append(
-            Contrast(
-                *(pair.route, pair.other, pair.drive.variant, condition.name),
-                *(pair.moment_us, pair.apart.distance_m, picture),
-            )
-        )
+        found.append(Contrast(pair.drive, pair.route, pair.other, picture))
     return tuple(found)
 
 
-def _chosen(baseline: str, drives: Sequence[DriveRecord], limit: int) -> list[_Pair]:
+def _chosen(
+    baseline: str, drives: Sequence[DriveRecord], limit: int
+) -> list[RoutePair]:
     """Choose the widest gaps: one of each variant first, and no route twice."""
     references = {each.condition: each for each in drives if each.variant == baseline}
     pairs = [
-        _Pair(drive, route, other)
+        RoutePair(drive, route, other)
         for drive in drives
         if drive.variant != baseline and drive.routes
         for route, other in zip(
@@ -125,7 +119,7 @@ def _chosen(baseline: str, drives: Sequence[DriveRecord], limit: int) -> list[_P
     ranked = sorted((pair for pair in pairs if pair.seen), key=lambda p: p.rank)
     # Where all look alike, one picture shows just that.
     ranked = [pair for pair in ranked if pair.differs] or ranked[:1]
-    chosen = list[_Pair]()
+    chosen = list[RoutePair]()
     for others_only in (True, False):
         for pair in ranked:
             shown = [each.drive.variant for each in chosen]

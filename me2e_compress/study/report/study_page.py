@@ -126,15 +126,15 @@ def _lede(outcome: StudyResult) -> str:
 def _contrast(contrast: Contrast, baseline: str) -> Drawing:
     route = contrast.route
     words = (
-        f"{baseline}, in grey: {_ended(route)}; {contrast.variant}, in colour:"
+        f"{baseline}, in grey: {_ended(route)}; {contrast.drive.variant}, in colour:"
         f" {_ended(contrast.other)}"
     )
     png = base64.b64encode(contrast.picture.read_bytes()).decode()
     image = Markup('<img src="data:image/png;base64,{}" alt="{}">').format(png, words)
     caption = (
-        f"{route.scenario}, {contrast.condition}, "
-        f"{contrast.time_us / 1e6:.1f} s into the route {route.route}; "
-        f"at most {contrast.apart_m:.1f} m apart"
+        f"{route.scenario}, {contrast.drive.condition}, "
+        f"{contrast.moment_us / 1e6:.1f} s into the route {route.route}; "
+        f"at most {contrast.apart.distance_m:.1f} m apart"
     )
     return Drawing(image, caption=caption, words=words)
 
