@@ -65,7 +65,7 @@ def with_cells(result: PaperResult, cells: Cells) -> PaperResult:
 
 
 def verdicts(result: PaperResult) -> dict[str, Verdict]:
-    return {each.question: each.verdict for each in result.findings}
+    return {each.asked.question: each.verdict for each in result.findings}
 
 
 @pytest.mark.parametrize(
@@ -138,12 +138,11 @@ def test_what_was_not_driven_is_not_tested_and_says_so(result: PaperResult) -> N
     lacking = with_cells(result, cells)
     lacking = replace(lacking, drives=(*lacking.drives, failed))
 
-    found = {each.question: each for each in lacking.findings}
+    found = {each.asked.question: each for each in lacking.findings}
     finding = found["Without occupancy it drives better"]
 
     assert finding.verdict is Verdict.NOT_TESTED
-    assert finding.reason == "no memory"
-    assert finding.estimate is None
+    assert finding.estimate.measure == Measure(None, "points", "no memory")
 
 
 def test_a_drive_without_collisions_has_no_shares(result: PaperResult) -> None:
@@ -152,12 +151,11 @@ def test_a_drive_without_collisions_has_no_shares(result: PaperResult) -> None:
     safe = tuple(replace(each, infractions=()) for each in record.routes)
     cells = {**cells_of(result), key: replace(record, routes=safe)}
 
-    question = "Without the map more of the collisions are with static things"
-    [finding] = [
-        each for each in with_cells(result, cells).findings if each.question == question
-    ]
+    found = {e.asked.question: e for e in with_cells(result, cells).findings}
+    [answer] = [each for name, each in found.items() if "static things" in name]
 
-    assert finding.reason == "a drive without a collision has no shares"
+    why = "a drive without a collision has no shares"
+    assert answer.estimate.measure.reason == why
 
 
 def test_rates_that_equation_4_makes_one_are_one_drive(result: PaperResult) -> None:

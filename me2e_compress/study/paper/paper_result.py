@@ -142,7 +142,7 @@ def paper_page(result: PaperResult, command: Sequence[str] = ()) -> Page:
             (each.variant, each.pipeline or each.failure or "as it is", each.sha256)
             for each in result.facts
         ],
-        [(each.verdict.value, f"{each.question}.") for each in result.findings],
+        [(each.verdict.value, f"{each.asked.question}.") for each in result.findings],
     )
 
 

@@ -15,7 +15,7 @@ from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.metrics.intervals import intervals, mean_estimate
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.route_values import DS, POINTS, RouteColumn
-from me2e_compress.study.cells import MISSING, estimate_cell
+from me2e_compress.study.cells import estimate_cell
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.paper.paper_cells import Energy, measures_by_variant
 from me2e_compress.study.paper.paper_drives import PaperDrives
@@ -29,33 +29,6 @@ class Verdict(StrEnum):
     NOT_CONFIRMED = "not confirmed"
     OPPOSITE = "opposite"
     NOT_TESTED = "not tested"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A question about a finding of the paper, and the answer.
-
-    The question is phrased so that the paper's answer is yes; ``paper`` and ``test``
-    say in words what the paper found and what is computed here.
-    """
-
-    question: str
-    paper: str
-    test: str
-    verdict: Verdict
-    estimate: Estimate | None = None
-    reason: str = ""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return all fields."""
-        return {
-            "question": self.question,
-            "paper": self.paper,
-            "test": self.test,
-            "verdict": self.verdict.value,
-            "estimate": None if self.estimate is None else self.estimate.to_json(),
-            "reason": self.reason or None,
-        }
 
 
 Rule = Callable[[Estimate], Verdict]
@@ -204,7 +177,11 @@ def _static_and_all(drive: DriveRecord) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class PaperQuestion:
-    """A finding of the paper before it is tested; ``rule`` may read the drives."""
+    """A question about a finding of the paper, whose answer is yes.
+
+    ``paper`` and ``test`` say in words what the paper found and what is computed here;
+    ``rule`` may read the drives.
+    """
 
     question: str
     paper: str
@@ -212,33 +189,49 @@ class PaperQuestion:
     compute: Callable[[Evidence], Estimate]
     rule: Callable[[Evidence], Rule] = lambda evidence: rises
 
-    def answer(self, result: PaperDrives) -> Finding:
-        """Compute and judge."""
+    def answer(self, result: PaperDrives) -> "Finding":
+        """Compute and judge; without an estimate nothing was tested."""
         evidence = Evidence(result)
-        words = self.question, self.paper, self.test
-        found = self.compute(evidence)
-        if found.value is None:
-            reason = found.measure.reason
-            return Finding(*words, Verdict.NOT_TESTED, reason=reason)
-        return Finding(*words, self.rule(evidence)(found), found)
+        found, verdict = self.compute(evidence), Verdict.NOT_TESTED
+        if found.value is not None:
+            verdict = self.rule(evidence)(found)
+        return Finding(self, verdict, found)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The answer to a question, and the estimate that it follows from."""
+
+    asked: PaperQuestion
+    verdict: Verdict
+    estimate: Estimate
+
+    def to_json(self) -> dict[str, Any]:
+        """Return question, verdict, and the estimate or why there is none."""
+        reason = self.estimate.measure.reason
+        return {
+            "question": self.asked.question,
+            "paper": self.asked.paper,
+            "test": self.asked.test,
+            "verdict": self.verdict.value,
+            "estimate": None if reason else self.estimate.to_json(),
+            "reason": reason or None,
+        }
 
 
 def findings_table(found: tuple[Finding, ...], preview: str) -> Table:
     """Show every question with its verdict and interval."""
-    # an untested finding has a reason instead of a difference
     rows = [
         (
-            Cell(each.question),
-            Cell(each.paper),
-            Cell(each.test if each.estimate else each.reason),
+            Cell(each.asked.question),
+            Cell(each.asked.paper),
+            Cell(each.estimate.measure.reason or each.asked.test),
             Cell(each.verdict.value),
-            Cell(MISSING, reason=each.reason)
-            if each.estimate is None
-            else _shown(each.estimate),
+            _shown(each.estimate),
         )
         for each in found
     ]
-    tested = sum(each.estimate is not None for each in found)
+    tested = sum(each.estimate.value is not None for each in found)
     return Table(
         f"The paper's findings{preview}",
         ("is it so that", "the paper", "the test", "here", "difference"),
@@ -253,4 +246,6 @@ def findings_table(found: tuple[Finding, ...], preview: str) -> Table:
 
 def _shown(estimate: Estimate) -> Cell:
     cell = estimate_cell(estimate, signed=True)
-    return Cell(f"{cell.text} {estimate.measure.unit}", cell.detail, cell.reason)
+    if cell.reason:
+        return cell
+    return Cell(f"{cell.text} {estimate.measure.unit}", cell.detail)
