@@ -199,12 +199,6 @@ def test_routes_of_the_command_line_win(models: Path) -> None:
         ("[latency]", "[latency", StudyError, "not TOML"),
         ('"frames"', '"gone"', StudyError, r"^held_out: \S+/gone: no such folder"),
         (
-            "routes = 3",
-            'routes = 3\nframes = "slow.onnx"',
-            StudyError,
-            r"^frames: \S+/slow\.onnx: no such folder",
-        ),
-        (
             'recipe = "exact"',
             'recipe = "feature-ext"',
             StudyError,
