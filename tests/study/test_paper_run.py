@@ -245,7 +245,7 @@ def test_models_are_timed_and_weighed(models: Path, tmp_path: Path) -> None:
     assert min(fact.latency_us) <= 200_001 <= max(fact.latency_us) + 2
     assert fact.parameters is not None
     assert sum(map(len, fact.modules_us.values())) > 0
-    assert found.preview == " (preview: 1 of 220 routes)"
+    assert found.study.preview == " (preview: 1 of 220 routes)"
     assert all("preview" in table.title for table in found.tables())
 
 
