@@ -42,7 +42,6 @@ from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.study import Listener, run_study
-from me2e_compress.study.all_tables import all_tables
 from me2e_compress.study.workspace import MARKDOWN, Workspace
 from me2e_compress.study.write import write_study
 from me2e_compress.workflows.checks import model_path
@@ -117,7 +116,7 @@ def run(bench: Bench, name: str, workers: int) -> None:
     study, folder = STUDIES[name](bench), bench.out / name
     outcome = run_study(study, bench.out, LocalEngine(workers), told())
     write_study(outcome, folder, (*COMMAND, str(bench.out), "--only", name))
-    parts = [table.markdown() for table in all_tables(outcome)]
+    parts = [table.markdown() for table in outcome.tables()]
     if name in BESIDES:
         parts.append(BESIDES[name](bench))
     if len(outcome.variants) > 1:

@@ -16,7 +16,7 @@ from pathlib import Path
 from me2e_compress.errors import Me2eError
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.study import load_study
-from me2e_compress.study.paper.model_facts import FILE
+from me2e_compress.study.paper.paper_drives import FILE
 from me2e_compress.study.paper.paper_run import read_paper
 from me2e_compress.study.paper.questions import Verdict
 from me2e_compress.study.workspace import Workspace

@@ -28,8 +28,8 @@ from me2e_compress.modules import ModuleMap
 from me2e_compress.quantization.plan import make_plan, stamp_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.study.paper.model_facts import int8_counts
 from me2e_compress.study.paper.published import INT8_COUNTS
+from me2e_compress.study.paper.weigh import int8_counts
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.export import export_stack

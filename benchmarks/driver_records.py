@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping
 
 from me2e_compress.evaluators.highway.results import ResultsFolder
 from me2e_compress.metrics.differences import PairedDifference, difference
-from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study import Condition, StudyResult, Variant
+from me2e_compress.study.cells import estimate_cell
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.tables import estimate_cell
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import Cell, Table
 
@@ -60,11 +60,11 @@ def among_conditions(
         conditions: All of them were driven.
         to: The one that is subtracted.
     """
-    reference = _episodes(workspace, variant, to)
+    reference = _routes(workspace, variant, to)
     rows = [
         (Cell(each.name), *_cells(difference(episodes, reference)))
         for each in conditions
-        if each != to and (episodes := _episodes(workspace, variant, each))
+        if each != to and (episodes := _routes(workspace, variant, each))
     ]
     return Table(
         f"{variant.name}: difference to {to.name} on the same routes",
@@ -120,20 +120,20 @@ def _cells(found: PairedDifference) -> tuple[Cell, ...]:
     )
 
 
-def _episodes(
+def _routes(
     workspace: Workspace, variant: Variant, condition: Condition
-) -> list[Episode]:
+) -> list[RouteSummary]:
     folder = ResultsFolder.open(workspace.results(variant, condition))
-    return list(folder.episodes().values())
+    return [RouteSummary.of(each) for each in folder.episodes().values()]
 
 
 def _driven(
     workspace: Workspace, variant: Variant, condition: Condition
-) -> list[Episode]:
+) -> list[RouteSummary]:
     """Give the episodes; none where nobody drove."""
     if not workspace.results(variant, condition).is_dir():
         return []
-    return _episodes(workspace, variant, condition)
+    return _routes(workspace, variant, condition)
 
 
 def _scores(outcome: StudyResult, drive: DriveRecord) -> Row:

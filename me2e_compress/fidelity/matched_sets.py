@@ -8,10 +8,9 @@ sure agents count here: the rest of the slots come and go.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Self, TypeAlias
+from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 import pydantic
 
 from me2e_compress import documents
@@ -27,9 +26,6 @@ SURE = 0.5
 SAME_M = 2.0
 """Centres farther apart are two agents: the largest distance at which nuScenes'
 detection benchmark calls one found."""
-
-Float64: TypeAlias = npt.NDArray[np.float64]
-Ints: TypeAlias = npt.NDArray[np.int64]
 
 
 class SetOutputs(pydantic.BaseModel):
@@ -55,7 +51,8 @@ class SetOutputs(pydantic.BaseModel):
         """
         text = metadata.get(SETS)
         try:
-            found = cls() if text is None else cls.model_validate(_read(text))
+            named = {} if text is None else documents.from_json(text)
+            found = cls.model_validate(named)
         except (documents.MalformedError, pydantic.ValidationError) as error:
             first = str(error).splitlines()[0]
             raise GraphError(f"metadata {SETS} names no outputs: {first}") from error
@@ -70,10 +67,6 @@ class SetOutputs(pydantic.BaseModel):
             each for each in found.others if tuple(shapes.get(each, ())[:2]) in rows
         )
         return found.model_copy(update={"others": others})
-
-
-def _read(text: str) -> object:
-    return documents.from_json(text)
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ is reproduced here with its faults:
 """
 
 from statistics import fmean
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.metrics.comfort import WINDOW, filtered
 from me2e_compress.metrics.efficiency import (
     CHECKPOINTS,
     DONE_PERCENT,
@@ -150,8 +150,4 @@ def _norm(frame: EgoFrame) -> float:
 
 def _smoothed(values: Floats, derivative: int = 0) -> Floats:
     """Smooth every row of [B, N] on its own."""
-    from scipy.signal import savgol_filter  # takes half a second to import
-
-    window = min(7, values.shape[1])
-    smoothed: Any = savgol_filter(values, window, 2, deriv=derivative, delta=DELTA_S)
-    return np.asarray(smoothed, np.float64)
+    return filtered(values, DELTA_S, derivative, min(WINDOW, values.shape[1]))

@@ -1,7 +1,6 @@
 """Driving comfort: the share of seconds with every variable in its range."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,26 +18,15 @@ BLOCKED_US = 60_000_000
 Floats = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class Bounds:
-    """Bounds of the six variables, in SI units (the paper's table 1).
-
-    They are the 99th percentiles of human drivers that nuPlan's comfort metric uses.
-    """
-
-    lowest_acceleration_mps2: float = -4.05
-    highest_acceleration_mps2: float = 2.40
-    lateral_acceleration_mps2: float = 4.89
-    yaw_rate_radps: float = 0.95
-    yaw_acceleration_radps2: float = 1.93
-    longitudinal_jerk_mps3: float = 4.13
-    jerk_mps3: float = 8.37
+# the paper's table 1 in SI units: the 99th percentiles of human drivers that nuPlan's
+# comfort metric uses
+LOWEST_ACCELERATION_MPS2, HIGHEST_ACCELERATION_MPS2 = -4.05, 2.40
+LATERAL_ACCELERATION_MPS2 = 4.89
+YAW_RATE_RADPS, YAW_ACCELERATION_RADPS2 = 0.95, 1.93
+LONGITUDINAL_JERK_MPS3, JERK_MPS3 = 4.13, 8.37
 
 
-BOUNDS = Bounds()
-
-
-def comfort(episode: Episode, bounds: Bounds = BOUNDS) -> Measure:
+def comfort(episode: Episode) -> Measure:
     """Return the share of segments of 20 frames in which every frame is smooth.
 
     Equation 7 with all six variables in SI units and the frames' own interval, which is
@@ -56,10 +44,10 @@ def comfort(episode: Episode, bounds: Bounds = BOUNDS) -> Measure:
     if len(episode.frames) < SEGMENT_FRAMES:
         frames = len(episode.frames)
         return Measure(None, "ratio", f"{frames} frames, {SEGMENT_FRAMES} are needed")
-    return Measure(float(_segments(smooth_frames(episode, bounds)).mean()), "ratio")
+    return Measure(float(_segments(smooth_frames(episode)).mean()), "ratio")
 
 
-def comfort_in_motion(episode: Episode, bounds: Bounds = BOUNDS) -> Measure:
+def comfort_in_motion(episode: Episode) -> Measure:
     """Return the comfort over the segments in which the ego moved.
 
     A standing ego is comfortable, so a driver that is stuck for most of a route scores
@@ -67,13 +55,11 @@ def comfort_in_motion(episode: Episode, bounds: Bounds = BOUNDS) -> Measure:
     at least one of its frames.
     """
     if len(episode.frames) < SEGMENT_FRAMES:
-        return comfort(episode, bounds)
+        return comfort(episode)
     moved = ~_segments(~_moving(episode.frames))
     if not moved.any():
         return Measure(None, "ratio", "the ego never moved")
-    return Measure(
-        float(_segments(smooth_frames(episode, bounds))[moved].mean()), "ratio"
-    )
+    return Measure(float(_segments(smooth_frames(episode))[moved].mean()), "ratio")
 
 
 def standing_share(episode: Episode) -> float | None:
@@ -106,7 +92,7 @@ def _moving(frames: Sequence[EgoFrame]) -> npt.NDArray[np.bool_]:
     return np.array([frame.speed_mps > BLOCKED_SPEED_MPS for frame in frames])
 
 
-def smooth_frames(episode: Episode, bounds: Bounds = BOUNDS) -> npt.NDArray[np.bool_]:
+def smooth_frames(episode: Episode) -> npt.NDArray[np.bool_]:
     """Return for each of at least 7 frames whether all six variables are in range."""
     frames = episode.frames
     # the jerk needs the acceleration vector in the world
@@ -118,24 +104,27 @@ def smooth_frames(episode: Episode, bounds: Bounds = BOUNDS) -> npt.NDArray[np.b
     north = along * np.sin(heading) + left * np.cos(heading)
     delta_s = frame_interval_us(frames) / 1e6
     # every variable against its bounds
-    acceleration = _filtered(along)
-    jerk_east, jerk_north = (_filtered(each, delta_s, 1) for each in (east, north))
+    acceleration = filtered(along)
+    jerk_east, jerk_north = (filtered(each, delta_s, 1) for each in (east, north))
     return (
-        (acceleration >= bounds.lowest_acceleration_mps2)
-        & (acceleration <= bounds.highest_acceleration_mps2)
-        & (np.abs(_filtered(left)) <= bounds.lateral_acceleration_mps2)
-        & (np.abs(_filtered(yaw_rate)) <= bounds.yaw_rate_radps)
-        & (np.abs(_filtered(yaw_rate, delta_s, 1)) <= bounds.yaw_acceleration_radps2)
-        & (np.abs(_filtered(along, delta_s, 1)) <= bounds.longitudinal_jerk_mps3)
-        & (np.hypot(jerk_east, jerk_north) <= bounds.jerk_mps3)
+        (acceleration >= LOWEST_ACCELERATION_MPS2)
+        & (acceleration <= HIGHEST_ACCELERATION_MPS2)
+        & (np.abs(filtered(left)) <= LATERAL_ACCELERATION_MPS2)
+        & (np.abs(filtered(yaw_rate)) <= YAW_RATE_RADPS)
+        & (np.abs(filtered(yaw_rate, delta_s, 1)) <= YAW_ACCELERATION_RADPS2)
+        & (np.abs(filtered(along, delta_s, 1)) <= LONGITUDINAL_JERK_MPS3)
+        & (np.hypot(jerk_east, jerk_north) <= JERK_MPS3)
     ) | _blocked_frames(episode)
 
 
-def _filtered(values: Floats, delta_s: float = 1.0, derivative: int = 0) -> Floats:
+def filtered(
+    values: Floats, delta_s: float = 1.0, derivative: int = 0, window: int = WINDOW
+) -> Floats:
+    """Smooth values, or every row of them, by Savitzky and Golay's filter."""
     from scipy.signal import savgol_filter  # takes half a second to import
 
     smoothed: Any = savgol_filter(
-        values, WINDOW, ORDER, deriv=derivative, delta=delta_s
+        values, window, ORDER, deriv=derivative, delta=delta_s
     )
     return np.asarray(smoothed, np.float64)
 

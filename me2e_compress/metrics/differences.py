@@ -7,15 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.driving_score import route_score
-from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.intervals import unseen_interval, unseen_share
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.metrics.route_values import RouteColumn, RouteValues
-
-PERCENT = (0.0, 100.0)
-DS = RouteColumn[Episode]("DS", "%", lambda one: route_score(one).composed, PERCENT)
-SR = RouteColumn[Episode]("SR %", "%", lambda one: 100.0 * one.succeeded, PERCENT)
+from me2e_compress.metrics.route_summary import RouteSummary
+from me2e_compress.metrics.route_values import DS, SR, RouteValues
 
 SCATTER = 12.0
 """Standard deviation, points a route, of the driving score's paired difference between
@@ -73,18 +68,11 @@ class PairedDifference:
 
     @property
     def verdict(self) -> str:
-        """Say in a word or two what these routes show about the driving score.
-
-        Bounds are rounded to a tenth of a point, as they are printed.
-        """
+        """Say in a word or two what these routes show about the driving score."""
         score = self.driving_score
         if abs(score.value or 0.0) < shown_by(score.n) or score.low is None:
             return "too few routes"
-        if round(score.low, 1) > 0.0:
-            return "better"
-        if score.high is not None and round(score.high, 1) < 0.0:
-            return "worse"
-        return "no difference shown"
+        return ("no difference shown", "better", "worse")[score.sign]
 
     @property
     def p_value(self) -> float:
@@ -112,18 +100,18 @@ class PairedDifference:
 
 
 def difference(
-    episodes: Sequence[Episode], reference: Sequence[Episode], seed: int = 0
+    routes: Sequence[RouteSummary], reference: Sequence[RouteSummary], seed: int = 0
 ) -> PairedDifference:
     """Compare two drives of the same routes, at least one, route by route."""
     # routes must match, whatever their order
-    ours, others = ({each.route for each in drive} for drive in (episodes, reference))
+    ours, others = ({each.route for each in drive} for drive in (routes, reference))
     if unpaired := sorted(ours ^ others):
         raise EvaluationError(
             f"route {unpaired[0]} was driven by one of the two only: differences are "
             "taken over the same routes"
         )
     scores, rates = (
-        column.values(episodes) - column.values(reference) for column in (DS, SR)
+        column.values(routes) - column.values(reference) for column in (DS, SR)
     )
     gaps, turns = scores.by_route.values(), rates.by_route.values()
     return PairedDifference(

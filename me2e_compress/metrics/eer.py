@@ -19,9 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.critic import critic_weights
 from me2e_compress.metrics.intervals import mean_estimate
-from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_measures import RouteMeasures
 
 Floats = npt.NDArray[np.float64]
@@ -29,6 +28,10 @@ Floats = npt.NDArray[np.float64]
 MEASURES: tuple[str, ...] = ("driving score", "efficiency", "comfort", "energy")
 SIGNS = np.array([1.0, 1.0, 1.0, -1.0])
 POINTS = "points"
+FLAT = 1e-12
+"""A measure whose standard deviation is below this share of its values is constant."""
+ALIKE = 1e-9
+"""Below this share, all measures are redundant."""
 
 
 class Normalization(StrEnum):
@@ -111,13 +114,13 @@ def eer(
     Raises:
         EvaluationError: The variants differ in the number of routes.
     """
-    if len({len(each.driving_score) for each in variants.values()}) > 1:
+    if len({len(each.table) for each in variants.values()}) > 1:
         raise EvaluationError("EER_AV compares variants on the same routes")
     # variants and routes that can be scored
     missing = {name: _missing(each) for name, each in variants.items()}
     able = {name: each for name, each in variants.items() if not missing[name]}
     kept, left_out = _kept(able)
-    tables = {name: each.table()[kept] for name, each in able.items()}
+    tables = {name: each.table[kept] for name, each in able.items()}
     # weights and scales, unless they are given
     reason = "" if kept.any() else "no route has all four measures"
     if not reason and scale is None:
@@ -130,7 +133,7 @@ def eer(
     for name, measures in variants.items():
         why = missing[name] or reason
         if why or scale is None:
-            scores[name] = Estimate(Measure(None, POINTS, why), None, None, 0)
+            scores[name] = Estimate.missing(POINTS, why)
             continue
         routes[name] = route_eer(tables[name], measures.crashed[kept], scale)
         kinds = types or [str(i) for i in range(len(kept))]
@@ -166,6 +169,46 @@ def scale_of(tables: Mapping[str, Floats], normalization: Normalization) -> EerS
     return EerScale(normalization, _four(weights), _four(offset), _four(span))
 
 
+def critic_weights(rows: Floats) -> Floats:
+    """Return [m] weights of m criteria, which add up to 1 (CRITIC).
+
+    A criterion weighs more the more it varies, independently of others (Diakoulaki,
+    Mavrotas and Papayannakis 1995), here in the paper's form.
+
+    Equation 10: c_i = sigma_i * sum over j of (1 - abs(r_ij)); equation 11: w_i = c_i /
+    sum of c. Sigma is the population's standard deviation (the sample's gives the same
+    weights), r is Pearson's. The sign of a criterion does not matter. A constant
+    criterion has weight 0 and is left out of the sums of the others.
+
+    Example: the columns (0, 0, 1, 1), (0, 1, 1, 1) and (0, 1, 0, 1) have sigma 1/2,
+    sqrt(3) / 4 and 1/2; r is 1 / sqrt(3) between the middle one and each other, and 0
+    between those two. So c is (2 - 1 / sqrt(3)) / 2 = 0.711, (sqrt(3) - 1) / 2 = 0.366
+    and 0.711, and the weights are 0.398, 0.205 and 0.398.
+
+    Args:
+        rows: [n, m] finite, normalized values, one row per observation.
+
+    Raises:
+        EvaluationError: All criteria but one are constant, or all are redundant.
+    """
+    # constant criteria are left out
+    spread = rows.std(axis=0)
+    varies = spread > FLAT * np.abs(rows).max(axis=0, initial=0.0)
+    content = np.zeros(rows.shape[1])
+    if varies.sum() > 1:
+        correlation = np.atleast_2d(np.corrcoef(rows[:, varies], rowvar=False))
+        apart = np.clip(1.0 - np.abs(correlation), 0.0, 1.0)
+        content[varies] = spread[varies] * apart.sum(axis=1)
+    # fully correlated criteria give no weights
+    total = float(content.sum())
+    if total <= ALIKE * float(spread.sum()) or not varies.any():
+        raise EvaluationError(
+            f"CRITIC finds no weights: of {rows.shape[1]} measures over {len(rows)} "
+            f"rows {int(varies.sum())} vary, and none tells what another does not"
+        )
+    return content / total
+
+
 def rankings(
     variants: Mapping[str, RouteMeasures],
 ) -> dict[Normalization, tuple[str, ...]]:
@@ -176,7 +219,7 @@ def rankings(
 
 def _missing(measures: RouteMeasures) -> str:
     """Name the measures that a variant has on no route."""
-    absent = np.asarray(np.isnan(measures.table()).all(axis=0))
+    absent = np.asarray(np.isnan(measures.table).all(axis=0))
     names = [name for name, gone in zip(MEASURES, absent, strict=True) if gone]
     return f"{' and '.join(names)}: not measured" if names else ""
 
@@ -187,7 +230,7 @@ def _kept(
     """Return which routes have all measures of all variants, and counts of gaps."""
     if not variants:
         return np.zeros(0, np.bool_), {}
-    gone = np.any([np.isnan(each.table()) for each in variants.values()], axis=0)
+    gone = np.any([np.isnan(each.table) for each in variants.values()], axis=0)
     counts = zip(MEASURES, gone.sum(axis=0).tolist(), strict=True)
     return ~gone.any(axis=1), {name: count for name, count in counts if count}
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, with_config
 
 from me2e_compress.metrics.conflict_record import ConflictRecord
-from me2e_compress.metrics.infraction import COLLISIONS, Infraction, InfractionKind
+from me2e_compress.metrics.infraction import Infraction, InfractionKind
 
 __all__ = [
     "FRAME_US",
@@ -40,6 +40,10 @@ class Ending(StrEnum):
     TIMEOUT = "timed out"
     POLICY_FAILED = "policy failed"
     SIMULATOR_FAILED = "simulator failed"
+
+
+FAILURES = (Ending.POLICY_FAILED, Ending.SIMULATOR_FAILED)
+"""Endings that are not the driver's driving."""
 
 
 @with_config(_STRICT)
@@ -128,11 +132,6 @@ class Episode:
     speed_ratios_percent: tuple[Number, ...] | None = None
     given: Given | None = None
     conflicts: ConflictRecord | None = None
-
-    @property
-    def collided(self) -> bool:
-        """Whether the ego hit anything."""
-        return any(infraction.kind in COLLISIONS for infraction in self.infractions)
 
     @property
     def succeeded(self) -> bool:

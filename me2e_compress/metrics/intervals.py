@@ -110,7 +110,7 @@ def unseen_interval(value: float, n: int, bounds: Bounds | None) -> Interval:
 
 
 def binomial_interval(successes: int, n: int) -> Interval:
-    """Return the exact (Clopper-Pearson) interval of a rate, as a share.
+    """Return the exact (Clopper-Pearson) interval of a rate, in percent.
 
     As if routes were independent of each other.
     """
@@ -119,7 +119,7 @@ def binomial_interval(successes: int, n: int) -> Interval:
     if n == 0:
         return None, None
     interval = binomtest(successes, n).proportion_ci(CONFIDENCE, method="exact")
-    return float(interval.low), float(interval.high)
+    return 100.0 * float(interval.low), 100.0 * float(interval.high)
 
 
 def _within_types(

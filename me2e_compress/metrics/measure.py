@@ -22,6 +22,11 @@ class Measure:
         if (self.value is None) != bool(self.reason):
             raise ValueError("a measure has either a value or a reason for having none")
 
+    def to_json(self) -> dict[str, float | str | None]:
+        """Return value, unit and reason."""
+        reason = self.reason or None
+        return {"value": self.value, "unit": self.unit, "reason": reason}
+
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
@@ -39,10 +44,22 @@ class Estimate:
     anew_low: float | None = None
     anew_high: float | None = None
 
+    @classmethod
+    def missing(cls, unit: str, reason: str, n: int = 0) -> "Estimate":
+        """Return no mean, and the reason why there is none."""
+        return cls(Measure(None, unit, reason), None, None, n)
+
     @property
     def value(self) -> float | None:
         """The mean itself."""
         return self.measure.value
+
+    @property
+    def sign(self) -> int:
+        """Sign of a difference that is certain as printed, to a tenth; otherwise 0."""
+        if self.low is not None and round(self.low, 1) > 0.0:
+            return 1
+        return -1 if self.high is not None and round(self.high, 1) < 0.0 else 0
 
     def to_json(self) -> dict[str, float | int | str | None]:
         """Return a flat object of all fields."""

@@ -3,92 +3,32 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.metrics.comfort import comfort
-from me2e_compress.metrics.driving_score import route_score
-from me2e_compress.metrics.efficiency import CHECKPOINTS, efficiency
-from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.efficiency import CHECKPOINTS
+from me2e_compress.metrics.episode import FAILURES
+from me2e_compress.metrics.route_summary import RouteSummary
 
 Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RouteMeasures:
-    """The measures of one variant on every route: arrays [routes], NaN if not measured.
+    """The measures of one variant on every route.
 
-    Driving score and efficiency are percentages, comfort is a ratio, the energy is that
-    of the whole route. The driving score is never NaN.
+    ``table`` is [routes, 4], NaN if not measured: driving score and efficiency in
+    percent, comfort as a ratio, joules of the whole route. The driving score is never
+    NaN. ``crashed`` is [routes].
     """
 
-    driving_score: Floats
-    efficiency: Floats
-    comfort: Floats
-    energy_j: Floats
+    table: Floats
     crashed: npt.NDArray[np.bool_]
-
-    @classmethod
-    def of_table(cls, table: Floats, crashed: npt.NDArray[np.bool_]) -> Self:
-        """Build from a table [routes, 4], as `table` returns it."""
-        return cls(table[:, 0], table[:, 1], table[:, 2], table[:, 3], crashed)
-
-    def table(self) -> Floats:
-        """Return [routes, 4]: driving score, efficiency, comfort, energy."""
-        columns = self.driving_score, self.efficiency, self.comfort, self.energy_j
-        return np.stack(columns, axis=1)
-
-
-@dataclass(frozen=True, slots=True)
-class MeasuredRoute:
-    """What the four measures of a route follow from.
-
-    ``inferences`` cost energy. ``recorded`` is false where frames are lacking although
-    the driver did not fail: then the record lacks them, not the drive.
-    """
-
-    driving_score: float
-    completion_percent: float
-    efficiency: float | None
-    comfort: float | None
-    inferences: int
-    crashed: bool
-    failed: bool
-    recorded: bool
-
-    def measures(self, j_per_frame: float | None) -> tuple[float, float, float, float]:
-        """Return driving score, efficiency, comfort and joules."""
-        efficiency, comfort, joules = self.efficiency, self.comfort, math.nan
-        if efficiency is None:
-            begun = self.completion_percent >= 100.0 / CHECKPOINTS
-            efficiency = math.nan if begun or not self.recorded else 0.0
-        if comfort is None:
-            comfort = 0.0 if self.recorded else math.nan
-        if j_per_frame is not None and (self.inferences or self.failed):
-            joules = j_per_frame * self.inferences
-        return self.driving_score, efficiency, comfort, joules
-
-    @classmethod
-    def of(cls, episode: Episode) -> Self:
-        """Measure a driven route."""
-        recorded = len(episode.frames) if episode.given is not None else 0
-        failed = bool(episode.failure)
-        return cls(
-            route_score(episode).composed,
-            episode.completion_percent,
-            efficiency(episode).value,
-            comfort(episode).value,
-            len(episode.decisions) or recorded,
-            episode.collided,
-            failed,
-            bool(episode.frames) or failed,
-        )
 
 
 def route_measures(
-    routes: Sequence[MeasuredRoute], j_per_frame: float | None
+    routes: Sequence[RouteSummary], j_per_frame: float | None
 ) -> RouteMeasures:
     """Return the measures of driven routes, in their order.
 
@@ -104,8 +44,25 @@ def route_measures(
     left out too. A route without moving traffic has no efficiency, nor has one without
     recorded frames or decisions.
     """
-    rows = [each.measures(j_per_frame) for each in routes]
-    return RouteMeasures.of_table(
+    rows = [_measures(each, j_per_frame) for each in routes]
+    return RouteMeasures(
         np.array(rows, np.float64).reshape(-1, 4),
-        np.array([each.crashed for each in routes], np.bool_),
+        np.array([bool(each.collisions) for each in routes], np.bool_),
     )
+
+
+def _measures(
+    route: RouteSummary, j_per_frame: float | None
+) -> tuple[float, float, float, float]:
+    efficiency, comfort, joules = route.efficiency, route.comfort, math.nan
+    # without frames the record lacks them, not the drive, unless the driver failed
+    failed = route.ending in FAILURES
+    recorded = bool(route.duration_us) or failed
+    if efficiency is None:
+        begun = route.completion >= 100.0 / CHECKPOINTS
+        efficiency = math.nan if begun or not recorded else 0.0
+    if comfort is None:
+        comfort = 0.0 if recorded else math.nan
+    if j_per_frame is not None and (route.decisions or failed):
+        joules = j_per_frame * route.decisions
+    return route.driving_score, efficiency, comfort, joules

@@ -4,31 +4,16 @@ Whatever is compared between two drives is compared here, route by route.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from dataclasses import dataclass, replace
 
 from me2e_compress.metrics.intervals import Bounds, mean_estimate
-from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_summary import RouteSummary
 
 POINTS = "points"
 """Difference of two percentages."""
-
-
-class DrivenRoute(Protocol):
-    """A route of a drive: an episode, or what was kept of one."""
-
-    @property
-    def route(self) -> str:
-        """Name of the route."""
-        ...
-
-    @property
-    def scenario(self) -> str:
-        """Its scenario type."""
-        ...
-
-
-Driven = TypeVar("Driven", bound=DrivenRoute)
+PERCENT, SHARE = (0.0, 100.0), (0.0, 1.0)
+"""Bounds of a route's values."""
 
 
 @dataclass(frozen=True)
@@ -36,55 +21,54 @@ class RouteValues:
     """Numbers of the routes that have one, and the scenario types of these routes.
 
     Subtracting another drive's values leaves the routes that both have; bounds are the
-    smallest and largest value of a route, if there are any.
+    smallest and largest value of a route, if there are any. ``missing`` says why no
+    route has a number.
     """
 
     name: str
     unit: str
     by_route: Mapping[str, float]
     types: Mapping[str, str]
-    bounds: Bounds | None = None
-    missing: str = "no route has a {name}"
+    bounds: Bounds | None
+    missing: str
 
     def __sub__(self, other: "RouteValues") -> "RouteValues":
         bounds = None
         if self.bounds is not None and other.bounds is not None:
             (low, high), (least, most) = self.bounds, other.bounds
             bounds = low - most, high - least
-        return RouteValues(
-            self.name,
-            POINTS if self.unit == "%" else self.unit,
-            {
-                route: value - other.by_route[route]
-                for route, value in self.by_route.items()
-                if route in other.by_route
-            },
-            self.types,
-            bounds,
-            "no route has a {name} in both drives",
-        )
+        shared = {
+            route: value - other.by_route[route]
+            for route, value in self.by_route.items()
+            if route in other.by_route
+        }
+        # a drive without a single number says why
+        missing = f"no route has a {self.name} in both drives"
+        if not (self.by_route and other.by_route):
+            missing = other.missing if self.by_route else self.missing
+        unit = POINTS if self.unit == "%" else self.unit
+        return replace(self, unit=unit, by_route=shared, bounds=bounds, missing=missing)
 
     def mean(self, seed: int = 0) -> Estimate:
         """Return the mean over routes with its intervals."""
         if not self.by_route:
-            why = self.missing.format(name=self.name)
-            return Estimate(Measure(None, self.unit, why), None, None, 0)
+            return Estimate.missing(self.unit, self.missing)
         types = [self.types[route] for route in self.by_route]
         values = list(self.by_route.values())
         return mean_estimate(values, types, self.unit, seed, self.bounds)
 
 
 @dataclass(frozen=True)
-class RouteColumn(Generic[Driven]):
+class RouteColumn:
     """One number of every route; None if it was not measured."""
 
     name: str
     unit: str
-    of: Callable[[Driven], float | None]
+    of: Callable[[RouteSummary], float | None]
     bounds: Bounds | None = None
 
-    def values(self, routes: Sequence[Driven]) -> RouteValues:
-        """Return the numbers of a drive."""
+    def values(self, routes: Sequence[RouteSummary], why: str = "") -> RouteValues:
+        """Return the numbers of a drive; ``why`` there are no routes, if so."""
         return RouteValues(
             self.name,
             self.unit,
@@ -95,4 +79,13 @@ class RouteColumn(Generic[Driven]):
             },
             {each.route: each.scenario for each in routes},
             self.bounds,
+            why or f"no route has a {self.name}",
         )
+
+
+DS = RouteColumn("DS", "%", lambda route: route.driving_score, PERCENT)
+SR = RouteColumn("SR %", "%", lambda route: 100.0 * route.succeeded, PERCENT)
+DE = RouteColumn("DE %", "%", lambda route: route.efficiency)
+DC = RouteColumn("DC", "ratio", lambda route: route.comfort, SHARE)
+COLUMNS = (DS, SR, DE, DC)
+"""The paper's scores of a route."""

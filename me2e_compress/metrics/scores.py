@@ -1,17 +1,21 @@
 """All scores of a set of driven routes."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from statistics import fmean
 from typing import Any
 
 import numpy as np
 
 from me2e_compress.metrics import bench2drive, comfort, efficiency, surrogate_safety
-from me2e_compress.metrics.abilities import ABILITIES, successes
-from me2e_compress.metrics.ability_rules import MEAN, ability_rates
+from me2e_compress.metrics.abilities import (
+    ABILITIES,
+    MEAN,
+    ability_rates,
+    successes,
+)
 from me2e_compress.metrics.driving_score import route_score
-from me2e_compress.metrics.episode import Ending, Episode
+from me2e_compress.metrics.episode import FAILURES, Episode
 from me2e_compress.metrics.intervals import (
     Bounds,
     Floats,
@@ -20,12 +24,10 @@ from me2e_compress.metrics.intervals import (
     mean_estimate,
 )
 from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.route_values import PERCENT, SHARE
 
 FULL_SET = 220
 """Routes of a whole benchmark: 44 scenario types with 5 variants each."""
-
-PERCENT, SHARE = (0.0, 100.0), (0.0, 1.0)
-"""Bounds of a route's values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,13 +47,7 @@ class SafetyScores:
 
     def to_json(self) -> dict[str, Any]:
         """Return one object per score."""
-        return {
-            "ttc_exposure": self.ttc_exposure.to_json(),
-            "smallest_ttc": self.smallest_ttc.to_json(),
-            "smallest_pet": self.smallest_pet.to_json(),
-            "smallest_distance": self.smallest_distance.to_json(),
-            "at_fault_collisions": self.at_fault_collisions.to_json(),
-        }
+        return {each.name: getattr(self, each.name).to_json() for each in fields(self)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +141,7 @@ def score(
         failures={
             each.route: each.failure or each.ending.value
             for each in episodes
-            if each.ending in (Ending.POLICY_FAILED, Ending.SIMULATOR_FAILED)
+            if each.ending in FAILURES
         },
     )
 
@@ -153,11 +149,12 @@ def score(
 def _safety(episodes: Sequence[Episode], seed: int) -> SafetyScores:
     faults = [surrogate_safety.at_fault_collision(episode) for episode in episodes]
     known = [fault for fault in faults if fault is not None]
-    at_fault = _rate(known, _types(episodes)[: len(known)], seed)
-    if len(known) < len(faults):
+    if len(known) == len(faults):
+        at_fault = _rate(known, _types(episodes), seed)
+    else:
         # routes without a collision alone would make a rate of nothing but zeros
         reason = f"whose fault {len(faults) - len(known)} collisions were is not known"
-        at_fault = Estimate(Measure(None, "%", reason), None, None, 0)
+        at_fault = Estimate.missing("%", reason)
     return SafetyScores(
         _over(episodes, surrogate_safety.ttc_exposure, "%", seed, PERCENT),
         _over(episodes, surrogate_safety.smallest_ttc, "s", seed),
@@ -186,7 +183,7 @@ def _over(
     known = [(each.value, kind) for each, kind in found if each.value is not None]
     if not known:
         reason = found[0][0].reason if found else "no route was driven"
-        return Estimate(Measure(None, unit, reason), None, None, 0)
+        return Estimate.missing(unit, reason)
     values, types = zip(*known, strict=True)
     return mean_estimate(values, types, unit, seed, bounds)
 
@@ -195,12 +192,11 @@ def _rate(outcomes: Sequence[bool], types: Sequence[str], seed: int) -> Estimate
     """Return a rate with its exact interval, and the one over types drawn anew."""
     n, good = len(outcomes), sum(outcomes)
     if n == 0:
-        return Estimate(Measure(None, "%", "no such route was driven"), None, None, 0)
+        return Estimate.missing("%", "no such route was driven")
     percents = [100.0 * outcome for outcome in outcomes]
     found = mean_estimate(percents, types, "%", seed, PERCENT)
     low, high = binomial_interval(good, n)
-    bounds = [None if bound is None else 100.0 * bound for bound in (low, high)]
-    return replace(found, low=bounds[0], high=bounds[1])
+    return replace(found, low=low, high=high)
 
 
 def _abilities(
@@ -229,7 +225,7 @@ def _mean_ability(
     missing = [name for name in ABILITIES if not outcomes[name]]
     if missing:
         reason = f"no route for {', '.join(missing)} was driven"
-        return Estimate(Measure(None, "%", reason), None, None, 0)
+        return Estimate.missing("%", reason)
     # [routes, 5] which abilities a route tests, and which it masters
     tests = np.array([[a in e.abilities for a in ABILITIES] for e in episodes])
     good = np.zeros(tests.shape)

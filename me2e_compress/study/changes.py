@@ -5,15 +5,14 @@ costs each variant, and whether it costs more than it costs the baseline: a mean
 paired differences of differences. A pair compares any two drives.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_values import DS, SR, RouteColumn
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.route_columns import DS, SR, Column
-from me2e_compress.study.route_summary import RouteSummary
 
 
 @dataclass(frozen=True)
@@ -51,24 +50,24 @@ def changes(
     seed: int,
 ) -> tuple[Change, ...]:
     """Compare every drive with the one that its condition changes, if there is one."""
-    there = _by_cell(drives)
+    there = _by_name(drives)
     found = list[Change]()
     for condition in (each for each in conditions if each.against):
         for drive in (each for each in drives if each.condition == condition.name):
             # the drive and its counterpart, of the variant and the baseline
-            cells = [
-                (variant, name)
+            four = [
+                there.get(f"{variant}.{name}")
                 for variant in (drive.variant, baseline)
                 for name in (condition.name, condition.against)
             ]
-            if not all(cell in there for cell in cells):
+            ours, before, theirs, theirs_before = four
+            if not (ours and before and theirs and theirs_before):
                 continue
-            ours, before, theirs, theirs_before = (there[cell] for cell in cells)
             # the plain difference, and how far it exceeds the baseline's
-            change = _change(cells[0], cells[1], ours, before, seed)
+            change = _change(ours, before, seed)
             if drive.variant != baseline:
-                four = ours, before, theirs, theirs_before
-                score, rate = (_beyond(column, *four, seed) for column in (DS, SR))
+                both = (ours, before), (theirs, theirs_before)
+                score, rate = (_beyond(column, *both, seed) for column in (DS, SR))
                 change = replace(
                     change, beyond_driving_score=score, beyond_success_rate=rate
                 )
@@ -80,50 +79,29 @@ def held_against(
     pairs: Sequence[tuple[str, str]], drives: Sequence[DriveRecord], seed: int
 ) -> tuple[Change, ...]:
     """Compare pairs of drives (``VARIANT.CONDITION``) if both were driven."""
-    there = _by_cell(drives)
-    cells = [(_cell(one), _cell(other)) for one, other in pairs]
+    there = _by_name(drives)
     return tuple(
-        _change(one, other, there[one], there[other], seed)
-        for one, other in cells
+        _change(there[one], there[other], seed)
+        for one, other in pairs
         if one in there and other in there
     )
 
 
-def _by_cell(
-    drives: Sequence[DriveRecord],
-) -> Mapping[tuple[str, str], tuple[RouteSummary, ...]]:
-    return {
-        (each.variant, each.condition): each.routes for each in drives if each.routes
-    }
+def _by_name(drives: Sequence[DriveRecord]) -> dict[str, DriveRecord]:
+    return {each.name: each for each in drives if each.routes}
 
 
-def _cell(name: str) -> tuple[str, str]:
-    variant, _, condition = name.partition(".")
-    return variant, condition
+def _change(drive: DriveRecord, other: DriveRecord, seed: int) -> Change:
+    score, rate = (drive.minus(other, column, seed) for column in (DS, SR))
+    return Change(drive.name, other.name, score, rate)
 
 
-def _change(
-    cell: tuple[str, str],
-    other: tuple[str, str],
-    ours: Sequence[RouteSummary],
-    others: Sequence[RouteSummary],
-    seed: int,
-) -> Change:
-    score, rate = (
-        (column.values(ours) - column.values(others)).mean(seed) for column in (DS, SR)
-    )
-    return Change(".".join(cell), ".".join(other), score, rate)
+Pair = tuple[DriveRecord, DriveRecord]
 
 
-def _beyond(
-    column: Column,
-    ours: Sequence[RouteSummary],
-    before: Sequence[RouteSummary],
-    theirs: Sequence[RouteSummary],
-    theirs_before: Sequence[RouteSummary],
-    seed: int,
-) -> Estimate:
+def _beyond(column: RouteColumn, ours: Pair, theirs: Pair, seed: int) -> Estimate:
     """Return how much more ours changed than theirs."""
-    change = column.values(ours) - column.values(before)
-    their_change = column.values(theirs) - column.values(theirs_before)
+    change, their_change = (
+        after.values(column) - before.values(column) for after, before in (ours, theirs)
+    )
     return (change - their_change).mean(seed)

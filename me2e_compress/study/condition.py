@@ -11,7 +11,7 @@ from me2e_compress.driving.layered_latency import LimitedLatency
 from me2e_compress.errors import EvaluationError, StudyError
 from me2e_compress.evaluators.highway.conditions import ConditionOptions, Conditions
 from me2e_compress.registry import name_in
-from me2e_compress.study.names import check_name
+from me2e_compress.study.study_blocks import check_name
 
 TRACE = "trace"
 """The latency of each model's own trace, times the device scale."""
@@ -187,9 +187,9 @@ def check_pairs(
     conditions: Sequence[str],
 ) -> None:
     """Check that pairs name drives of the study."""
+    there = {f"{one}.{other}" for one in variants for other in conditions}
     for name in (name for pair in pairs for name in pair):
-        variant, _, condition = name.partition(".")
-        if variant not in variants or condition not in conditions:
+        if name not in there:
             raise StudyError(
                 f"pair: {name!r} is no VARIANT.CONDITION; there are "
                 f"{', '.join(variants)} and {', '.join(conditions)}"

@@ -18,8 +18,12 @@ from me2e_compress.study.condition import (
     check_conditions_elsewhere,
     check_pairs,
 )
-from me2e_compress.study.names import check_name, check_unique
-from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
+from me2e_compress.study.study_blocks import (
+    FramesToRecord,
+    StudyBlock,
+    check_name,
+    check_unique,
+)
 from me2e_compress.workflows.other_evaluators import HIGHWAY, is_highway
 
 

@@ -11,7 +11,7 @@ from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
-from me2e_compress.study.report import Section
+from me2e_compress.study.report.page import Section
 from me2e_compress.study.run import run_study
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.tables import differences, scoreboards

@@ -16,11 +16,23 @@ from me2e_compress import documents
 from me2e_compress.errors import StudyError
 from me2e_compress.metrics.differences import PairedDifference
 from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_summary import RouteSummary
+from me2e_compress.metrics.route_values import DS, RouteColumn, RouteValues
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.runtime.atomic import write_bytes
-from me2e_compress.study.route_summary import RouteSummary
 
-_ROUTE = TypeAdapter(RouteSummary)
+
+@dataclass(frozen=True)
+class _Head:
+    """The first line of a file."""
+
+    variant: str
+    condition: str
+    made_by: dict[str, Any]
+
+
+_HEAD, _ROUTE = TypeAdapter(_Head), TypeAdapter(RouteSummary)
 
 
 @dataclass(frozen=True)
@@ -64,7 +76,13 @@ class DriveRecord:
     ) -> Self:
         """Summarize episodes; ``made_by`` loses its redundant list of routes."""
         kept = {key: value for key, value in made_by.items() if key != "routes"}
-        return cls(variant, condition, tuple(map(RouteSummary.of, episodes)), kept)
+        routes = (RouteSummary.of(each).rounded() for each in episodes)
+        return cls(variant, condition, tuple(routes), kept)
+
+    @property
+    def name(self) -> str:
+        """``VARIANT.CONDITION``."""
+        return f"{self.variant}.{self.condition}"
 
     @property
     def set_size(self) -> int:
@@ -83,6 +101,20 @@ class DriveRecord:
         """Decisions over the time driven; 0 if no time passed."""
         time_us = sum(each.duration_us for each in self.routes)
         return 1e6 * sum(each.decisions for each in self.routes) / max(time_us, 1)
+
+    def values(self, column: RouteColumn) -> RouteValues:
+        """Return one number of every route; of a drive not made, the reason."""
+        return column.values(self.routes, self.reason)
+
+    def mean(self, column: RouteColumn, seed: int = 0) -> Estimate:
+        """Return a mean over routes with its intervals."""
+        return self.values(column).mean(seed)
+
+    def minus(
+        self, reference: "DriveRecord", column: RouteColumn = DS, seed: int = 0
+    ) -> Estimate:
+        """Return the mean of "this minus the reference" over routes that have both."""
+        return (self.values(column) - reference.values(column)).mean(seed)
 
     def to_json(self) -> dict[str, Any]:
         """Return scores, difference and routes, as they stand in the study's JSON."""
@@ -126,36 +158,34 @@ class DriveRecord:
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a file that `save` wrote; a repeated route or a cut-off is an error."""
-        try:
-            head, *rows = map(documents.from_json, _lines(path))
+        with documents.reading(path, StudyError, "not a record of a drive"):
+            content = documents.content(path, documents.LARGEST_LOG_BYTES)
+            text = content.decode("utf-8")
+            if not text.endswith("\n"):
+                raise documents.MalformedError("its last line was cut off")
+            first, *rows = map(documents.from_json, text.splitlines())
+            head = _HEAD.validate_python(first)
             routes = tuple(_ROUTE.validate_python(row) for row in rows)
-            record = cls(head["variant"], head["condition"], routes, head["made_by"])
-            int(record.set_size)  # a head without one is spoilt
-        except OSError as error:
-            raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
-        except (ValueError, KeyError, TypeError) as error:
-            words = " ".join(str(error).split())[:200]
-            raise StudyError(f"{path}: not a record of a drive: {words}") from error
-        names = [each.route for each in routes]
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise StudyError(f"{path}: names route {twice} twice")
-        return record
+            names = [each.route for each in routes]
+            if twice := [name for name in names if names.count(name) > 1]:
+                raise documents.MalformedError(f"names route {twice[0]} twice")
+            if not isinstance(head.made_by.get("set_size"), int):
+                raise documents.MalformedError("it does not say of how many routes")
+            return cls(head.variant, head.condition, routes, head.made_by)
 
     def difference_from(self, made_by: Mapping[str, Any]) -> str:
         """Say how another fingerprint differs from its own; empty if it does not."""
-        for key in sorted({*made_by, *self.made_by} - {"routes"}):
-            old, new = self.made_by.get(key), made_by.get(key)
-            if old != new:
-                return f"its {key} is {str(old)[:60]}, this one's {str(new)[:60]}"
-        return ""
+        other = {key: each for key, each in made_by.items() if key != "routes"}
+        return first_difference(self.made_by, other)
 
 
-def _lines(path: Path) -> list[str]:
-    text = documents.content(path, documents.LARGEST_LOG_BYTES).decode("utf-8")
-    if not text.endswith("\n"):
-        raise ValueError("its last line was cut off")
-    return text.splitlines()
+def first_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Say how two fingerprints differ, in the first key; empty if they do not."""
+    for key in sorted({*before, *now}):
+        old, new = before.get(key), now.get(key)
+        if old != new:
+            return f"its {key} is {str(old)[:60]}, this one's {str(new)[:60]}"
+    return ""
 
 
 def apart(

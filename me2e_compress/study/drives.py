@@ -53,14 +53,12 @@ class DriveSetup:
             return ()
         names = [each.variant.name for each in prepared]
         baseline = prepared[names.index(self.study.baseline)]
-        reference = self._episodes(baseline, condition)
+        episodes = self._episodes(baseline, condition)
+        reference = self._scored(baseline, condition, episodes)
         return tuple(
-            self._drive(
-                each,
-                condition,
-                reference if each is baseline else self._episodes(each, condition),
-                None if each is baseline else reference,
-            )
+            reference
+            if each is baseline
+            else self._compared(each, condition, reference, episodes)
             for each in prepared
         )
 
@@ -189,27 +187,34 @@ class DriveSetup:
         keep(found, episodes, folder, driver)
         return episodes
 
-    def _drive(
+    def _scored(
         self,
         prepared: PreparedVariant,
         condition: Condition,
         episodes: tuple[Episode, ...] | None,
-        reference: tuple[Episode, ...] | None,
     ) -> DriveRecord:
-        name, seed = prepared.variant.name, self.study.seed
+        names = prepared.variant.name, condition.name
         if episodes is None:
-            why = self._why_not(prepared)
-            return DriveRecord(name, condition.name, reason=why)
-        record = replace(
-            DriveRecord.of(name, condition.name, {}, episodes),
-            scores=score(episodes, self.study.set_size or len(episodes), seed),
-        )
-        if reference is None:
+            return DriveRecord(*names, reason=self._why_not(prepared))
+        expected = self.study.set_size or len(episodes)
+        scores = score(episodes, expected, self.study.seed)
+        return replace(DriveRecord.of(*names, {}, episodes), scores=scores)
+
+    def _compared(
+        self,
+        prepared: PreparedVariant,
+        condition: Condition,
+        reference: DriveRecord,
+        their_episodes: tuple[Episode, ...] | None,
+    ) -> DriveRecord:
+        episodes = self._episodes(prepared, condition)
+        record = self._scored(prepared, condition, episodes)
+        if episodes is None or their_episodes is None:
             return record
         return replace(
             record,
-            difference=difference(episodes, reference, seed),
-            apart=apart(episodes, reference),
+            difference=difference(record.routes, reference.routes, self.study.seed),
+            apart=apart(episodes, their_episodes),
         )
 
     def _teller(self, stage: str) -> Callable[[DrivingProgress], None]:

@@ -1,19 +1,12 @@
 """Read a study from a TOML file."""
 
+import inspect
+import json
 from collections.abc import Sequence
-from dataclasses import MISSING
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Literal
 
-from pydantic import (
-    AliasChoices,
-    BaseModel,
-    ConfigDict,
-    Field,
-    GetPydanticSchema,
-    ValidationError,
-    create_model,
-)
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
 from me2e_compress import documents, recipe
 from me2e_compress.driving.policies import driver_named
@@ -23,7 +16,6 @@ from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.evaluation_options import routes_named
 from me2e_compress.passes import Pass
-from me2e_compress.registry.registry import fields_of
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study.condition import Condition
@@ -86,7 +78,9 @@ def load_study(
     except documents.MalformedError as error:
         raise StudyError(f"{path}: not TOML: {error}") from error
     try:
-        table = _Study.model_validate(content)
+        # JSON has tables and lists for dataclasses and tuples, but no dates
+        text = json.dumps(content, default=lambda date: {"date": str(date)})
+        table = _Study.model_validate_json(text)
     except ValidationError as error:
         raise StudyError(f"{path}: {_complaint(error)}") from error
     # options of the caller take precedence
@@ -106,20 +100,6 @@ class _Table(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid")
 
 
-def _table_of(cls: type) -> type[_Table]:
-    """Make the table of a file whose keys are the fields of a dataclass."""
-    types = get_type_hints(cls)
-    keys: dict[str, Any] = {
-        each.name: (types[each.name], ... if each.default is MISSING else each.default)
-        for each in fields_of(cls)
-    }
-    return create_model(cls.__name__, __base__=_Table, **keys)
-
-
-def _read_as(table: type[_Table]) -> GetPydanticSchema:
-    return GetPydanticSchema(lambda source, handler: handler(table))
-
-
 class _Variant(_Table):
     name: str
     policy: str
@@ -131,20 +111,9 @@ class _Variant(_Table):
     host_stage: str = ""
 
 
-class _Block(_Table):
-    name: str
-    variants: list[str]
-    conditions: list[str]
-
-
 class _Pair(_Table):
     of: str
     against: str
-
-
-_CONDITION = _table_of(Condition)
-_LATENCY = _table_of(Timing)
-_RECORD = _table_of(FramesToRecord)
 
 
 class _Study(_Table):
@@ -157,37 +126,39 @@ class _Study(_Table):
     held_out: str | None = None
     provider: str = "cpu"
     plugins: list[str] = Field(default_factory=list)
-    record: Annotated[_Table, _read_as(_RECORD)] | None = None
+    record: FramesToRecord | None = None
     report: Literal["comparison", "paper"] = "comparison"
-    latency: Annotated[_Table, _read_as(_LATENCY)] = Field(default_factory=_LATENCY)
+    latency: Timing = Field(default_factory=Timing)
     variant: list[_Variant] = Field(validation_alias=AliasChoices("variant", "scheme"))
     """Files written before variants had their name say ``[[scheme]]``."""
-    condition: list[Annotated[_Table, _read_as(_CONDITION)]]
-    block: list[_Block] = Field(default_factory=list)
+    condition: tuple[Condition, ...]
+    block: tuple[StudyBlock, ...] = ()
     pair: list[_Pair] = Field(default_factory=list)
 
 
-_KINDS: dict[object, type[_Table]] = {
+_KINDS: dict[object, type] = {
     "variant": _Variant,
     "scheme": _Variant,
-    "condition": _CONDITION,
-    "latency": _LATENCY,
-    "block": _Block,
+    "condition": Condition,
+    "latency": Timing,
+    "block": StudyBlock,
     "pair": _Pair,
-    "record": _RECORD,
+    "record": FramesToRecord,
 }
 
 
 def _complaint(error: ValidationError) -> str:
     """Describe the first error; unknown keys go first, as they may explain others."""
     found = error.errors(include_url=False)
-    unknown = [each for each in found if each["type"] == "extra_forbidden"]
+    kinds = ("extra_forbidden", "unexpected_keyword_argument")
+    unknown = [each for each in found if each["type"] in kinds]
     first = (unknown or found)[0]
     where = ".".join(str(part) for part in first["loc"])
     if not unknown:
         return f"{where}: {first['msg']}"
-    kind = _KINDS.get(first["loc"][0], _Study) if len(first["loc"]) > 1 else _Study
-    return f"no key {where}; there are {', '.join(kind.model_fields)}"
+    inside = _KINDS.get(first["loc"][0], _Study) if len(first["loc"]) > 1 else _Study
+    keys = inspect.signature(inside).parameters
+    return f"no key {where}; there are {', '.join(keys)}"
 
 
 def _code(table: _Study) -> list[str]:
@@ -206,6 +177,10 @@ class _Reader:
     def study(
         self, table: _Study, routes: str | None, plugins: Sequence[Path]
     ) -> Study:
+        if table.record is not None and (table.frames or table.held_out):
+            raise StudyError(
+                f"{self.path}: give folders of frames, or what to record, not both"
+            )
         # the caller's routes take precedence over the file's
         libraries = (*map(self._beside, table.plugins), *plugins)
         which = routes if table.routes is None or routes else str(table.routes)
@@ -213,34 +188,21 @@ class _Reader:
         return Study(
             title=table.title,
             variants=tuple(self._variant(each) for each in table.variant),
-            conditions=tuple(Condition(**dict(each)) for each in table.condition),
+            conditions=table.condition,
             baseline=table.baseline,
             evaluator=table.evaluator,
             routes=driven,
             set_size=set_size,
             frames=self._file(table.frames),
             held_out=self._file(table.held_out),
-            timing=Timing(**dict(table.latency)),
+            timing=table.latency,
             seed=table.seed,
             provider=provider_named(table.provider, libraries),
-            to_record=self._to_record(table),
-            blocks=tuple(
-                StudyBlock(each.name, tuple(each.variants), tuple(each.conditions))
-                for each in table.block
-            ),
+            to_record=table.record,
+            blocks=table.block,
             pairs=tuple((each.of, each.against) for each in table.pair),
             report=table.report,
         )
-
-    def _to_record(self, table: _Study) -> FramesToRecord | None:
-        asked = table.record
-        if asked is None:
-            return None
-        if table.frames is not None or table.held_out is not None:
-            raise StudyError(
-                f"{self.path}: give folders of frames, or what to record, not both"
-            )
-        return FramesToRecord(**dict(asked))
 
     def _variant(self, table: _Variant) -> Variant:
         policy, adapter, stage = table.policy, table.adapter, table.host_stage

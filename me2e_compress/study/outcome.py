@@ -13,7 +13,7 @@ from me2e_compress.study.changes import Change, changes, held_against
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.plan_fidelity import PlanFidelity, measure_json
+from me2e_compress.study.plan_fidelity import PlanFidelity
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.side_by_side import Contrast
 from me2e_compress.study.timing import Clock
@@ -40,16 +40,14 @@ class VariantOutcome:
         cls, prepared: PreparedVariant, clock: Clock, fidelity: PlanFidelity
     ) -> "VariantOutcome":
         """Collect the findings about a variant."""
-        size = prepared.size_bytes
-        name = prepared.variant.name
+        name, size = prepared.variant.name, prepared.size_bytes
         why = prepared.failure or "no model"
+        unknown = Measure(None, "ms", why)
         return cls(
             prepared,
-            Measure(None, "MB", why) if size is None else _mb(size),
+            Measure(None, "MB", why) if size is None else Measure(size / 1e6, "MB"),
             {
-                percent: Measure(None, "ms", why)
-                if prepared.model is None
-                else clock.latency(name, percent)
+                percent: clock.latency(name, percent) if prepared.model else unknown
                 for percent in LATENCY_PERCENTILES
             },
             fidelity,
@@ -64,10 +62,10 @@ class VariantOutcome:
             "pipeline": prepared.pipeline or None,
             "model_sha256": prepared.sha256,
             "weights": prepared.weights,
-            "size": measure_json(self.size_mb),
+            "size": self.size_mb.to_json(),
             "fidelity": self.fidelity.to_json(),
             "latency": {
-                f"p{percent}": measure_json(measure)
+                f"p{percent}": measure.to_json()
                 for percent, measure in self.latency_ms.items()
             },
         }
@@ -96,6 +94,11 @@ class StudyOutcome:
     load: Load | None = None
 
     @property
+    def title(self) -> str:
+        """The study's title, with a note if not all routes were driven."""
+        return f"{self.study.title}{self.study.preview}"
+
+    @property
     def timed(self) -> bool:
         """Whether the latency of any variant is known."""
         return any(each.latency_ms[50].value is not None for each in self.variants)
@@ -107,6 +110,23 @@ class StudyOutcome:
             return len(self.study.routes), self.study.set_size
         scores = [each.scores for each in self.drives if each.scores is not None]
         return (scores[0].routes, scores[0].expected) if scores else (0, 0)
+
+    def label(self, drive: DriveRecord) -> str:
+        """Name a drive by its variant, and by its condition if there are several."""
+        if len(self.study.conditions) == 1:
+            return drive.variant
+        return f"{drive.variant}, {drive.condition}"
+
+    def drive(self, variant: str, condition: str) -> DriveRecord:
+        """Return a drive; one that was not made says why."""
+        names = variant, condition
+        found = (e for e in self.drives if (e.variant, e.condition) == names)
+        why = self.why_not(variant, condition)
+        return next(found, DriveRecord(variant, condition, reason=why))
+
+    def why_not(self, variant: str, condition: str) -> str:
+        """Say why there is no record of a drive."""
+        return f"{variant} under {condition}: not driven"
 
     def under(self, condition: Condition) -> tuple[DriveRecord, ...]:
         """Return the drives under one condition."""
@@ -133,7 +153,3 @@ def this_machine(load: Load | None = None) -> str:
     cores = f"{os.cpu_count() or 1} cores"
     named = f"{processor()}, {cores}, {platform.system()} {platform.machine()}"
     return f"{named}; {load}" if load is not None and load.busy else named
-
-
-def _mb(size_bytes: int) -> Measure:
-    return Measure(size_bytes / 1e6, "MB")

@@ -10,7 +10,6 @@ from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.fidelity.compare import Fidelity, compare
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
 from me2e_compress.study.definition import Study
 from me2e_compress.study.prepared import PreparedVariant
@@ -32,18 +31,15 @@ class PlanFidelity:
     @classmethod
     def unknown(cls, reason: str) -> "PlanFidelity":
         """Return the result for a variant that was not compared."""
-        return cls(
-            Measure(None, "m", reason),
-            Measure(None, "m", reason),
-            Measure(None, "dB", reason),
-        )
+        metres = Measure(None, "m", reason)
+        return cls(metres, metres, Measure(None, "dB", reason))
 
     def to_json(self) -> dict[str, Any]:
         """Return the three measures with their units, and the number of frames."""
         return {
-            "plan_mean": measure_json(self.mean_m),
-            "plan_max": measure_json(self.max_m),
-            "plan_sqnr": measure_json(self.plan_sqnr_db),
+            "plan_mean": self.mean_m.to_json(),
+            "plan_max": self.max_m.to_json(),
+            "plan_sqnr": self.plan_sqnr_db.to_json(),
             "frames": self.frames,
         }
 
@@ -86,38 +82,19 @@ def judge(
         found = compare(left, right, reported())
     except (EvaluationError, FramesError) as error:
         return PlanFidelity.unknown(str(error))
-    return _of(found, right)
+    return _of(found)
 
 
-def measure_json(measure: Measure) -> dict[str, float | str | None]:
-    """Return value, unit and reason."""
-    return {
-        "value": measure.value,
-        "unit": measure.unit,
-        "reason": measure.reason or None,
-    }
-
-
-def _of(found: Fidelity, session: Session) -> PlanFidelity:
+def _of(found: Fidelity) -> PlanFidelity:
     if found.plan is None:
         return PlanFidelity.unknown(found.plan_reason)
-    # the output that holds the plan
-    adapter = PlanAdapter.of(session.metadata, list(session.outputs))
-    sqnr_db = next(
-        (
-            output.sqnr_db
-            for output in found.outputs
-            if adapter is not None and output.name == adapter.output
-        ),
-        math.nan,
-    )
+    noise = {each.name: each.sqnr_db for each in found.outputs}[found.plan_output]
     # an identical plan has an infinite ratio
-    exact = sqnr_db == math.inf
+    sqnr = Measure(noise, "dB") if math.isfinite(noise) else None
+    why = EXACT if noise == math.inf else "no plan"
     return PlanFidelity(
         Measure(found.plan.mean_m, "m"),
         Measure(found.plan.max_m, "m"),
-        Measure(sqnr_db, "dB")
-        if math.isfinite(sqnr_db)
-        else Measure(None, "dB", EXACT if exact else "no plan"),
+        sqnr or Measure(None, "dB", why),
         found.frames,
     )

@@ -98,7 +98,7 @@ def prepare_variant(
     sha256 = graph.sha256_of(model)
     origin = source.name, to_text(variant.passes)
     if not variant.passes:
-        origin = _reported_beside(model, sha256) or origin
+        origin = _reported_beside(model) or origin
     weights = named_weights(load_interface(model).metadata_props)
     size = graph.file_bytes(model)
     return PreparedVariant(
@@ -106,27 +106,15 @@ def prepare_variant(
     )
 
 
-def _reported_beside(model: Path, sha256: str) -> tuple[str, str] | None:
-    """Read source and passes from the report next to a file, if it matches."""
-    report = _report_of(model)
-    if report is None or report.output.sha256 != sha256:
+def _reported_beside(model: Path) -> tuple[str, str] | None:
+    """Read source and passes from the report next to a file, if it is of that file."""
+    try:
+        report = _Report.model_validate_json(beside(model, "report").read_bytes())
+        if report.output.sha256 != graph.sha256_of(model):
+            return None
+    except (OSError, DecodeError, ValidationError):
         return None
     return report.source.file, report.pipeline
-
-
-def _unaltered(model: Path) -> bool:
-    """Return whether a file still matches its report."""
-    try:
-        return _reported_beside(model, graph.sha256_of(model)) is not None
-    except (OSError, DecodeError):
-        return False
-
-
-def _report_of(model: Path) -> "_Report | None":
-    try:
-        return _Report.model_validate_json(beside(model, "report").read_bytes())
-    except (OSError, ValidationError):
-        return None
 
 
 class _File(BaseModel):
@@ -151,7 +139,7 @@ def _compressed(
     frames = None if study.frames is None else CalibrationSet(study.frames)
     path = workspace.model(variant, _key(study, variant, source, frames))
     if path.is_file() and beside(path, "report").is_file():
-        if _unaltered(path):
+        if _reported_beside(path) is not None:
             return path
         listener.on_warning(f"{path}: not what its report is of: made again")
     stage = f"compress {variant.name}"

@@ -1,4 +1,4 @@
-"""Run a study."""
+"""Run a study, and write its report."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -11,14 +11,15 @@ from me2e_compress.study.definition import Study
 from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.file import load_study
 from me2e_compress.study.outcome import VariantOutcome, this_machine
-from me2e_compress.study.paper.model_facts import weighed
-from me2e_compress.study.paper.paper_run import drive_blocks
+from me2e_compress.study.paper.paper_run import drive_blocks, read_paper
+from me2e_compress.study.paper.weigh import weighed
 from me2e_compress.study.plan_fidelity import judge
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
 from me2e_compress.study.side_by_side import take_pictures
 from me2e_compress.study.study_result import StudyResult
-from me2e_compress.study.timing import Clock, time_all
+from me2e_compress.study.timing import time_all
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
+from me2e_compress.study.write import StudyFiles, write_study
 from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.claims import check_ours, writing
 from me2e_compress.workflows.frames import FramesOptions, record_frames
@@ -75,6 +76,44 @@ def run_study(
         return _compared(setup, prepared, pictures)
 
 
+def run_and_report(
+    study: Study,
+    folder: str | Path,
+    command: Sequence[str] = (),
+    engine: Engine | None = None,
+    listener: Listener = SILENT,
+    records: Path | None = None,
+    weigh: Sequence[Path] = (),
+    *,
+    force: bool = False,
+) -> tuple[StudyResult, StudyFiles]:
+    """Run a study and write its report; the paper's tables are written block by block.
+
+    ``command`` is the command line that reproduces it. With ``records``, a folder of
+    finished drives, the paper's tables are made of these and nothing is driven;
+    ``weigh`` are folders of other stacks' files for the paper's table 4. Returns the
+    results and the files.
+
+    Raises:
+        StudyError: Records are given for a study that is not the paper's.
+        Me2eError: See `run_study`.
+    """
+    if study.report == "comparison" and (records is not None or weigh):
+        option = "--weigh" if records is None else "--records"
+        raise StudyError(f"{option} is for a study with the paper's tables")
+    if records is not None:
+        read = read_paper(study, records, weigh)
+        return read, write_study(read, folder, command, force=force)
+
+    def land(so_far: StudyResult) -> None:
+        write_study(so_far, folder, command, force=force)
+
+    found = run_study(
+        study, folder, engine, listener, on_block=land, weigh=weigh, force=force
+    )
+    return found, write_study(found, folder, command, force=force)
+
+
 def _begun(
     study: Study, folder: Path, engine: Engine, listener: Listener
 ) -> tuple[DriveSetup, list[PreparedVariant]]:
@@ -116,7 +155,11 @@ def _compared(
 ) -> StudyResult:
     """Compare the plans and the drives of every variant with the baseline's."""
     study, clock = setup.study, setup.clock
-    variants = _variants(study, prepared, clock, setup.listener)
+    baseline = next(each for each in prepared if each.variant is study.reference)
+    variants = tuple(
+        VariantOutcome.of(each, clock, judge(study, baseline, each, setup.listener))
+        for each in prepared
+    )
     drives = [
         drive
         for condition in study.conditions
@@ -143,14 +186,3 @@ def _read(study: Study | str | Path) -> Study:
         return load_study(study)
     study.check_recordings()
     return study
-
-
-def _variants(
-    study: Study, prepared: list[PreparedVariant], clock: Clock, listener: Listener
-) -> tuple[VariantOutcome, ...]:
-    names = [each.variant.name for each in prepared]
-    baseline = prepared[names.index(study.baseline)]
-    return tuple(
-        VariantOutcome.of(each, clock, judge(study, baseline, each, listener))
-        for each in prepared
-    )

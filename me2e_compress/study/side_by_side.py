@@ -1,11 +1,13 @@
 """Pictures of the moment at which two drives of a route diverge."""
 
+import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.simulator.cameras import paint_texture
 from me2e_compress.simulator.pictures import Moment, RoutePicture, overlay, write_png
 from me2e_compress.simulator.routes import Route
@@ -14,28 +16,14 @@ from me2e_compress.study.condition import Condition
 from me2e_compress.study.drive_record import Apart, DriveRecord
 from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.prepared import PreparedVariant
-from me2e_compress.study.route_summary import RouteSummary
 
 SCORED, MOVED_M = 1.0, 0.5
 """Two drives whose scores are closer, and that were never farther apart, look alike."""
 
 
 @dataclass(frozen=True)
-class Contrast:
-    """A PNG of one moment of two drives: the baseline in grey under the variant."""
-
-    route: RouteSummary
-    other: RouteSummary
-    variant: str
-    condition: str
-    time_us: int
-    apart_m: float
-    picture: Path
-
-
-@dataclass(frozen=True)
-class _Pair:
-    """A candidate: one route of two drives."""
+class RoutePair:
+    """One route as two drivers drove it: ``route`` is the baseline's."""
 
     drive: DriveRecord
     route: RouteSummary
@@ -48,6 +36,7 @@ class _Pair:
 
     @property
     def gap(self) -> float:
+        """How far the driving scores differ."""
         return abs(self.route.driving_score - self.other.driving_score)
 
     @property
@@ -57,10 +46,12 @@ class _Pair:
 
     @property
     def differs(self) -> bool:
+        """Whether a reader can see that the two are not alike."""
         return self.gap >= SCORED or self.apart.distance_m > MOVED_M
 
     @property
     def rank(self) -> tuple[float, float]:
+        """Order of pictures: the widest gap first."""
         return -self.gap, -self.apart.distance_m
 
     @property
@@ -76,6 +67,13 @@ class _Pair:
         alone = [us for kind, us in timed if kind not in kinds]
         times = alone or [us for _, us in timed]
         return times[0] if times else min(worse.duration_us, better.duration_us)
+
+
+@dataclass(frozen=True)
+class Contrast(RoutePair):
+    """A PNG of the moment of two drives: the baseline in grey under the variant."""
+
+    picture: Path
 
 
 def take_pictures(
@@ -101,20 +99,17 @@ def take_pictures(
         where = routes[pair.route.route]
         both = by_name[pair.drive.variant], by_name[setup.study.baseline]
         picture = _picture(setup, *both, condition, where, pair.moment_us)
-        found.append(
-            Contrast(
-                *(pair.route, pair.other, pair.drive.variant, condition.name),
-                *(pair.moment_us, pair.apart.distance_m, picture),
-            )
-        )
+        found.append(Contrast(pair.drive, pair.route, pair.other, picture))
     return tuple(found)
 
 
-def _chosen(baseline: str, drives: Sequence[DriveRecord], limit: int) -> list[_Pair]:
+def _chosen(
+    baseline: str, drives: Sequence[DriveRecord], limit: int
+) -> list[RoutePair]:
     """Choose the widest gaps: one of each variant first, and no route twice."""
     references = {each.condition: each for each in drives if each.variant == baseline}
     pairs = [
-        _Pair(drive, route, other)
+        RoutePair(drive, route, other)
         for drive in drives
         if drive.variant != baseline and drive.routes
         for route, other in zip(
@@ -124,7 +119,7 @@ def _chosen(baseline: str, drives: Sequence[DriveRecord], limit: int) -> list[_P
     ranked = sorted((pair for pair in pairs if pair.seen), key=lambda p: p.rank)
     # Where all look alike, one picture shows just that.
     ranked = [pair for pair in ranked if pair.differs] or ranked[:1]
-    chosen = list[_Pair]()
+    chosen = list[RoutePair]()
     for others_only in (True, False):
         for pair in ranked:
             shown = [each.drive.variant for each in chosen]
@@ -133,25 +128,6 @@ def _chosen(baseline: str, drives: Sequence[DriveRecord], limit: int) -> list[_P
             if pair.route.route not in [each.route.route for each in chosen]:
                 chosen.append(pair)
     return chosen
-
-
-@dataclass
-class _Film:
-    """Keeps all positions, and the camera images of the latest moment only."""
-
-    until_us: int
-    moments: list[Moment] = field(default_factory=list)
-
-    def see(self, moment: Moment) -> None:
-        if self.moments:
-            self.moments[-1] = replace(self.moments[-1], images=None)
-        self.moments.append(moment)
-        if moment.scene.time_us >= self.until_us:
-            raise _Enough
-
-
-class _Enough(Exception):  # noqa: N818 - it ends a drive, nothing went wrong
-    """Ends a drive once the moment was seen."""
 
 
 def _picture(
@@ -171,7 +147,7 @@ def _picture(
     points = world.path.points
     texture = paint_texture(world.roadmap, points)
     drives = [
-        RoutePicture(each.variant.name, texture, points, _watched(job, route, time_us))
+        RoutePicture(each.variant.name, texture, points, watch(job, route, time_us))
         for each, job in zip((variant, baseline), jobs, strict=True)
         if job is not None
     ]
@@ -179,10 +155,21 @@ def _picture(
     return path
 
 
-def _watched(job: Job, route: Route, time_us: int) -> list[Moment]:
-    film = _Film(time_us)
-    try:
-        drive(route, job.driver.open(), job.conditions, Listeners(on_moment=film.see))
-    except _Enough:
-        return film.moments
-    return film.moments
+class _Enough(Exception):  # noqa: N818 - it ends a drive, nothing went wrong
+    """Ends a drive once the moment was seen."""
+
+
+def watch(job: Job, route: Route, until_us: int) -> list[Moment]:
+    """Drive a route, and return its moments; only the last one has camera images."""
+    moments = list[Moment]()
+
+    def see(moment: Moment) -> None:
+        if moments:
+            moments[-1] = replace(moments[-1], images=None)
+        moments.append(moment)
+        if moment.scene.time_us >= until_us:
+            raise _Enough
+
+    with contextlib.suppress(_Enough):
+        drive(route, job.driver.open(), job.conditions, Listeners(on_moment=see))
+    return moments

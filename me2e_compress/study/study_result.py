@@ -1,12 +1,20 @@
 """Result of a study: what it found, as lines, tables and JSON."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 from me2e_compress.runtime.providers import PROVIDERS
-from me2e_compress.study.all_tables import all_tables
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome
+from me2e_compress.study.tables import (
+    abilities,
+    change_tables,
+    differences,
+    near_misses,
+    route_table,
+    scoreboards,
+)
 from me2e_compress.workflows.result import Result, Table, counted
 
 
@@ -43,9 +51,28 @@ class StudyResult(StudyOutcome, Result):
         )
         return (*left_out, *broken, *busy)
 
+    @property
+    def tables_by_section(self) -> Mapping[str, tuple[Table, ...]]:
+        """Every table, in reading order; a preview is marked as such."""
+        route_by_route, several = route_table(self), len(self.variants) > 1
+        found = {
+            "Scoreboard": scoreboards(self),
+            "Paired differences": (differences(self),) if several else (),
+            "One change at a time": change_tables(self),
+            "Route by route": () if route_by_route is None else (route_by_route,),
+            "Near misses": (near_misses(self),),
+            "Abilities": abilities(self),
+        }
+        preview = self.study.preview
+        return {
+            heading: tuple(replace(e, title=f"{e.title}{preview}") for e in tables)
+            for heading, tables in found.items()
+        }
+
     def tables(self) -> tuple[Table, ...]:
         """Return every table, in reading order."""
-        return all_tables(self)
+        by_section = self.tables_by_section.values()
+        return tuple(table for tables in by_section for table in tables)
 
     def records(self) -> list[dict[str, object]]:
         """Return one row per drive."""
@@ -54,16 +81,8 @@ class StudyResult(StudyOutcome, Result):
     def _record(self, drive: DriveRecord) -> dict[str, object]:
         # a drive that was not made has no scores
         scores, of = drive.scores, self.variant(drive.variant)
-        found = (
-            {}
-            if scores is None
-            else {
-                "driving_score": scores.driving_score.value,
-                "success_rate": scores.success_rate.value,
-                "efficiency": scores.efficiency.value,
-                "comfort": scores.comfort.value,
-            }
-        )
+        names = ("driving_score", "success_rate", "efficiency", "comfort")
+        found = {} if scores is None else {n: getattr(scores, n).value for n in names}
         return {
             "variant": drive.variant,
             "condition": drive.condition,

@@ -1,24 +1,21 @@
-"""Tables of a study: one content for the terminal, Markdown and HTML."""
+"""Tables of a study, in reading order."""
 
 from collections.abc import Mapping, Sequence
 
 from me2e_compress.metrics.abilities import ABILITIES
 from me2e_compress.metrics.differences import PairedDifference, holm
-from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
+from me2e_compress.study.cells import MISSING, anew_cell, estimate_cell, measure_cell
 from me2e_compress.study.changes import Change
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome, VariantOutcome
-from me2e_compress.study.plan_fidelity import EXACT
 from me2e_compress.workflows.result import Cell, Table, counted
-from me2e_compress.workflows.result import number as plain_number
 
-MISSING = "\N{EN DASH}"
-"""Shown if nothing was measured."""
-INFINITE = "\N{INFINITY}"
-MINUS = "\N{MINUS SIGN}"
 SCORES = ("DS", "SR %", "DE %", "DC")
+MOST_ROUTES = 40
+"""With more routes than this, the table of endings is left out."""
 COSTS = ("size MB", "p50 ms", "p99 ms", "plan m", "SQNR dB")
 
 
@@ -52,25 +49,23 @@ def _scoreboard(outcome: StudyOutcome, condition: Condition) -> Table:
 def differences(outcome: StudyOutcome) -> Table:
     """Show every variant minus the baseline, paired by route."""
     # drives with a difference to the baseline
-    baseline = outcome.study.baseline
-    several = len(outcome.study.conditions) > 1
-    names, found = list[str](), list[PairedDifference]()
-    for drive in outcome.drives:
-        if drive.difference is not None:
-            found.append(drive.difference)
-            name = f"{drive.variant}, {drive.condition}"
-            names.append(name if several else drive.variant)
+    compared = [
+        (outcome.label(drive), drive.difference)
+        for drive in outcome.drives
+        if drive.difference is not None
+    ]
+    found = [each for _, each in compared]
     # p-values are corrected for all comparisons shown
     corrected = holm([each.p_value for each in found])
     return Table(
-        f"Difference to {baseline} on the same routes",
+        f"Difference to {outcome.study.baseline} on the same routes",
         (
             *("variant", "DS, points", "DS, other types", "SR, points", "SR p"),
             *("routes better", "routes worse"),
         ),
         tuple(
             (Cell(name), *_difference(each, p))
-            for name, each, p in zip(names, found, corrected, strict=True)
+            for (name, each), p in zip(compared, corrected, strict=True)
         ),
         _differences_note(found),
     )
@@ -175,13 +170,10 @@ def change_tables(outcome: StudyOutcome) -> tuple[Table, ...]:
 
 
 def _change(change: Change, *, beyond: bool) -> tuple[Cell, ...]:
-    score = change.driving_score
     cells = (
         Cell(change.drive),
         Cell(change.against),
-        estimate_cell(score, signed=True),
-        between_cell(score.anew_low, score.anew_high, "+.1f"),
-        estimate_cell(change.success_rate, signed=True),
+        *_gaps(change.driving_score, change.success_rate),
     )
     own = Cell(MISSING, reason="the baseline itself")
     rest = (change.beyond_driving_score, change.beyond_success_rate)
@@ -189,12 +181,70 @@ def _change(change: Change, *, beyond: bool) -> tuple[Cell, ...]:
     return (*cells, *shown) if beyond else cells
 
 
+def _gaps(score: Estimate, rate: Estimate) -> tuple[Cell, Cell, Cell]:
+    """Show differences of driving score, with both intervals, and of success rate."""
+    signed = estimate_cell(score, signed=True)
+    return signed, anew_cell(score), estimate_cell(rate, signed=True)
+
+
+def route_table(outcome: StudyOutcome) -> Table | None:
+    """Show how each route ended for each driver; None if there are too many routes."""
+    driven = [each for each in outcome.drives if each.routes]
+    if not driven or len(driven[0].routes) > MOST_ROUTES:
+        return None
+    # one column per drive, one row per route
+    names = map(outcome.label, driven)
+    return Table(
+        "How each route ended",
+        ("route", *names),
+        tuple(
+            (
+                Cell(routes[0].route),
+                *(Cell(f"{each.driving_score:.1f}", each.fate) for each in routes),
+            )
+            for routes in zip(*(each.routes for each in driven), strict=True)
+        ),
+        "Driving score, and why it is not 100.",
+    )
+
+
+def near_misses(outcome: StudyOutcome) -> Table:
+    """Show how near every drive came to collisions, which end few routes."""
+    columns = ("TTC < 1.5 s, %", "least TTC s", "PET s", "distance m", "at fault %")
+    return Table(
+        "Near misses",
+        ("variant", *columns),
+        tuple(
+            (Cell(outcome.label(each)), *_safety(each, len(columns)))
+            for each in outcome.drives
+        ),
+        "Means over routes with their 95 % intervals: share of the time with a time to "
+        "collision below 1.5 s, the least of a route, post-encroachment time of "
+        "crossing paths, smallest distance; and routes with a collision that the ego "
+        "could have prevented. Least TTC and PET exist on some routes only.",
+        outcome.study.baseline,
+    )
+
+
+def _safety(drive: DriveRecord, columns: int) -> tuple[Cell, ...]:
+    if drive.scores is None:
+        return (Cell(MISSING, reason=drive.reason),) * columns
+    found = drive.scores.safety
+    return (
+        estimate_cell(found.ttc_exposure),
+        estimate_cell(found.smallest_ttc, ".2f"),
+        estimate_cell(found.smallest_pet, ".2f"),
+        estimate_cell(found.smallest_distance, ".2f"),
+        estimate_cell(found.at_fault_collisions),
+    )
+
+
 def _scores(drive: DriveRecord) -> tuple[Cell, ...]:
     if drive.scores is None:
         return (Cell(MISSING, reason=drive.reason),) * 4
-    scores = drive.scores
-    shown = (scores.driving_score, scores.success_rate, scores.efficiency)
-    return (*map(estimate_cell, shown), estimate_cell(scores.comfort))
+    found = drive.scores
+    shown = (found.driving_score, found.success_rate, found.efficiency, found.comfort)
+    return tuple(map(estimate_cell, shown))
 
 
 def _costs(variant: VariantOutcome) -> tuple[Cell, ...]:
@@ -208,11 +258,8 @@ def _costs(variant: VariantOutcome) -> tuple[Cell, ...]:
 
 
 def _difference(found: PairedDifference, p_value: float) -> tuple[Cell, ...]:
-    score = found.driving_score
     return (
-        estimate_cell(score, signed=True),
-        between_cell(score.anew_low, score.anew_high, "+.1f"),
-        estimate_cell(found.success_rate, signed=True),
+        *_gaps(found.driving_score, found.success_rate),
         Cell(f"{p_value:.2g}"),
         Cell(str(found.better)),
         Cell(str(found.worse)),
@@ -248,38 +295,3 @@ def _costs_note(outcome: StudyOutcome) -> str:
         "held-out frames, and the noise on them."
     )
     return " ".join(notes)
-
-
-def estimate_cell(
-    estimate: Estimate, form: str = ".1f", *, signed: bool = False
-) -> Cell:
-    """Show a mean with its interval."""
-    measure, sign = estimate.measure, "+" if signed else ""
-    if measure.value is None:
-        return Cell(MISSING, reason=measure.reason)
-    form = f"{sign}{'.3f' if measure.unit == 'ratio' else form}"
-    text = number(measure.value, form)
-    if estimate.low is None or estimate.high is None:
-        return Cell(text)
-    low, high = (number(each, form) for each in (estimate.low, estimate.high))
-    return Cell(text, f"{low} to {high}")
-
-
-def between_cell(low: float | None, high: float | None, form: str) -> Cell:
-    """Show an interval alone."""
-    if low is None or high is None:
-        return Cell(MISSING, reason="too few scenario types")
-    return Cell(f"{number(low, form)} to {number(high, form)}")
-
-
-def measure_cell(measure: Measure, form: str) -> Cell:
-    """Show a number, or a dash with its reason."""
-    if measure.value is None:
-        infinite = measure.reason == EXACT
-        return Cell(INFINITE if infinite else MISSING, reason=measure.reason)
-    return Cell(number(measure.value, form))
-
-
-def number(value: float, form: str) -> str:
-    """Format a number with a true minus sign and no negative zero."""
-    return plain_number(value, form).replace("-", MINUS)

@@ -2,9 +2,9 @@
 
 from me2e_compress.metrics.differences import PairedDifference, shown_by
 from me2e_compress.metrics.measure import Measure
+from me2e_compress.study.cells import MISSING, measure_cell, number
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome
-from me2e_compress.study.tables import MISSING, number
 from me2e_compress.workflows.result import Cell, Table
 
 
@@ -24,7 +24,7 @@ def before_and_after(outcome: StudyOutcome, name: str) -> Table:
             (
                 Cell("the plan moves by, m"),
                 Cell(MISSING),
-                _cell(moved, ".3f"),
+                measure_cell(moved, ".3f"),
                 Cell(far),
             ),
             (
@@ -72,19 +72,18 @@ def _row(what: str, before: Measure, after: Measure, form: str) -> tuple[Cell, .
     share = ""
     if before.value and after.value is not None:
         share = f"{after.value / before.value:.0%}"
-    return Cell(what), _cell(before, form), _cell(after, form), Cell(share)
-
-
-def _cell(measure: Measure, form: str) -> Cell:
-    if measure.value is None:
-        return Cell(MISSING, reason=measure.reason)
-    return Cell(number(measure.value, form))
+    return (
+        Cell(what),
+        measure_cell(before, form),
+        measure_cell(after, form),
+        Cell(share),
+    )
 
 
 def _score(drive: DriveRecord) -> Cell:
     if drive.scores is None:
         return Cell(MISSING, reason=drive.reason)
-    return _cell(drive.scores.driving_score.measure, ".1f")
+    return measure_cell(drive.scores.driving_score.measure, ".1f")
 
 
 def _difference(drive: DriveRecord) -> str:

@@ -153,10 +153,9 @@ def held_frames(study: Study, condition: Condition) -> int:
             study, next(each for each in study.conditions if each.name == under)
         )
     latency_us = round(1e6 * (study.timing.baseline_median_s or 0.0))
-    if True:
-        source = condition.source(study.seed).with_trace((latency_us,), 1.0)
-        nobody = DecisionFacts(latency_us, np.empty((0, 2)))
-        latency_us = source.on_route("")(nobody)
+    source = condition.source(study.seed).with_trace((latency_us,), 1.0)
+    nobody = DecisionFacts(latency_us, np.empty((0, 2)))
+    latency_us = source.on_route("")(nobody)
     return skipped_decisions(latency_us, condition.settings.dt_us) + 1
 
 

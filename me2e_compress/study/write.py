@@ -8,9 +8,9 @@ from me2e_compress import drafts, marks
 from me2e_compress.display import in_markdown
 from me2e_compress.errors import StudyError
 from me2e_compress.runtime.atomic import write_bytes, write_document
-from me2e_compress.study.paper.paper_page import paper_html
-from me2e_compress.study.paper.paper_result import PaperResult
-from me2e_compress.study.report import Section, html
+from me2e_compress.study.paper.paper_result import PaperResult, paper_page
+from me2e_compress.study.report.page import Section
+from me2e_compress.study.report.study_page import study_page
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.workflows.claims import writing
@@ -49,13 +49,12 @@ def write_study(
     # paths, and all tables as Markdown
     folder = Path(folder)
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
-    title = f"{outcome.study.title}{outcome.study.preview}"
-    heading = f"{marks.IN_MARKDOWN}# {in_markdown(title)}\n\n"
+    heading = f"{marks.IN_MARKDOWN}# {in_markdown(outcome.title)}\n\n"
     text = heading + "\n".join(table.markdown() for table in outcome.tables())
     if isinstance(outcome, PaperResult):
-        page = paper_html(outcome, command)
+        page = paper_page(outcome, command)
     else:
-        page = html(outcome, command, sections)
+        page = study_page(outcome, command, sections)
     # all files are written, or none
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -65,7 +64,7 @@ def write_study(
         ):
             write_document(written.record, outcome.to_json(), indent=1)
             write_bytes(written.tables, text.encode())
-            write_bytes(written.report, page.encode())
+            write_bytes(written.report, page.html().encode())
     except OSError as error:
         raise StudyError(f"{folder}: cannot be written: {error.strerror}") from error
     return written

@@ -13,16 +13,17 @@ from me2e_compress.evaluators.bench2drive.real_results import (
 )
 from me2e_compress.evaluators.bench2drive.records import number_of
 from me2e_compress.metrics import scores as metrics
-from me2e_compress.metrics.ability_rules import MEAN, RULES, Rules, ability_rates
+from me2e_compress.metrics.abilities import MEAN, RULES, Rules, ability_rates
 from me2e_compress.metrics.comfort import stood_most
 from me2e_compress.metrics.episode import LARGEST
 from me2e_compress.metrics.leaderboard_scores import (
+    VERSIONS,
     LeaderboardScores,
     Quotients,
+    Version,
     leaderboard_scores,
 )
 from me2e_compress.metrics.measure import Measure
-from me2e_compress.metrics.penalties import VERSIONS, Version
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.workflows.result import Table, number, table
 

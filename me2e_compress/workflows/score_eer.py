@@ -10,11 +10,8 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.eer import MEASURES, EerResult, EerScale, eer, rankings
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.metrics.route_measures import (
-    MeasuredRoute,
-    RouteMeasures,
-    route_measures,
-)
+from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
+from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.workflows.eer_weights import Kind, SavedWeights
 from me2e_compress.workflows.paired_drives import UNPAIRED, paired_drives
@@ -213,7 +210,7 @@ def _variants(
         for name, each in joules.items()
     }
     return {
-        name: route_measures(list(map(MeasuredRoute.of, episodes)), named.get(name))
+        name: route_measures(list(map(RouteSummary.of, episodes)), named.get(name))
         for name, episodes in folders.items()
     }
 

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import me2e_compress.study.reported
+import me2e_compress.study.run
 from me2e_compress.cli.commands.study import study
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway import evaluation_options
@@ -135,7 +135,7 @@ def test_a_model_that_ships_is_not_one_where_you_are(
         asked.append(found)
         raise StudyError("seen")
 
-    monkeypatch.setattr(me2e_compress.study.reported, "run_study", noted)
+    monkeypatch.setattr(me2e_compress.study.run, "run_study", noted)
     with pytest.raises(StudyError, match="seen"):
         study(toml, tmp_path / "out")
 

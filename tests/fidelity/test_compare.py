@@ -6,10 +6,10 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
+from benchmarks.plan_reaction import plan_reaction
 from me2e_compress import graph
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.fidelity.compare import Displacement, compare
-from me2e_compress.fidelity.reaction import plan_reaction
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.critic import critic_weights
+from me2e_compress.metrics.eer import critic_weights
 
 BY_HAND = np.array([[0, 0, 0], [0, 1, 1], [1, 1, 0], [1, 1, 1]], np.float64)
 
@@ -82,11 +82,3 @@ def test_one_scale_for_all_measures_does_not_matter(
     assert (found is None) == (other is None)
     if found is not None:
         assert found == pytest.approx(other, abs=1e-6)
-
-
-def test_the_sample_deviation_gives_the_same_weights() -> None:
-    spread = BY_HAND.std(axis=0, ddof=1)
-    apart = 1.0 - np.abs(np.corrcoef(BY_HAND, rowvar=False))
-    content = spread * apart.sum(axis=1)
-
-    assert critic_weights(BY_HAND) == pytest.approx(content / content.sum())

@@ -3,13 +3,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.differences import difference, holm
-from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.differences import PairedDifference, difference, holm
+from me2e_compress.metrics.infraction import Infraction, InfractionKind
+from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.route_summary import RouteSummary
 from tests.metrics.drives import drive, infraction
 
 CRASH = infraction(InfractionKind.COLLISION_VEHICLE)
-GOOD = [drive(route=name) for name in "abcd"]
-BAD = [drive(CRASH, route="a", completion=50.0), *GOOD[1:]]
+
+
+def driven(*hits: Infraction, route: str, completion: float = 100.0) -> RouteSummary:
+    return RouteSummary.of(drive(*hits, route=route, completion=completion))
+
+
+GOOD = [driven(route=name) for name in "abcd"]
+BAD = [driven(CRASH, route="a", completion=50.0), *GOOD[1:]]
 
 
 def test_the_mean_of_differences_route_by_route() -> None:
@@ -45,7 +53,7 @@ def test_where_nothing_differs_the_interval_is_what_may_be_unseen() -> None:
 
 
 def test_four_routes_that_differ_alike_say_little_of_a_fifth() -> None:
-    worse = [drive(CRASH, route=name, completion=50.0) for name in "abcd"]
+    worse = [driven(CRASH, route=name, completion=50.0) for name in "abcd"]
 
     found = difference(worse, GOOD)
 
@@ -58,8 +66,8 @@ def test_four_routes_that_differ_alike_say_little_of_a_fifth() -> None:
 
 def test_success_is_compared_by_mcnemars_exact_test() -> None:
     names = [str(i) for i in range(20)]
-    one = [drive(*[CRASH] * (k < 1), route=name) for k, name in enumerate(names)]
-    other = [drive(*[CRASH] * (k > 11), route=name) for k, name in enumerate(names)]
+    one = [driven(*[CRASH] * (k < 1), route=name) for k, name in enumerate(names)]
+    other = [driven(*[CRASH] * (k > 11), route=name) for k, name in enumerate(names)]
 
     found = difference(one, other)
 
@@ -93,3 +101,43 @@ def test_one_route_has_no_interval() -> None:
 def test_other_routes_are_named() -> None:
     with pytest.raises(EvaluationError, match="route d was driven by one"):
         difference(BAD[:3], GOOD)
+
+
+def paired(
+    routes: int, low: float | None, high: float | None, value: float = 0.0
+) -> PairedDifference:
+    score = Estimate(Measure(value, "points"), low, high, routes)
+    return PairedDifference(score, score, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("routes", "low", "high", "least"),
+    [
+        (220, -1.0, 1.0, 1.6),
+        (5, 0.0, 0.0, 10.5),  # all alike: five routes show little nevertheless
+        (5, -0.3, 40.6, 20.45),
+        (1, None, None, 23.5),
+    ],
+)
+def test_few_routes_show_only_large_differences(
+    routes: int, low: float | None, high: float | None, least: float
+) -> None:
+    assert paired(routes, low, high).smallest_shown == pytest.approx(least, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("routes", "low", "high", "value", "said"),
+    [
+        (220, 0.7, 6.7, 3.7, "better"),
+        (220, -6.7, -0.7, -3.7, "worse"),
+        (220, -0.9, 5.6, 2.3, "no difference shown"),
+        (220, 0.2, 1.8, 1.0, "too few routes"),  # below the 1.6 that 220 show
+        (4, 1.0, 20.0, 11.0, "too few routes"),
+        (1, None, None, 60.0, "too few routes"),
+        (220, 0.04, 4.0, 2.0, "no difference shown"),  # shown as 0.0
+    ],
+)
+def test_a_verdict_asks_for_the_interval_and_for_enough_routes(
+    routes: int, low: float | None, high: float | None, value: float, said: str
+) -> None:
+    assert paired(routes, low, high, value).verdict == said

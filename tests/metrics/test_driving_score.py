@@ -67,8 +67,3 @@ def test_an_unfinished_route_is_no_success() -> None:
 @pytest.mark.parametrize("ending", [e for e in Ending if e is not Ending.COMPLETED])
 def test_a_whole_route_that_ended_otherwise_is_no_success(ending: Ending) -> None:
     assert not drive(ending=ending).succeeded
-
-
-def test_a_collision_is_remembered() -> None:
-    assert drive(infraction(InfractionKind.COLLISION_PEDESTRIAN)).collided
-    assert not drive(infraction(InfractionKind.RED_LIGHT)).collided

@@ -20,22 +20,19 @@ from me2e_compress.metrics.eer import (
 )
 from me2e_compress.metrics.episode import Ending, Episode, Given
 from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.metrics.route_measures import (
-    MeasuredRoute,
-    RouteMeasures,
-    route_measures,
-)
+from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
+from me2e_compress.metrics.route_summary import RouteSummary
 from tests.metrics.drives import cruise, drive, infraction
 
 
 def measured(episodes: Sequence[Episode], j_per_frame: float | None) -> RouteMeasures:
-    return route_measures([MeasuredRoute.of(each) for each in episodes], j_per_frame)
+    return route_measures([RouteSummary.of(each) for each in episodes], j_per_frame)
 
 
 def measures(*rows: tuple[float, float, float, float], crashed: str) -> RouteMeasures:
     """Rows of DS, DE, DC and joules; an ``x`` for every route with a collision."""
     hits = np.array([letter == "x" for letter in crashed])
-    return RouteMeasures.of_table(np.array(rows, np.float64), hits)
+    return RouteMeasures(np.array(rows, np.float64), hits)
 
 
 BY_HAND = {
@@ -54,7 +51,7 @@ routes = arrays(np.float64, (5, 4), elements=st.floats(0, 100, width=16))
 
 
 def of_table(table: np.ndarray) -> RouteMeasures:
-    return RouteMeasures.of_table(table, table[:, 0] < 50.0)
+    return RouteMeasures(table, table[:, 0] < 50.0)
 
 
 def test_the_example_by_hand() -> None:
@@ -86,7 +83,7 @@ def test_smallest_and_largest_of_all_routes_are_the_scale() -> None:
 
 
 def test_weights_come_from_critic_over_routes_and_variants() -> None:
-    tables = {name: each.table() for name, each in BY_HAND.items()}
+    tables = {name: each.table for name, each in BY_HAND.items()}
     found = scale_of(tables, Normalization.MIN_MAX).weights
 
     # normalized: DS 1 1/3 1 0, DE 1/2 0 1 0, DC 1 1/2 1/2 0, E 1 1 0 0
@@ -105,9 +102,9 @@ def test_a_scale_is_used_again_on_another_variant() -> None:
 
 @pytest.mark.parametrize("measure", range(4))
 def test_a_missing_measure_is_named_and_the_others_are_scored(measure: int) -> None:
-    table = BY_HAND["a"].table().copy()
+    table = BY_HAND["a"].table.copy()
     table[:, measure] = NAN
-    lacking = RouteMeasures.of_table(table, BY_HAND["a"].crashed)
+    lacking = RouteMeasures(table, BY_HAND["a"].crashed)
 
     found = eer({**BY_HAND, "c": lacking})
 
@@ -118,10 +115,8 @@ def test_a_missing_measure_is_named_and_the_others_are_scored(measure: int) -> N
 
 def test_a_route_that_one_variant_did_not_measure_is_left_out_of_all() -> None:
     more = {
-        "a": measures(
-            *BY_HAND["a"].table().tolist(), (10, NAN, 0.5, 10), crashed="..."
-        ),
-        "b": measures(*BY_HAND["b"].table().tolist(), (90, 90, 0.9, 1), crashed=".x."),
+        "a": measures(*BY_HAND["a"].table.tolist(), (10, NAN, 0.5, 10), crashed="..."),
+        "b": measures(*BY_HAND["b"].table.tolist(), (90, 90, 0.9, 1), crashed=".x."),
     }
 
     found = eer(more)
@@ -149,13 +144,9 @@ def test_neither_units_nor_the_order_of_routes_change_a_score(
     one: np.ndarray, other: np.ndarray, unit: float, order: list[int]
 ) -> None:
     found = eer({"a": of_table(one), "b": of_table(other)})
+    units = (1.0, 1.0, 1.0, unit)
     moved = eer(
-        {
-            name: dataclasses.replace(
-                of_table(table[order]), energy_j=unit * table[order, 3]
-            )
-            for name, table in (("a", one), ("b", other))
-        }
+        {"a": of_table(one[order] * units), "b": of_table(other[order] * units)}
     )
 
     for name, score in found.scores.items():
@@ -168,7 +159,7 @@ def test_the_ranking_under_every_normalization() -> None:
     drawn = np.random.default_rng(1).uniform(0, 1, (3, 30, 4)) * (100, 100, 1, 10)
     drawn[0, :, 0] = 100.0
     variants = {
-        name: RouteMeasures.of_table(table, np.zeros(30, np.bool_))
+        name: RouteMeasures(table, np.zeros(30, np.bool_))
         for name, table in zip("abc", drawn, strict=True)
     }
 
@@ -182,9 +173,8 @@ def test_the_ranking_under_every_normalization() -> None:
 def test_joules_of_a_route_are_those_of_its_decisions() -> None:
     found = measured([drive(driven=cruise(traffic=5.0))], 2.5)
 
-    assert found.energy_j.tolist() == [2.5]  # a drive by hand has one decision
-    assert found.efficiency.tolist() == pytest.approx([200.0])
-    assert found.comfort.tolist() == [1.0]
+    # a drive by hand has one decision
+    assert found.table.tolist() == [pytest.approx([100.0, 200.0, 1.0, 2.5])]
 
 
 def test_without_a_log_of_decisions_a_recorded_step_of_a_real_run_is_one() -> None:
@@ -194,18 +184,18 @@ def test_without_a_log_of_decisions_a_recorded_step_of_a_real_run_is_one() -> No
         given=Given("Completed", 100.0, 1.0, 100.0),
     )
 
-    assert measured([real], 2.5).energy_j.tolist() == [20.0]
+    assert measured([real], 2.5).table[0, 3] == 20.0
 
 
 def test_no_counter_no_joules() -> None:
-    assert np.isnan(measured([drive()], None).energy_j).all()
+    assert np.isnan(measured([drive()], None).table[0, 3])
 
 
 def test_a_driver_that_failed_at_once_is_not_left_out() -> None:
     stuck = drive(completion=1.0, driven=cruise(1.0), ending=Ending.TIMEOUT)
     found = measured([stuck], 1.0)
 
-    assert (found.efficiency[0], found.comfort[0]) == (0.0, 0.0)
+    assert found.table[0, 1:3].tolist() == [0.0, 0.0]
 
 
 def test_without_a_record_nothing_is_made_up() -> None:
@@ -213,7 +203,7 @@ def test_without_a_record_nothing_is_made_up() -> None:
     silent = dataclasses.replace(drive(hit, completion=2.0), decisions=())
     found = measured([silent], 1.0)
 
-    assert np.isnan(found.table()[0, 1:]).all()
+    assert np.isnan(found.table[0, 1:]).all()
     assert found.crashed.tolist() == [True]
 
 

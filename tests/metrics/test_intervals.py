@@ -131,5 +131,5 @@ def test_the_exact_binomial_interval() -> None:
     # Clopper and Pearson: with no failure the lower end is (alpha / 2) ** (1 / n).
     low, high = binomial_interval(10, 10)
 
-    assert low == pytest.approx(0.025**0.1)
-    assert high == 1.0
+    assert low == pytest.approx(100 * 0.025**0.1)
+    assert high == 100.0

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 
 from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.study import Study
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.paper.model_facts import (
+from me2e_compress.study.paper.paper_drives import (
     FILE,
     Int8Counts,
+    KeptFacts,
     ModelFacts,
-    save_facts,
 )
-from me2e_compress.study.route_summary import RouteSummary
 from me2e_compress.study.workload import held_frames
 
 LOST = {"minus-map": 60.0, "minus-motion": 10.0, "full": 6.0, "prediction": 3.0}
@@ -31,8 +31,8 @@ def write_records(study: Study, folder: Path) -> Path:
             made_by = {"set_size": study.set_size, "routes_sha256": "0", "of": name}
             record = DriveRecord(name, condition.name, routes, made_by)
             record.save(folder / f"{name}.{condition.name}.jsonl")
-    about = {"machine": "none", "device_scale": 20.0}
-    save_facts(folder / FILE, [_fact(each.name) for each in study.variants], about)
+    facts = tuple(_fact(each.name) for each in study.variants)
+    KeptFacts(20.0, facts, "none").save(folder / FILE)
     return folder
 
 
@@ -92,7 +92,3 @@ def _fact(name: str) -> ModelFacts:
         modules if name == "float" else {},
         modelled_j=0.004 - 1e-5 * (int8.operators if int8 else 0),
     )
-
-
-def _share(value: float) -> float:
-    return float(np.clip(value, 0.0, 1.0))

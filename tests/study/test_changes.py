@@ -1,14 +1,12 @@
 from collections.abc import Sequence
-from pathlib import Path
 
 import pytest
 
-from me2e_compress.errors import StudyError
+from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.study import Condition, Study, load_study
 from me2e_compress.study.changes import changes, held_against
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.file import STUDIES
-from me2e_compress.study.route_summary import RouteSummary
 from me2e_compress.study.tables import change_tables
 from tests.study.conftest import IDEAL, Make
 
@@ -72,11 +70,6 @@ def test_a_pair_crosses_variants_and_conditions() -> None:
     assert pair.to_json()["beyond_baseline"]["driving_score"] is None
 
 
-def test_a_pair_of_nothing_is_refused(make: Make) -> None:
-    with pytest.raises(StudyError, match=r"pair: 'slow.fog' is no VARIANT.CONDITION"):
-        make(pairs=(("slow.ideal", "slow.fog"),))
-
-
 def test_tables_of_changes_and_pairs(make: Make) -> None:
     class Outcome:
         """A study's outcome, so far as these tables read it."""
@@ -98,17 +91,3 @@ def test_a_study_that_ships_is_whole(name: str) -> None:
     study = load_study(STUDIES / f"{name}.toml", "2")
 
     assert study.pairs or any(each.against for each in study.conditions)
-
-
-def test_pairs_of_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "study.toml"
-    path.write_text("""
-    title = "t"
-    baseline = "blind"
-    routes = 2
-    variant = [{name = "blind", policy = "blind"}]
-    condition = [{name = "a", latency = "none"}, {name = "b", latency = "fps:4"}]
-    pair = [{of = "blind.b", against = "blind.a"}]
-    """)
-
-    assert load_study(path).pairs == (("blind.b", "blind.a"),)

@@ -9,8 +9,7 @@ from me2e_compress.driving.latency import TraceLatency
 from me2e_compress.driving.layered_latency import AgentsLatency, LimitedLatency
 from me2e_compress.driving.realtime import LatencyModel
 from me2e_compress.errors import Me2eError, StudyError
-from me2e_compress.study import Condition, Study, Timing, load_study, run_study
-from tests.evaluators.highway.drivers import PARKED
+from me2e_compress.study import Condition, Timing, run_study
 from tests.study.conftest import BLIND, IDEAL, Here, Make
 
 
@@ -69,17 +68,6 @@ def test_own_latencies_may_be_limited_and_grow_with_the_scene() -> None:
     assert found == LimitedLatency(AgentsLatency(trace, 3_000), 10.0)
 
 
-def alone(make: Make, *conditions: Condition) -> Study:
-    """Give a study of the blind driver on one route; nothing is measured of it."""
-    return make(
-        variants=(BLIND,),
-        baseline="blind",
-        conditions=conditions,
-        timing=Timing(),
-        routes=(PARKED,),
-    )
-
-
 def test_every_option_reaches_the_drive(make: Make, tmp_path: Path) -> None:
     condition = Condition(
         "all", "fps:20", latency_model="fifo", limit_fps=8.0, dt_ms=25.0,
@@ -123,37 +111,6 @@ def test_a_mean_is_that_of_the_drive_that_it_names(make: Make, tmp_path: Path) -
     }
     assert len(set(taken["busy"])) > 1
     assert set(taken["even"]) == {round(fmean(taken["busy"]))}
-
-
-def test_conditions_of_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "study.toml"
-    path.write_text("""
-    title = "t"
-    baseline = "blind"
-    routes = 2
-    variant = [{name = "blind", policy = "blind"}]
-
-    [[condition]]
-    name = "clear"
-    latency = "fps:10"
-
-    [[condition]]
-    name = "fog"
-    latency = "fps:10"
-    weather = "fog_m=60"
-    against = "clear"
-
-    [[condition]]
-    name = "even"
-    mean_of = "blind.fog"
-    latency_model = "fifo"
-    """)
-
-    _, fog, even = load_study(path).conditions
-
-    assert fog == Condition("fog", "fps:10", weather="fog_m=60", against="clear")
-    assert even == Condition("even", mean_of="blind.fog", latency_model="fifo")
-    assert fog.described("here") == "fog: 10 decisions a second, weather fog_m=60"
 
 
 @pytest.mark.parametrize(

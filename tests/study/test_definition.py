@@ -19,6 +19,10 @@ from tests.study.conftest import IDEAL, Make
         ({"routes": ()}, "no route to drive"),
         ({"seed": -1}, "seed -1: must be 0 or more"),
         (
+            {"pairs": (("slow.ideal", "slow.fog"),)},
+            r"pair: 'slow.fog' is no VARIANT.CONDITION",
+        ),
+        (
             {"conditions": (Condition("device", "trace"),), "held_out": None},
             "condition device: the latency of slow is measured on held-out frames",
         ),

@@ -15,7 +15,7 @@ from me2e_compress.errors import (
 from me2e_compress.runtime.providers import CPU, CpuProvider
 from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.study import Condition, load_study
-from me2e_compress.study.study_blocks import FramesToRecord
+from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
 from me2e_compress.zoo.shipped import shipped
 from tests.cli.conftest import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED
@@ -69,6 +69,39 @@ def test_everything_that_a_file_says(models: Path) -> None:
     exact = recipe.load("exact")
     assert [len(variant.passes) for variant in study.variants] == [0, len(exact), 2]
     assert study.conditions == (Condition("ideal", "none"),)
+
+
+def test_conditions_blocks_and_pairs_of_a_file(models: Path) -> None:
+    parts = """
+    [[condition]]
+    name = "fog"
+    latency = "fps:10"
+    weather = "fog_m=60"
+    limit_fps = 5
+    against = "ideal"
+
+    [[condition]]
+    name = "even"
+    mean_of = "float.fog"
+    latency_model = "fifo"
+
+    [[block]]
+    name = "table-3"
+    variants = ["small"]
+    conditions = ["fog", "even"]
+
+    [[pair]]
+    of = "float.fog"
+    against = "small.ideal"
+    """
+    study = load_study(write(models, GOOD + parts))
+
+    _, fog, even = study.conditions
+    rest = {"limit_fps": 5.0, "against": "ideal"}
+    assert fog == Condition("fog", "fps:10", weather="fog_m=60", **rest)  # type: ignore[arg-type]
+    assert even == Condition("even", mean_of="float.fog", latency_model="fifo")
+    assert study.blocks == (StudyBlock("table-3", ("small",), ("fog", "even")),)
+    assert study.pairs == (("float.fog", "small.ideal"),)
 
 
 def test_files_lie_beside_the_study(models: Path, tmp_path: Path) -> None:
@@ -165,12 +198,6 @@ def test_routes_of_the_command_line_win(models: Path) -> None:
         ),
         ("[latency]", "[latency", StudyError, "not TOML"),
         ('"frames"', '"gone"', StudyError, r"^held_out: \S+/gone: no such folder"),
-        (
-            "routes = 3",
-            'routes = 3\nframes = "slow.onnx"',
-            StudyError,
-            r"^frames: \S+/slow\.onnx: no such folder",
-        ),
         (
             'recipe = "exact"',
             'recipe = "feature-ext"',

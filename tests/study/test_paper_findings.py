@@ -1,7 +1,6 @@
 """Tables, findings and page of the paper's study, from drives that nobody drove."""
 
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +11,9 @@ from me2e_compress.marks import is_marked
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study import load_study
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.paper.model_facts import Int8Counts, ModelFacts, weighed
+from me2e_compress.study.paper.paper_drives import Int8Counts, ModelFacts
 from me2e_compress.study.paper.paper_figures import safety
-from me2e_compress.study.paper.paper_page import paper_html
-from me2e_compress.study.paper.paper_result import PaperResult
+from me2e_compress.study.paper.paper_result import PaperResult, paper_page
 from me2e_compress.study.paper.paper_run import read_paper
 from me2e_compress.study.paper.questions import (
     Rule,
@@ -25,6 +23,7 @@ from me2e_compress.study.paper.questions import (
     rises,
     within,
 )
+from me2e_compress.study.paper.weigh import weighed
 from me2e_compress.study.report.style import styled, svg
 from me2e_compress.study.write import write_study
 from tests.study.paper_records import write_records
@@ -41,7 +40,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> PaperResult:
 
 @pytest.fixture(scope="module")
 def page(result: PaperResult) -> str:
-    return paper_html(result, ("me2e-compress", "study", "paper"))
+    return paper_page(result, ("me2e-compress", "study", "paper")).html()
 
 
 def test_all_files_say_that_we_wrote_them(result: PaperResult, tmp_path: Path) -> None:
@@ -50,9 +49,14 @@ def test_all_files_say_that_we_wrote_them(result: PaperResult, tmp_path: Path) -
         assert all(map(is_marked, vars(written).values()))
 
 
-def with_cells(
-    result: PaperResult, cells: Mapping[tuple[str, str], DriveRecord]
-) -> PaperResult:
+Cells = dict[tuple[str, str], DriveRecord]
+
+
+def cells_of(result: PaperResult) -> Cells:
+    return {(each.variant, each.condition): each for each in result.finished}
+
+
+def with_cells(result: PaperResult, cells: Cells) -> PaperResult:
     drives = (
         replace(each, variant=variant, condition=condition)
         for (variant, condition), each in cells.items()
@@ -61,7 +65,7 @@ def with_cells(
 
 
 def verdicts(result: PaperResult) -> dict[str, Verdict]:
-    return {each.question: each.verdict for each in result.findings}
+    return {each.asked.question: each.verdict for each in result.findings}
 
 
 @pytest.mark.parametrize(
@@ -99,8 +103,8 @@ def test_findings_follow_from_the_drives(result: PaperResult) -> None:
 
 
 def test_other_drives_turn_a_finding_round(result: PaperResult) -> None:
-    slow, ideal = result.cells["float", "fps-1"], result.cells["float", "ideal"]
-    turned = {**result.cells, ("float", "fps-1"): ideal, ("float", "ideal"): slow}
+    slow, ideal = result.drive("float", "fps-1"), result.drive("float", "ideal")
+    turned = {**cells_of(result), ("float", "fps-1"): ideal, ("float", "ideal"): slow}
 
     found = verdicts(with_cells(result, turned))
 
@@ -115,9 +119,9 @@ def test_what_spikes_cost_is_told_of_the_speed_that_it_is_asked_of(
     result: PaperResult, where: str, drive: str
 ) -> None:
     key = "optimizer", drive
-    record = result.cells[key]
+    record = result.drive(*key)
     worse = tuple(replace(each, driving_score=0.0) for each in record.routes)
-    cells = {**result.cells, key: replace(record, routes=worse)}
+    cells = {**cells_of(result), key: replace(record, routes=worse)}
 
     before, after = verdicts(result), verdicts(with_cells(result, cells))
 
@@ -127,31 +131,31 @@ def test_what_spikes_cost_is_told_of_the_speed_that_it_is_asked_of(
 
 
 def test_what_was_not_driven_is_not_tested_and_says_so(result: PaperResult) -> None:
-    cells = {key: each for key, each in result.cells.items() if key[0] != "minus-occ"}
+    cells = {
+        key: each for key, each in cells_of(result).items() if key[0] != "minus-occ"
+    }
     failed = DriveRecord("minus-occ", "device", reason="no memory")
     lacking = with_cells(result, cells)
     lacking = replace(lacking, drives=(*lacking.drives, failed))
 
-    found = {each.question: each for each in lacking.findings}
+    found = {each.asked.question: each for each in lacking.findings}
     finding = found["Without occupancy it drives better"]
 
     assert finding.verdict is Verdict.NOT_TESTED
-    assert finding.reason == "no memory"
-    assert finding.estimate is None
+    assert finding.estimate.measure == Measure(None, "points", "no memory")
 
 
 def test_a_drive_without_collisions_has_no_shares(result: PaperResult) -> None:
     key = "float", "device"
-    record = result.cells[key]
+    record = result.drive(*key)
     safe = tuple(replace(each, infractions=()) for each in record.routes)
-    cells = {**result.cells, key: replace(record, routes=safe)}
+    cells = {**cells_of(result), key: replace(record, routes=safe)}
 
-    question = "Without the map more of the collisions are with static things"
-    [finding] = [
-        each for each in with_cells(result, cells).findings if each.question == question
-    ]
+    found = {e.asked.question: e for e in with_cells(result, cells).findings}
+    [answer] = [each for name, each in found.items() if "static things" in name]
 
-    assert finding.reason == "a drive without a collision has no shares"
+    why = "a drive without a collision has no shares"
+    assert answer.estimate.measure.reason == why
 
 
 def test_rates_that_equation_4_makes_one_are_one_drive(result: PaperResult) -> None:
@@ -241,7 +245,7 @@ def test_the_page_holds_tables_figures_and_findings(
 def test_a_study_without_drives_has_a_page_too(result: PaperResult) -> None:
     empty = replace(result, drives=(), facts=())
 
-    page = paper_html(empty)
+    page = paper_page(empty).html()
 
     assert "<svg" not in page
     assert set(verdicts(empty).values()) == {Verdict.NOT_TESTED}
@@ -260,7 +264,7 @@ def test_the_same_records_give_the_same_figure(result: PaperResult) -> None:
 def test_a_record_is_read_as_it_was_written(
     result: PaperResult, tmp_path: Path
 ) -> None:
-    record = result.cells["minus-map", "device"]
+    record = result.drive("minus-map", "device")
     path = tmp_path / "one.jsonl"
     record.save(path)
 

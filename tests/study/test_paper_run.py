@@ -19,8 +19,7 @@ from me2e_compress.study import (
     run_study,
 )
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.paper.accident import Accident
-from me2e_compress.study.paper.accident_figure import plans_before
+from me2e_compress.study.paper.accident import Accident, plans_before
 from me2e_compress.study.paper.paper_result import PaperResult
 from me2e_compress.study.paper.paper_run import read_paper
 from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
@@ -96,33 +95,22 @@ def test_a_variant_that_fails_leaves_the_others(driven: Path) -> None:
 
     found = run_paper(ASKED, driven, Here(), listener)
 
-    assert set(found.cells) == {
-        ("blind", "ideal"),
-        ("blind", "slow"),
-        ("faster", "ideal"),
-    }
+    names = {each.name for each in found.finished}
+    assert names == {"blind.ideal", "blind.slow", "faster.ideal"}
     why = "variant broken: gone.onnx: no such model"
-    assert found.failures == {("broken", "ideal"): why}
+    assert found.drive("broken", "ideal").reason == why
     assert warned[0] == f"variant broken is left out: {why}"
     assert found.alerts() == (f"broken under ideal was left out: {why}",)
 
 
-def test_a_finished_cell_needs_no_frames_to_go_on(driven: Path) -> None:
-    engine = Here()
+def test_a_finished_cell_needs_no_frames_and_lands_nothing(driven: Path) -> None:
+    engine, landed = Here(), list[StudyResult]()
     before = run_paper(ASKED, driven, engine)
     for path in (driven / "results").glob("*/routes/*.json"):
         path.unlink()
 
-    assert run_paper(ASKED, driven, engine) == before
-    assert engine.driven == []
-
-
-def test_a_run_that_drives_nothing_lands_nothing_between(driven: Path) -> None:
-    landed = list[int]()
-
-    run_paper(ASKED, driven, Here(), on_block=lambda found: landed.append(1))
-
-    assert landed == []
+    assert run_paper(ASKED, driven, engine, on_block=landed.append) == before
+    assert (engine.driven, landed) == ([], [])
 
 
 def test_tables_follow_from_the_records_alone(driven: Path) -> None:
@@ -140,7 +128,9 @@ def test_a_record_of_another_evaluation_is_not_taken(driven: Path) -> None:
 
     found = run_paper(other, driven, Here())
 
-    assert "of another evaluation: its policy is" in found.failures["faster", "ideal"]
+    assert (
+        "of another evaluation: its policy is" in found.drive("faster", "ideal").reason
+    )
 
 
 def test_the_blocks_of_a_study_can_be_chosen() -> None:
@@ -255,7 +245,7 @@ def test_models_are_timed_and_weighed(models: Path, tmp_path: Path) -> None:
     assert min(fact.latency_us) <= 200_001 <= max(fact.latency_us) + 2
     assert fact.parameters is not None
     assert sum(map(len, fact.modules_us.values())) > 0
-    assert found.preview == " (preview: 1 of 220 routes)"
+    assert found.study.preview == " (preview: 1 of 220 routes)"
     assert all("preview" in table.title for table in found.tables())
 
 
@@ -274,8 +264,8 @@ def test_the_mean_of_a_drive_that_a_later_block_has(tmp_path: Path) -> None:
 
     found = run_paper(asked, tmp_path, Here())
 
-    assert not found.failures
-    assert found.cells["faster", "even"].mean_latency_us == 500_000
+    assert not found.alerts()
+    assert found.drive("faster", "even").mean_latency_us == 500_000
     assert held_frames(asked, even) == held_frames(asked, SLOW)
 
 

@@ -12,12 +12,11 @@ from me2e_compress.marks import IN_JSON, IN_MARKDOWN, is_marked
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.runtime.others_load import Load
 from me2e_compress.study import Condition, StudyResult
-from me2e_compress.study.all_tables import MOST_ROUTES, route_table
-from me2e_compress.study.report import html
+from me2e_compress.study.cells import MINUS
 from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import Point, forest, front, pareto
-from me2e_compress.study.report.findings import TIMES, findings, sure
-from me2e_compress.study.tables import MINUS
+from me2e_compress.study.report.study_page import TIMES, findings, study_page
+from me2e_compress.study.tables import MOST_ROUTES, route_table
 from me2e_compress.study.write import write_study
 from tests.study.conftest import IDEAL, ROUTES, SLOW
 
@@ -50,7 +49,7 @@ def test_a_front_is_what_no_other_beats(points: list[Point]) -> None:
 
 @pytest.fixture(scope="module")
 def page(found: StudyResult) -> str:
-    return html(found, ("me2e-compress", "study", "<s>.toml"))
+    return study_page(found, ("me2e-compress", "study", "<s>.toml")).html()
 
 
 def test_the_page_needs_nothing_beside_it(page: str) -> None:
@@ -85,7 +84,7 @@ def test_the_checkpoint_stands_where_a_variant_was_made(found: StudyResult) -> N
     first = dataclasses.replace(first, prepared=of_file)
     named = dataclasses.replace(found, variants=(first, *others))
 
-    assert "; weights: a.pth</code>" in html(named)
+    assert "; weights: a.pth</code>" in study_page(named).html()
 
 
 def test_every_section_is_there(page: str) -> None:
@@ -104,7 +103,7 @@ def test_every_section_is_there(page: str) -> None:
 
 
 def test_the_same_study_gives_the_same_page(found: StudyResult, page: str) -> None:
-    assert html(found, ("me2e-compress", "study", "<s>.toml")) == page
+    assert study_page(found, ("me2e-compress", "study", "<s>.toml")).html() == page
 
 
 def test_the_headline_says_what_so_few_routes_cannot_show(page: str) -> None:
@@ -119,9 +118,9 @@ def test_a_busy_machine_is_said_above_all(found: StudyResult) -> None:
     words = "the machine was busy: other processes took 1.3 of 2 cores"
 
     assert busy.alerts()[-1].startswith(words)
-    assert f'<p class="alert">{words}' in html(busy)
+    assert f'<p class="alert">{words}' in study_page(busy).html()
     assert idle.alerts() == dataclasses.replace(found, load=None).alerts()
-    assert "timed, other processes took 0.1 of 2 cores" in html(idle)
+    assert "timed, other processes took 0.1 of 2 cores" in study_page(idle).html()
 
 
 def test_each_route_has_its_end(found: StudyResult) -> None:
@@ -171,7 +170,7 @@ def test_a_curve_needs_three_conditions(found: StudyResult) -> None:
 
 
 def test_findings_give_costs_and_what_is_sure(found: StudyResult) -> None:
-    told = {each.variant: each.text for each in findings(found)}
+    told = dict(findings(found))
 
     assert list(told) == ["blind", "again", "fast"]
     assert told["again"].startswith(f"1.00 {TIMES} the size, ")
@@ -187,7 +186,7 @@ def test_findings_give_costs_and_what_is_sure(found: StudyResult) -> None:
 def test_what_is_shown_as_zero_is_no_difference(
     low: float, high: float, sign: int
 ) -> None:
-    assert sure(Estimate(Measure(low, "points"), low, high, 9)) == sign
+    assert Estimate(Measure(low, "points"), low, high, 9).sign == sign
 
 
 def test_files_are_written_beside_each_other(

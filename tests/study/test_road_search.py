@@ -135,7 +135,7 @@ def test_the_best_on_the_road_is_the_recipe(found: Found) -> None:
 
     (ablate,) = (each for each in recipe.load(result.output) if not each.exact)
     assert ablate.name == "ablate-modules"
-    assert result.winner.name == "without-occ"
+    assert result.winner == "without-occ"
     assert result.difference.better == len(ROUTES)
     assert result.worse_by_at_most == pytest.approx(27.1, abs=0.05)
     assert re.match(
@@ -174,9 +174,7 @@ def test_the_tables_tell_what_became_of_every_scheme(found: Found) -> None:
     result, _, _ = found
     grid, rungs = result.tables()
 
-    assert [row[0].text for row in grid.rows] == ["float, as it is"] + [
-        each.name for each in result.schemes
-    ]
+    assert [row[0].text for row in grid.rows] == ["float, as it is", *result.grid]
     fates = {row[0].text: row[-1].text for row in grid.rows}
     assert fates["without-occ"] == "this one"
     assert fates["without-map"].startswith("dropped after 2 routes, -40.0")
@@ -217,6 +215,5 @@ def test_a_scheme_that_cannot_be_made_is_reported_and_the_rest_goes_on(
 
     result = search(model, both, Scripted(), [])
 
-    fates = {each.name: each.refused for each in result.schemes}
-    assert "no-such-rules" in fates["int8-backbone"]
-    assert result.winner.name == "without-occ"
+    assert "no-such-rules" in result.refused("int8-backbone")
+    assert result.winner == "without-occ"

@@ -138,7 +138,7 @@ def test_a_picture_shows_where_two_drives_part(found: StudyResult) -> None:
     assert here == max(gaps)
     assert contrast.picture.read_bytes().startswith(b"\x89PNG")
     longest = max(contrast.route.duration_us, contrast.other.duration_us)
-    assert 0 < contrast.time_us <= longest
+    assert 0 < contrast.moment_us <= longest
 
 
 def test_the_same_seed_gives_the_same_bytes(

@@ -4,16 +4,18 @@ import pytest
 
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study import StudyResult
-from me2e_compress.study.all_tables import all_tables, near_misses
-from me2e_compress.study.tables import (
+from me2e_compress.study.cells import (
     INFINITE,
     MINUS,
     MISSING,
-    abilities,
-    differences,
     estimate_cell,
     measure_cell,
     number,
+)
+from me2e_compress.study.tables import (
+    abilities,
+    differences,
+    near_misses,
     scoreboards,
 )
 from me2e_compress.workflows.result import Cell, Table
@@ -105,7 +107,7 @@ def test_one_variant_has_one_scoreboard_of_its_conditions(found: StudyResult) ->
     assert table.columns == ("condition", "DS", "SR %", "DE %", "DC")
     assert [row[0].text for row in mastered.rows] == ["ideal", "slow"]
     assert [row[0].text for row in table.rows] == ["ideal", "slow"]
-    assert "Difference" not in "".join(each.title for each in all_tables(alone))
+    assert "Difference" not in "".join(each.title for each in alone.tables())
 
 
 def test_markdown() -> None:

@@ -90,8 +90,12 @@ def test_each_variant_pays_its_own_latency(ours: Study, tmp_path: Path) -> None:
 def test_what_was_measured_is_kept(
     ours: Study, paced: list[list[str]], tmp_path: Path
 ) -> None:
+    assert ours.held_out is not None
+
     assert clock_of(ours, tmp_path) == clock_of(ours, tmp_path)
     assert len(paced) == 1
+    kept = LatencyTrace.load(tmp_path / "traces" / "fast.json")
+    assert kept.frames == CalibrationSet(ours.held_out).fingerprint
 
 
 def test_a_model_that_joins_later_is_put_on_the_scale_of_the_others(
@@ -133,37 +137,20 @@ def test_a_trace_of_something_else_is_measured_again(
     assert warnings == [f"{stale}: of {words}: measured again"]
 
 
-def test_a_study_that_asks_for_fewer_samples_takes_those_that_are_kept(
-    ours: Study, paced: list[list[str]], tmp_path: Path
+@pytest.mark.parametrize(("change", "days"), [({"samples": 3}, 1), ({"threads": 2}, 2)])
+def test_fewer_samples_take_what_is_kept_and_more_threads_do_not(
+    ours: Study,
+    paced: list[list[str]],
+    tmp_path: Path,
+    change: dict[str, int],
+    days: int,
 ) -> None:
-    fewer = replace(ours, timing=replace(ours.timing, samples=3))
-
     kept = clock_of(ours, tmp_path)
 
-    assert clock_of(fewer, tmp_path) == kept
-    assert len(paced) == 1
+    again = clock_of(replace(ours, timing=replace(ours.timing, **change)), tmp_path)
 
-
-def test_more_threads_are_measured_again(
-    ours: Study, paced: list[list[str]], tmp_path: Path
-) -> None:
-    clock_of(ours, tmp_path)
-
-    clock_of(replace(ours, timing=replace(ours.timing, threads=2)), tmp_path)
-
-    assert len(paced) == 2
-
-
-def test_a_trace_says_what_frames_it_is_of(
-    ours: Study, paced: list[list[str]], tmp_path: Path
-) -> None:
-    assert ours.held_out is not None
-
-    clock_of(ours, tmp_path)
-
-    kept = LatencyTrace.load(tmp_path / "traces" / "fast.json")
-    assert kept.frames == CalibrationSet(ours.held_out).fingerprint
-    assert len(paced) == 1
+    assert len(paced) == days
+    assert (again == kept) is (days == 1)
 
 
 def test_a_trace_from_before_frames_were_named_is_kept(

@@ -12,11 +12,11 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
+from benchmarks.plan_reaction import plan_reaction
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.fidelity.compare import Reference
-from me2e_compress.fidelity.reaction import plan_reaction
 from me2e_compress.graph import provenance
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context

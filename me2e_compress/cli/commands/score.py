@@ -7,9 +7,9 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
-from me2e_compress.metrics.ability_rules import Rules
+from me2e_compress.metrics.abilities import Rules
 from me2e_compress.metrics.deadlines import BUDGET_MS
-from me2e_compress.metrics.penalties import Version
+from me2e_compress.metrics.leaderboard_scores import Version
 from me2e_compress.workflows import score as workflow
 from me2e_compress.workflows.score_bench2drive import Bench2DriveOptions
 from me2e_compress.workflows.score_eer import EerOptions, joules_named

@@ -55,7 +55,7 @@ def study(
     # takes highway-env and matplotlib two seconds to import
     from me2e_compress.evaluators.highway.evaluation_options import engine_of
     from me2e_compress.study import load_study, study_path
-    from me2e_compress.study.reported import run_and_report
+    from me2e_compress.study.run import run_and_report
     from me2e_compress.study.workload import workload
     from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
     from me2e_compress.workflows.checks import check_folder

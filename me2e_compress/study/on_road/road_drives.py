@@ -11,13 +11,14 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.engine import Engine
 from me2e_compress.metrics.differences import PairedDifference, difference
-from me2e_compress.metrics.driving_score import route_score
-from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.route_summary import RouteSummary
+from me2e_compress.metrics.route_values import DS
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study.definition import Study
+from me2e_compress.study.drive_record import first_difference
 from me2e_compress.study.drives import DriveSetup
-from me2e_compress.study.on_road.limits import Weighed
+from me2e_compress.study.on_road.road_options import Weighed
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
 from me2e_compress.study.timing import time_all
 from me2e_compress.study.workspace import Workspace
@@ -46,33 +47,27 @@ class RoadDrives:
 
     def same_as(self, name: str) -> str:
         """Return the first scheme with the same file; empty for the first itself."""
-        first = self.prepared[name].variant.name
-        return "" if first == name else first
+        first = self.prepared.get(name)
+        return "" if first is None or first.variant.name == name else first.variant.name
 
-    def episodes(self, name: str, routes: Sequence[Route]) -> tuple[Episode, ...]:
+    def driven(self, name: str, routes: Sequence[Route]) -> list[RouteSummary]:
         """Drive what is missing of some routes; return them in order."""
         (condition,) = self.study.conditions
-        return self.setup.some(self.prepared[name], condition, routes)
+        episodes = self.setup.some(self.prepared[name], condition, routes)
+        return [RouteSummary.of(each) for each in episodes]
 
     def differ(self, name: str, routes: Sequence[Route]) -> list[float]:
         """Return the driving score minus the float model's, in points, by route."""
         if self.prepared[name].variant.name == self.study.baseline:
             return [0.0] * len(routes)
-        pairs = zip(
-            self.episodes(name, routes),
-            self.episodes(self.study.baseline, routes),
-            strict=True,
-        )
-        return [
-            route_score(one).composed - route_score(other).composed
-            for one, other in pairs
-        ]
+        ours, theirs = (self.driven(e, routes) for e in (name, self.study.baseline))
+        return list((DS.values(ours) - DS.values(theirs)).by_route.values())
 
     def difference(self, name: str) -> PairedDifference:
         """Return the difference from the float model over all routes."""
         routes, baseline = self.study.routes, self.study.baseline
-        ours, others = (self.episodes(each, routes) for each in (name, baseline))
-        return difference(ours, others, self.study.seed)
+        ours, theirs = (self.driven(each, routes) for each in (name, baseline))
+        return difference(ours, theirs, self.study.seed)
 
 
 def make_drives(
@@ -140,7 +135,7 @@ def _claim(study: Study, folder: Path) -> None:
     """Write what decides the drives, or check that an existing folder agrees."""
     # an empty folder is claimed, any other one must match
     asked, path = _decisive(study), folder / ASKED
-    try:
+    with documents.reading(path, StudyError, "not JSON"):
         folder.mkdir(parents=True, exist_ok=True)
         if not path.exists():
             if any(not each.name.startswith(".") for each in folder.iterdir()):
@@ -148,19 +143,10 @@ def _claim(study: Study, folder: Path) -> None:
             write_json(path, asked, indent=1)
             return
         before = documents.from_json(documents.content(path))
-    except OSError as error:
-        raise StudyError(f"{path}: {error.strerror}") from error
-    except documents.MalformedError as error:
-        raise StudyError(f"{path}: not JSON: {error}") from error
     # what decides the drives must be the same
     before = before if isinstance(before, dict) else {}
-    for key, value in asked.items():
-        if before.get(key) != value:
-            old, new = (str(each)[:60] for each in (before.get(key), value))
-            raise StudyError(
-                f"{folder}: of another search: its {key} is {old}, this one's {new};"
-                " choose another folder"
-            )
+    if other := first_difference(before, asked):
+        raise StudyError(f"{folder}: of another search: {other}; choose another folder")
 
 
 def _decisive(study: Study) -> dict[str, Any]:

@@ -1,16 +1,15 @@
 """Result of a search on the road: one scheme, and how certain it is."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from me2e_compress.metrics.differences import PairedDifference
-from me2e_compress.study.condition import Condition
 from me2e_compress.study.on_road.grid import GridPoint
 from me2e_compress.study.on_road.halving import Rung, Standing
-from me2e_compress.study.on_road.limits import Weighed
-from me2e_compress.workflows.budgets import Joules
+from me2e_compress.study.on_road.road_drives import RoadDrives
+from me2e_compress.study.on_road.road_options import Limits, Weighed
 from me2e_compress.workflows.result import (
     Result,
     Table,
@@ -21,49 +20,50 @@ from me2e_compress.workflows.result import (
 )
 
 
-@dataclass(frozen=True)
-class Scheme:
-    """One assignment, apart from how it drives.
-
-    It has no costs if it could not be made; ``refused`` says why it did not drive, and
-    ``same_as`` names a scheme with a byte-identical file, if there is one.
-    """
-
-    name: str
-    point: GridPoint
-    weighed: Weighed | None
-    refused: str
-    same_as: str
-
-
 @dataclass(frozen=True, repr=False)
 class RoadSearchResult(Result):
     """The scheme to ship, and everything that it was chosen by.
 
     Attributes:
         output: The recipe that was written.
+        grid: The schemes by name.
+        made: Their files, with what they cost.
         difference: The winner minus the float model, over all routes.
-        device_scale: How many times slower the device is than this machine.
-        coverage: Routes that were driven, and those of the whole set.
-        spent: Share of each budget that the winner uses, in words.
     """
 
     output: Path
-    schemes: tuple[Scheme, ...]
-    float_costs: Weighed
+    limits: Limits
+    grid: Mapping[str, GridPoint]
+    made: RoadDrives
     rungs: tuple[Rung, ...]
     difference: PairedDifference
-    joules: Joules
-    condition: Condition
-    device_scale: float
-    coverage: tuple[int, int]
-    spent: str
 
     @property
-    def winner(self) -> Scheme:
+    def winner(self) -> str:
         """The scheme that the recipe makes."""
-        name = self.rungs[-1].standings[0].name
-        return next(each for each in self.schemes if each.name == name)
+        return self.rungs[-1].standings[0].name
+
+    @property
+    def coverage(self) -> tuple[int, int]:
+        """Routes that were driven, and those of the whole set."""
+        return len(self.made.study.routes), self.made.study.set_size
+
+    @property
+    def device_scale(self) -> float:
+        """How many times slower the device is than this machine."""
+        return self.made.setup.clock.scale
+
+    def refused(self, scheme: str) -> str:
+        """Say why a scheme did not drive; empty if it might have."""
+        made = self.made
+        if scheme in made.failures:
+            return f"not made: {made.failures[scheme]}"
+        if self.limits.spent(made.weighed[scheme]) <= 1:
+            return ""
+        return f"over budget: {self._spent(scheme)}"
+
+    def _spent(self, scheme: str) -> str:
+        return self.limits.words(self.made.weighed[scheme], self.made.joules)
 
     @property
     def worse_by_at_most(self) -> float | None:
@@ -76,7 +76,7 @@ class RoadSearchResult(Result):
         """The scheme, and how much worse than float it may be."""
         score, routes = self.difference.driving_score, self.coverage[0]
         mean, most = score.value or 0.0, self.worse_by_at_most
-        said = f"this one: {self.winner.name} ({number(mean, '+.1f')} DS); on"
+        said = f"this one: {self.winner} ({number(mean, '+.1f')} DS); on"
         said += f" {counted(routes, 'route')}"
         if most is None:
             return f"{said} there is no interval: too few routes"
@@ -92,7 +92,7 @@ class RoadSearchResult(Result):
     def lines(self) -> tuple[str, ...]:
         """Return the answer, and what it holds for."""
         chosen = len(self.rungs[-1].standings)
-        lines = [self.headline, f"budgets: {self.spent}"]
+        lines = [self.headline, f"budgets: {self._spent(self.winner)}"]
         if chosen > 1:
             lines.append(
                 f"chosen as the best of {chosen} on these routes: others may show"
@@ -100,7 +100,7 @@ class RoadSearchResult(Result):
             )
         if self.coverage[0] < self.coverage[1]:
             lines.append("a preview: {} of {} routes".format(*self.coverage))
-        return (*lines, f"{self.output}: {self.winner.name}")
+        return (*lines, f"{self.output}: {self.winner}")
 
     def tables(self) -> tuple[Table, ...]:
         """Return the grid with its costs, and the rungs."""
@@ -110,74 +110,80 @@ class RoadSearchResult(Result):
         """Return one row per scheme."""
         return [
             {
-                "scheme": each.name,
-                "int8": each.point.int8,
-                "ablated": each.point.ablated,
-                **(asdict(each.weighed) if each.weighed else {}),
-                "refused": each.refused or None,
-                "routes": max((rung.routes for rung, _ in self._of(each)), default=0),
-                "difference": self._last(each),
+                "scheme": name,
+                "int8": point.int8,
+                "ablated": point.ablated,
+                **(self._costs_json(name) or {}),
+                "refused": self.refused(name) or None,
+                "routes": max((rung.routes for rung, _ in self._of(name)), default=0),
+                "difference": self._last(name),
             }
-            for each in self.schemes
+            for name, point in self.grid.items()
         ]
 
     def to_json(self) -> dict[str, Any]:
         """Return the whole search as JSON."""
         return {
-            "winner": self.winner.name,
+            "winner": self.winner,
             "recipe": str(self.output),
             "difference": self.difference.to_json(),
             "worse_by_at_most": self.worse_by_at_most,
             "routes": dict(zip(("driven", "set"), self.coverage, strict=True)),
-            "condition": self.condition.to_json(),
+            "condition": self.made.study.conditions[0].to_json(),
             "latency": {"device_scale": self.device_scale},
-            "joules": self.joules,
-            "float": asdict(self.float_costs),
-            "schemes": [self._scheme_json(each) for each in self.schemes],
+            "joules": self.made.joules,
+            "float": self._costs_json(self.made.study.baseline),
+            "schemes": [self._scheme_json(each) for each in self.grid],
             "rungs": [asdict(each) for each in self.rungs],
         }
 
-    def _scheme_json(self, scheme: Scheme) -> dict[str, Any]:
+    def _scheme_json(self, scheme: str) -> dict[str, Any]:
         return {
-            "name": scheme.name,
-            "int8": list(scheme.point.int8),
-            "ablated": list(scheme.point.ablated),
-            "costs": asdict(scheme.weighed) if scheme.weighed else None,
-            "refused": scheme.refused or None,
-            "same_as": scheme.same_as or None,
+            "name": scheme,
+            "int8": list(self.grid[scheme].int8),
+            "ablated": list(self.grid[scheme].ablated),
+            "costs": self._costs_json(scheme),
+            "refused": self.refused(scheme) or None,
+            "same_as": self.made.same_as(scheme) or None,
         }
 
-    def _of(self, scheme: Scheme) -> Iterator[tuple[Rung, Standing]]:
+    def _costs_json(self, scheme: str) -> dict[str, float] | None:
+        weighed = self.made.weighed.get(scheme)
+        return None if weighed is None else asdict(weighed)
+
+    def _of(self, scheme: str) -> Iterator[tuple[Rung, Standing]]:
         """Yield the standings of a scheme, rung by rung."""
         for rung in self.rungs:
             for standing in rung.standings:
-                if standing.name == scheme.name:
+                if standing.name == scheme:
                     yield rung, standing
 
-    def _last(self, scheme: Scheme) -> float | None:
+    def _last(self, scheme: str) -> float | None:
         found = [standing.difference for _, standing in self._of(scheme)]
         return found[-1] if found else None
 
     def _grid(self) -> Table:
-        rows = [("float, as it is", *_costs(self.float_costs), "the reference")]
+        weighed, joules = self.made.weighed, self.made.joules
+        whole = weighed[self.made.study.baseline]
+        rows = [("float, as it is", *_costs(whole), "the reference")]
         rows += [
-            (each.name, *_costs(each.weighed), self._fate(each))
-            for each in self.schemes
+            (name, *_costs(weighed.get(name)), self._fate(name)) for name in self.grid
         ]
-        kind = "measured" if self.joules == "J" else "by published figures"
+        kind = "measured" if joules == "J" else "by published figures"
         note = (
             f"MB of weights; ms: median of a decision, {self.device_scale:.3g} times as"
             f" on this machine; joules a frame {kind}"
         )
-        columns = ("scheme", "MB", "ms", self.joules, "outcome")
+        columns = ("scheme", "MB", "ms", joules, "outcome")
         return table("Schemes", columns, rows, note)
 
-    def _fate(self, scheme: Scheme) -> str:
-        if scheme.refused:
-            return scheme.refused
+    def _fate(self, scheme: str) -> str:
+        if refused := self.refused(scheme):
+            return refused
         stood = list(self._of(scheme))
         if not stood:
-            return f"the same file as {scheme.same_as}" if scheme.same_as else ""
+            same = self.made.same_as(scheme)
+            return f"the same file as {same}" if same else ""
         rung, standing = stood[-1]
         routes = counted(rung.routes, "route")
         if rung is self.rungs[-1]:
@@ -196,11 +202,10 @@ class RoadSearchResult(Result):
             for rung in self.rungs
         ]
         columns = ("routes", "schemes", "kept", "best", "last that was kept")
-        note = f"points of driving score against float, paired; {self._conditions()}"
+        device = f"{self.device_scale:.3g} times as here"
+        condition = self.made.study.conditions[0].described(device)
+        note = f"points of driving score against float, paired; {condition}"
         return table("Rungs", columns, rows, note)
-
-    def _conditions(self) -> str:
-        return self.condition.described(f"{self.device_scale:.3g} times as here")
 
 
 def _costs(weighed: Weighed | None) -> tuple[str, str, str]:

@@ -17,7 +17,7 @@ from me2e_compress.study.on_road.grid import GridModules, GridPoint
 from me2e_compress.study.on_road.halving import Rung, drives, halve, stratified
 from me2e_compress.study.on_road.road_drives import RoadDrives, make_drives
 from me2e_compress.study.on_road.road_options import RoadSearchOptions
-from me2e_compress.study.on_road.road_result import RoadSearchResult, Scheme
+from me2e_compress.study.on_road.road_result import RoadSearchResult
 from me2e_compress.study.workload import workload
 from me2e_compress.workflows.budgets import joules_here
 from me2e_compress.workflows.checks import check_folder, load_map, model_path
@@ -83,16 +83,7 @@ def search_on_road(
         )
         write_bytes(recipe_file, text.encode())
     return RoadSearchResult(
-        recipe_file,
-        tuple(_scheme(name, point, made, options) for name, point in grid.items()),
-        made.weighed[BASELINE],
-        rungs,
-        made.difference(winner),
-        made.joules,
-        study.conditions[0],
-        made.setup.clock.scale,
-        (len(study.routes), study.set_size),
-        options.limits.words(made.weighed[winner], made.joules),
+        recipe_file, options.limits, grid, made, rungs, made.difference(winner)
     )
 
 
@@ -191,14 +182,3 @@ def climbed(
 
     routes = made.study.routes
     return halve(fitting, routes, options.first_rung, made.differ, told)
-
-
-def _scheme(
-    name: str, point: GridPoint, made: RoadDrives, options: RoadSearchOptions
-) -> Scheme:
-    if name in made.failures:
-        return Scheme(name, point, None, f"not made: {made.failures[name]}", "")
-    weighed, same = made.weighed[name], made.same_as(name)
-    limits = options.limits
-    over = "" if limits.spent(weighed) <= 1 else limits.words(weighed, made.joules)
-    return Scheme(name, point, weighed, over and f"over budget: {over}", same)

@@ -1,24 +1,32 @@
 """A driver's successive plans before its own accident (the paper's figure 6)."""
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
+import numpy.typing as npt
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from pydantic import ConfigDict, TypeAdapter, with_config
 
 from me2e_compress import documents
 from me2e_compress.errors import StudyError
-from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.infraction import COLLISIONS, InfractionKind
+from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Actor, Ego
 from me2e_compress.simulator.world import World
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.route_summary import RouteSummary
+from me2e_compress.study.report.figures import WIDTH_IN
+from me2e_compress.study.report.style import MUTED, RULE, styled
+from me2e_compress.study.side_by_side import watch
 
 FILE = "accident.json"
 BEFORE_US, EVERY_US = 3_000_000, 500_000
@@ -26,8 +34,12 @@ BEFORE_US, EVERY_US = 3_000_000, 500_000
 NEAR_M = 40.0
 """Road users no farther than this are kept."""
 
+MARGIN_M = 8.0
+"""Around what the figure shows."""
+
 _STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
 Point = tuple[float, float]
+Floats = npt.NDArray[np.float64]
 
 
 @with_config(_STRICT)
@@ -77,14 +89,9 @@ class Accident:
     @classmethod
     def load(cls, path: Path) -> "Accident":
         """Read a file that `save` wrote."""
-        try:
+        with documents.reading(path, StudyError, "not an accident"):
             content = documents.from_json(documents.content(path))
             return _ACCIDENT.validate_python(content)
-        except OSError as error:
-            raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
-        except (ValueError, ValidationError) as error:
-            words = " ".join(str(error).split())[:200]
-            raise StudyError(f"{path}: not an accident: {words}") from error
 
 
 _ACCIDENT = TypeAdapter(Accident)
@@ -104,8 +111,12 @@ def watched(
     record: DriveRecord, happened: RouteSummary, route: Route, job: Job
 ) -> Accident:
     """Drive the route of an accident again, and keep its last seconds."""
-    film = _LastSeconds(happened.duration_us - BEFORE_US)
-    drive(route, job.driver.open(), job.conditions, Listeners(on_moment=film.see))
+    from_us = happened.duration_us - BEFORE_US
+    moments = (
+        _planned(each)
+        for each in watch(job, route, happened.duration_us)
+        if (since_us := each.scene.time_us - from_us) >= 0 and not since_us % EVERY_US
+    )
     partner = next(who for kind, _, who in happened.infractions if kind in COLLISIONS)
     points = World(route).path.points
     return Accident(
@@ -115,21 +126,8 @@ def watched(
         route.scenario,
         partner,
         tuple((float(x), float(y)) for x, y in points),
-        tuple(film.kept),
+        tuple(moments),
     )
-
-
-@dataclass
-class _LastSeconds:
-    """Keeps two moments per second, counted back from the end, and the last one."""
-
-    from_us: int
-    kept: list[PlannedMoment] = field(default_factory=list)
-
-    def see(self, moment: Moment) -> None:
-        since_us = moment.scene.time_us - self.from_us
-        if since_us >= 0 and since_us % EVERY_US == 0:
-            self.kept.append(_planned(moment))
 
 
 def _planned(moment: Moment) -> PlannedMoment:
@@ -158,3 +156,96 @@ def _in_world(
     cos, sin = math.cos(heading), math.sin(heading)
     turned = np.asarray(plan) @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
     return tuple((round(float(a), 3), round(float(b), 3)) for a, b in turned)
+
+
+def plans_before(accident: Accident) -> Figure:
+    """Draw all moments in the frame of the ego at the last one, later ones darker."""
+    with styled():
+        # the road, in the ego's frame at the collision
+        figure = Figure(figsize=(WIDTH_IN, 3.6), layout="constrained")
+        axes = figure.subplots()
+        here = accident.moments[-1].ego
+        axes.plot(
+            *_seen(accident.path, here).T,
+            color=RULE,
+            linewidth=9,
+            solid_capstyle="round",
+            zorder=0,
+        )
+        # later moments are darker
+        shades = colormaps["viridis_r"](np.linspace(0.1, 1.0, len(accident.moments)))
+        last_us = accident.moments[-1].time_us
+        for moment, shade in zip(accident.moments, shades, strict=True):
+            _moment(axes, moment, here, shade, moment.time_us - last_us)
+        _frame(axes, accident.moments, here)
+        # legend beside the plot, title above
+        axes.legend(
+            frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5)
+        )
+        axes.set_title(
+            f"{accident.variant}, {accident.condition}, {accident.route}: plans before"
+            f" the collision with {accident.partner}",
+            color=MUTED,
+        )
+        axes.set_xlabel("metres ahead of where it hit")
+        return figure
+
+
+def _moment(
+    axes: Axes,
+    moment: PlannedMoment,
+    here: SeenBox,
+    shade: Sequence[float],
+    until_us: int,
+) -> None:
+    colour = tuple(shade)
+    _draw(axes, moment.ego, here, colour, filled=True)
+    for other in moment.others:
+        _draw(axes, other, here, colour, filled=False)
+    if moment.plan:
+        start = _seen([(moment.ego.x, moment.ego.y), *moment.plan], here)
+        axes.plot(
+            *start.T,
+            "o-",
+            color=colour,
+            markersize=3,
+            linewidth=1.3,
+            label=f"{until_us / 1e6:+.1f} s" if until_us else "collision",
+        )
+
+
+def _draw(
+    axes: Axes, box: SeenBox, here: SeenBox, colour: tuple[float, ...], *, filled: bool
+) -> None:
+    cos, sin = math.cos(box.heading), math.sin(box.heading)
+    half = np.array([box.length, box.width]) / 2
+    signs = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])
+    corners = (signs * half) @ np.array([[cos, sin], [-sin, cos]]) + (box.x, box.y)
+    axes.add_patch(
+        Polygon(
+            _seen(corners, here),
+            closed=True,
+            facecolor=(*colour[:3], 0.25) if filled else "none",
+            edgecolor=colour if filled else (*colour[:3], 0.7),
+            linewidth=1.2 if filled else 0.9,
+            linestyle="-" if filled else ":",
+        )
+    )
+
+
+def _seen(points: npt.ArrayLike, here: SeenBox) -> Floats:
+    """Convert points from the world to a box's frame, x forward, y left."""
+    cos, sin = math.cos(here.heading), math.sin(here.heading)
+    moved = np.asarray(points, np.float64) - (here.x, here.y)
+    return np.asarray(moved @ np.array([[cos, -sin], [sin, cos]]))
+
+
+def _frame(axes: Axes, moments: Sequence[PlannedMoment], here: SeenBox) -> None:
+    """Limit the view to the ego's way and plans, with a margin."""
+    driven = [(moment.ego.x, moment.ego.y) for moment in moments]
+    planned = [point for moment in moments for point in moment.plan]
+    points = _seen([*driven, *planned], here)
+    low, high = points.min(axis=0) - MARGIN_M, points.max(axis=0) + MARGIN_M
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal")

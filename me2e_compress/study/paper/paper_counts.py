@@ -3,11 +3,9 @@
 from collections import Counter
 
 from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.paper.model_facts import SCHEMES, ModelFacts
-from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.study.paper.published import INT8_COUNTS, PublishedInt8
-from me2e_compress.study.tables import MISSING
+from me2e_compress.study.cells import MISSING
+from me2e_compress.study.paper.paper_drives import SCHEMES, ModelFacts, PaperDrives
+from me2e_compress.study.paper.published import INT8_COUNTS
 from me2e_compress.workflows.result import Cell, Table
 
 PARTNERS = (
@@ -31,7 +29,7 @@ def table_4(result: PaperDrives) -> Table:
             _row(result.fact(f"{stack} {scheme}"), scheme, paper) for scheme in SCHEMES
         ]
     return Table(
-        f"Table 4: what is int8{result.preview}",
+        f"Table 4: what is int8{result.study.preview}",
         ("file", *COUNTS, "paper's stack", *(f"paper's {each}" for each in COUNTS)),
         tuple(rows),
         "Tensors: activations that are quantized; int8 operators: layers, attention"
@@ -47,54 +45,44 @@ def table_4(result: PaperDrives) -> Table:
 
 
 def _row(fact: ModelFacts, scheme: str, stack: str) -> tuple[Cell, ...]:
-    int8, given = fact.int8, INT8_COUNTS[stack, scheme]
-    why = fact.failure or "not weighed"
-    if fact.size_bytes is not None:
-        why = "nothing of it is int8"
-    counts = [Cell(MISSING, reason=why)] * 3
-    if int8 is not None:
-        each = int8.tensors, int8.operators, int8.compute_intensive
-        counts = [Cell(str(count)) for count in each]
-    size = Cell(MISSING, reason=why)
-    if fact.size_bytes is not None:
-        size = Cell(f"{fact.size_bytes / 1e6:.2f}")
-    return Cell(fact.variant), *counts, size, Cell(stack), *_given(given)
-
-
-def _given(row: PublishedInt8) -> tuple[Cell, ...]:
-    counts = row.tensors, row.operators, row.compute_intensive
-    texts = ["" if each is None else str(each) for each in counts]
-    return (*map(Cell, texts), Cell(f"{row.megabytes:.2f}"))
+    # what is counted here
+    why, size = fact.failure or "not weighed", fact.size_bytes
+    shown = Cell(MISSING, reason=why) if size is None else Cell(f"{size / 1e6:.2f}")
+    counts = [
+        Cell(MISSING, reason=why if size is None else "nothing of it is int8")
+    ] * 3
+    if fact.int8 is not None:
+        counts = [Cell(str(count)) for count in vars(fact.int8).values()]
+    # what the paper counted
+    *theirs, megabytes = vars(INT8_COUNTS[stack, scheme]).values()
+    given = [Cell("" if each is None else str(each)) for each in theirs]
+    cells = [Cell(fact.variant), *counts, shown, Cell(stack), *given]
+    return *cells, Cell(f"{megabytes:.2f}")
 
 
 def partners(result: PaperDrives) -> Table:
     """Show what was hit, as shares of the collisions."""
     # shares of each kind of partner, by drive
     rows = []
-    for (variant, condition), cell in result.cells.items():
-        found = collisions(cell)
-        total = sum(found.values())
+    for each in result.finished:
+        found = Counter(kind for route in each.routes for kind, _ in route.collisions)
+        total = found.total()
         rows.append(
             (
-                Cell(variant),
-                Cell(condition),
+                Cell(each.variant),
+                Cell(each.condition),
                 Cell(str(total)),
                 *(_share(found[kind], total) for kind in PARTNERS),
             )
         )
     return Table(
-        f"Collisions by partner{result.preview}",
+        f"Collisions by partner{result.study.preview}",
         ("variant", "condition", "collisions", "vehicle", "pedestrian", "static"),
         tuple(rows),
         "Share of all collisions, and their number. The paper: 55 % with static"
         " structures where seg is away (schemes 2 and 6).",
         words=2,
     )
-
-
-def collisions(cell: DriveRecord) -> Counter[str]:
-    """Count collisions by kind."""
-    return Counter(kind for route in cell.routes for kind, _ in route.collisions)
 
 
 def _share(count: int, total: int) -> Cell:

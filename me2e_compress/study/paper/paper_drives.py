@@ -1,21 +1,136 @@
-"""Drives of the paper's study so far, apart from what they say about its findings."""
+"""The paper's drives so far, and facts of the files that drove."""
 
-import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
+import numpy as np
+from pydantic import ConfigDict, TypeAdapter, with_config
+
+from me2e_compress import documents
+from me2e_compress.errors import StudyError
+from me2e_compress.runtime.atomic import write_json
+from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome
 from me2e_compress.study.paper.accident import Accident
-from me2e_compress.study.paper.model_facts import ModelFacts
 
-CellKey = tuple[str, str]
-"""A variant and a condition, by their names."""
+FILE = "variants.json"
+SCHEMES = ("exact", "prediction", "feature-ext", "full")
+"""Rows of table 4."""
+
+_STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True)
+class Int8Counts:
+    """Counts of the int8 part of a graph.
+
+    ``tensors`` are activations with a scale of their own (nodes that quantize),
+    ``operators`` are nodes that read int8: layers, attention products, residual Adds.
+    Those that are convolutions or matrix products are ``compute_intensive``.
+    """
+
+    tensors: int
+    operators: int
+    compute_intensive: int
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True)
+class ModelFacts:
+    """A variant's file.
+
+    Attributes:
+        pipeline: The passes that made it, as text.
+        size_bytes: Size of the file with its weights.
+        macs: Multiply-accumulates of one inference.
+        int8: None for a file without a plan.
+        latency_us: Latencies of inferences alone, warm, on the target device.
+        modules_us: Latencies by module under a profiler, on the target device.
+        modelled_j: Joules per frame from published energies of MACs and bytes.
+        joules: Measured joules per frame, and the ends of their 95 % interval; None
+            without a counter, and ``no_joules`` says why.
+        failure: Why there is no file that can drive; empty if there is one.
+    """
+
+    variant: str
+    sha256: str | None = None
+    pipeline: str = ""
+    size_bytes: int | None = None
+    parameters: int | None = None
+    macs: int | None = None
+    int8: Int8Counts | None = None
+    latency_us: tuple[int, ...] = ()
+    modules_us: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    modelled_j: float | None = None
+    joules: tuple[float, float, float] | None = None
+    no_joules: str = "not measured"
+    failure: str = ""
+
+    def latency_ms(self, percent: float) -> float | None:
+        """Return a percentile of the latencies; None if none were measured."""
+        if not self.latency_us:
+            return None
+        return float(np.percentile(self.latency_us, percent, method="higher")) / 1e3
+
+    @property
+    def fps(self) -> float | None:
+        """Inferences per second at the mean latency, as in the paper's FPS column."""
+        if not self.latency_us:
+            return None
+        return 1e6 / float(np.mean(self.latency_us))
+
+    @property
+    def of_another_stack(self) -> bool:
+        """Whether it serves table 4 only: a variant's name has no space."""
+        return " " in self.variant
+
+    def with_energy(self, found: EnergyResult) -> "ModelFacts":
+        """Return it with a counter's measurement, or why there is none."""
+        if found.j_per_frame is None:
+            return replace(self, no_joules=found.reason)
+        low, high = found.low or 0.0, found.high or found.j_per_frame
+        return replace(self, joules=(found.j_per_frame, low, high), no_joules="")
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True)
+class KeptFacts:
+    """Facts of files, as they are kept, and what they were measured on."""
+
+    device_scale: float
+    variants: tuple[ModelFacts, ...]
+    machine: str = ""
+
+    def save(self, path: Path) -> None:
+        """Write them as JSON."""
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_json(path, _KEPT.dump_python(self, mode="json"))
+        except OSError as error:
+            raise StudyError(f"{path}: cannot be written: {error.strerror}") from error
+
+    @classmethod
+    def load(cls, path: Path) -> "KeptFacts":
+        """Read a file that `save` wrote."""
+        with documents.reading(path, StudyError, "not facts of variants"):
+            content = documents.from_json(documents.content(path))
+            return _KEPT.validate_python(content)
+
+    @property
+    def by_variant(self) -> dict[str, ModelFacts]:
+        """Facts by the name of the variant."""
+        return {each.variant: each for each in self.variants}
+
+
+_KEPT = TypeAdapter(KeptFacts)
 
 
 @dataclass(frozen=True, repr=False)
 class PaperDrives(StudyOutcome):
-    """The drives that were made, and facts about the files that drove.
+    """The drives of the paper's study so far, and facts about the files that drove.
 
     Its drives have no scores, its facts stand for variants.
     """
@@ -24,44 +139,15 @@ class PaperDrives(StudyOutcome):
     accident: Accident | None = None
 
     @property
-    def title(self) -> str:
-        """The study's title, with a note if not all routes were driven."""
-        return f"{self.study.title}{self.preview}"
-
-    @property
-    def preview(self) -> str:
-        """Suffix of titles if only a part of the routes is driven; empty otherwise."""
-        return self.study.preview
-
-    @functools.cached_property
-    def cells(self) -> Mapping[CellKey, DriveRecord]:
-        """The finished drives."""
-        return {
-            (each.variant, each.condition): each
-            for each in self.drives
-            if not each.reason
-        }
-
-    @functools.cached_property
-    def failures(self) -> Mapping[CellKey, str]:
-        """Reasons of the drives that failed."""
-        return {
-            (each.variant, each.condition): each.reason
-            for each in self.drives
-            if each.reason
-        }
+    def finished(self) -> tuple[DriveRecord, ...]:
+        """The drives that did not fail."""
+        return tuple(each for each in self.drives if not each.reason)
 
     def fact(self, variant: str) -> ModelFacts:
         """Return the facts about a variant; empty facts if it was not prepared."""
         found = (each for each in self.facts if each.variant == variant)
         return next(found, ModelFacts(variant))
 
-    def cell(self, variant: str, condition: str) -> DriveRecord | None:
-        """Return a drive; None if it was not driven."""
-        return self.cells.get((variant, condition))
-
     def why_not(self, variant: str, condition: str) -> str:
-        """Say why a cell is empty."""
-        reason = self.failures.get((variant, condition))
-        failed = reason or self.fact(variant).failure
-        return failed or f"{variant} under {condition}: not driven"
+        """Say why there is no record of a drive."""
+        return self.fact(variant).failure or super().why_not(variant, condition)

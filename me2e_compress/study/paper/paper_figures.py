@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from me2e_compress.driving.realtime import skipped_decisions
-from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_values import DC, DE, DS, RouteColumn
+from me2e_compress.study.paper.paper_cells import held_at
 from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.study.paper.published import RATES, PublishedDrive
+from me2e_compress.study.paper.published import RATES
 from me2e_compress.study.report.figures import WIDTH_IN
 from me2e_compress.study.report.style import (
     ACCENT,
@@ -22,7 +22,6 @@ from me2e_compress.study.report.style import (
     RULE,
     styled,
 )
-from me2e_compress.study.route_columns import DC, DE, DS, Column, mean_of
 from me2e_compress.study.workload import held_frames
 
 RATE_TICKS = (1, 2, 3, 5, 10, 20, 30)
@@ -65,7 +64,7 @@ def where_the_time_goes(result: PaperDrives) -> Figure | None:
         return figure
 
 
-def _over_rates(result: PaperDrives, columns: Sequence[Column]) -> Figure | None:
+def _over_rates(result: PaperDrives, columns: Sequence[RouteColumn]) -> Figure | None:
     block = next((b for b in result.study.blocks if b.name == "table-2"), None)
     if block is None:
         return None
@@ -93,8 +92,8 @@ def _driven_rates(
     }
     found = list[tuple[float, str]]()
     for row in RATES:
-        condition = held.get(skipped_decisions(round(1e6 / row.fps)) + 1)
-        if condition is not None and result.cell(name, condition) is not None:
+        condition = held.get(held_at(row.fps))
+        if condition is not None and not result.drive(name, condition).reason:
             found.append((row.fps, condition))
     return found
 
@@ -104,11 +103,14 @@ def _draw_rates(
     result: PaperDrives,
     name: str,
     driven: Sequence[tuple[float, str]],
-    column: Column,
+    column: RouteColumn,
 ) -> None:
     """Draw one column over the rates, and the driver at its own latency."""
     # mean and interval at each rate
-    found = [(fps, _mean(result, name, where, column)) for fps, where in driven]
+    seed = result.study.seed
+    found = [
+        (fps, result.drive(name, where).mean(column, seed)) for fps, where in driven
+    ]
     known = [(fps, each) for fps, each in found if each.value is not None]
     sure = [
         (fps, each.low, each.high)
@@ -137,13 +139,13 @@ def _draw_rates(
     axes.set_title(f"{column.name}: {name}, 95 % interval", color=MUTED)
 
 
-def _draw_own(axes: Axes, result: PaperDrives, name: str, column: Column) -> None:
+def _draw_own(axes: Axes, result: PaperDrives, name: str, column: RouteColumn) -> None:
     # the first condition that charges each model's own latency
     fps = result.fact(name).fps
     traced = [each.name for each in result.study.conditions if each.traced]
-    if fps is None or not traced or result.cell(name, traced[0]) is None:
+    if fps is None or not traced:
         return
-    own = _mean(result, name, traced[0], column)
+    own = result.drive(name, traced[0]).mean(column, result.study.seed)
     if own.value is None:
         return
     # a diamond with its interval
@@ -159,10 +161,10 @@ def _draw_own(axes: Axes, result: PaperDrives, name: str, column: Column) -> Non
     )
 
 
-def _draw_given(axes: Axes, column: Column) -> None:
+def _draw_given(axes: Axes, column: RouteColumn) -> None:
     """Draw the paper's own figures, on axes of their own."""
-    pick = {"DS": _ds, "DE %": _de, "DC": _dc}[column.name]
-    at, values = [row.fps for row in RATES], [pick(row) for row in RATES]
+    name = {"DS": "ds", "DE %": "de", "DC": "dc"}[column.name]
+    at, values = [row.fps for row in RATES], [getattr(row, name) for row in RATES]
     axes.plot(at, values, "o-", color=MUTED, markersize=4, linewidth=1.0)
     _rate_axis(axes)
     axes.set_title(f"{column.name}: the paper's UniAD, as published", color=MUTED)
@@ -175,22 +177,6 @@ def _rate_axis(axes: Axes) -> None:
     axes.set_xlabel("decisions a second (FPS)")
     axes.grid(visible=True, axis="y")
     axes.spines["left"].set_visible(False)
-
-
-def _ds(row: PublishedDrive) -> float:
-    return row.ds
-
-
-def _de(row: PublishedDrive) -> float:
-    return row.de
-
-
-def _dc(row: PublishedDrive) -> float:
-    return row.dc
-
-
-def _mean(result: PaperDrives, name: str, condition: str, column: Column) -> Estimate:
-    return mean_of(result.cells[name, condition], column, result.study.seed)
 
 
 def _stack(axes: Axes, parts: Mapping[str, tuple[int, ...]], name: str) -> None:

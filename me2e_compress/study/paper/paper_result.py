@@ -1,14 +1,21 @@
-"""Results of the paper's study so far."""
+"""Results of the paper's study so far, and their page."""
 
 import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from matplotlib.figure import Figure
+
+from me2e_compress.metrics.route_values import COLUMNS
+from me2e_compress.study.paper import paper_figures
+from me2e_compress.study.paper.accident import plans_before
 from me2e_compress.study.paper.paper_drives import PaperDrives
 from me2e_compress.study.paper.paper_findings import findings
 from me2e_compress.study.paper.paper_tables import all_paper_tables
 from me2e_compress.study.paper.questions import Finding, findings_table
-from me2e_compress.study.route_columns import COLUMNS, mean_of
+from me2e_compress.study.report.page import Drawing, Page, Section
+from me2e_compress.study.report.style import styled, svg
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.workflows.result import Table
 
@@ -20,10 +27,9 @@ class PaperResult(PaperDrives, StudyResult):
     @property
     def headline(self) -> str:
         """Title, and number of drives."""
-        wanted = sum(
-            len(self.study.driven_under(each)) for each in self.study.conditions
-        )
-        return f"{self.title}: {len(self.cells)} of {wanted} drives"
+        study = self.study
+        wanted = sum(len(study.driven_under(each)) for each in study.conditions)
+        return f"{self.title}: {len(self.finished)} of {wanted} drives"
 
     @functools.cached_property
     def findings(self) -> tuple[Finding, ...]:
@@ -32,7 +38,8 @@ class PaperResult(PaperDrives, StudyResult):
 
     def tables(self) -> tuple[Table, ...]:
         """Return the findings, then the paper's tables in its order."""
-        return findings_table(self.findings, self.preview), *all_paper_tables(self)
+        preview = self.study.preview
+        return findings_table(self.findings, preview), *all_paper_tables(self)
 
     def lines(self) -> tuple[str, ...]:
         """Return how many drives there are."""
@@ -41,47 +48,112 @@ class PaperResult(PaperDrives, StudyResult):
     def alerts(self) -> tuple[str, ...]:
         """Return the drives that failed, and why."""
         return tuple(
-            f"{variant} under {condition} was left out: {why}"
-            for (variant, condition), why in self.failures.items()
+            f"{each.variant} under {each.condition} was left out: {each.reason}"
+            for each in self.drives
+            if each.reason
         )
 
     def records(self) -> list[dict[str, object]]:
         """Return one row per drive."""
         return [
             {
-                "variant": variant,
-                "condition": condition,
-                "routes": len(cell.routes),
-                **{each.name: mean_of(cell, each).value for each in COLUMNS},
+                "variant": each.variant,
+                "condition": each.condition,
+                "routes": len(each.routes),
+                **{column.name: each.mean(column).value for column in COLUMNS},
             }
-            for (variant, condition), cell in self.cells.items()
+            for each in self.finished
         ]
 
     def to_json(self) -> dict[str, Any]:
         """Return the scores of every drive, and the facts about the files."""
-        seed = self.study.seed
+        study, seed = self.study, self.study.seed
         return {
             "title": self.title,
-            "baseline": self.study.baseline,
+            "baseline": study.baseline,
             "seed": seed,
-            "routes": {"driven": len(self.study.routes), "set": self.study.set_size},
+            "routes": {"driven": len(study.routes), "set": study.set_size},
             "device_scale": self.device_scale,
             "machine": self.machine,
             "drives": [
                 {
-                    "scheme": variant,
-                    "condition": condition,
-                    "routes": len(cell.routes),
+                    "scheme": drive.variant,
+                    "condition": drive.condition,
+                    "routes": len(drive.routes),
                     "scores": {
-                        each.name: mean_of(cell, each, seed).to_json()
-                        for each in COLUMNS
+                        each.name: drive.mean(each, seed).to_json() for each in COLUMNS
                     },
                 }
-                for (variant, condition), cell in self.cells.items()
+                for drive in self.finished
             ],
             "findings": [each.to_json() for each in self.findings],
             "failures": [
-                {"scheme": variant, "condition": condition, "reason": why}
-                for (variant, condition), why in self.failures.items()
+                {"scheme": e.variant, "condition": e.condition, "reason": e.reason}
+                for e in self.drives
+                if e.reason
             ],
         }
+
+
+def _figure_6(result: PaperResult) -> Figure | None:
+    return None if result.accident is None else plans_before(result.accident)
+
+
+FIGURES: dict[str, tuple[tuple[Callable[[PaperResult], Figure | None], str], ...]] = {
+    "Table 2": (
+        (
+            paper_figures.safety,
+            "Figure 5a. Rates of one n of equation 4 are one drive: 14 to 30 FPS, grey,"
+            " and 8 and 10. Right, the paper's own figures.",
+        ),
+        (paper_figures.efficiency_and_comfort, "Figure 5b."),
+    ),
+    "Table 3": (
+        (
+            paper_figures.where_the_time_goes,
+            "Figure 7. Left, the modules of the whole driver, inference by inference;"
+            " right, the longest tails: the share of decisions that take longer.",
+        ),
+    ),
+    "Collisions by partner": (
+        (
+            _figure_6,
+            "Figure 6. One driver's successive plans before its own accident, the later"
+            " the darker: filled boxes are the ego, dotted ones who was near.",
+        ),
+    ),
+}
+
+
+def paper_page(result: PaperResult, command: Sequence[str] = ()) -> Page:
+    """Return the page of the questions, their answers, figures and tables."""
+    findings, *tables = result.tables()
+    return Page(
+        result.title,
+        result.headline,
+        [Section("Findings", (findings,)), *(_section(e, result) for e in tables)],
+        [
+            ("Command", " ".join(command)),
+            ("Machine", result.machine),
+            ("Device", f"{result.device_scale:.3g} times slower, for all alike"),
+            ("Seed", str(result.study.seed)),
+        ],
+        [
+            (each.variant, each.pipeline or each.failure or "as it is", each.sha256)
+            for each in result.facts
+        ],
+        [(each.verdict.value, f"{each.asked.question}.") for each in result.findings],
+    )
+
+
+def _section(table: Table, result: PaperResult) -> Section:
+    """Return a table under its name, with the figures that have drives."""
+    preview = result.study.preview
+    heading = table.title.removesuffix(preview).partition(":")[0]
+    with styled():  # the same figure gives the same names in its SVG
+        drawn = [
+            Drawing(svg(figure), f"{note}{preview}")
+            for draw, note in FIGURES.get(heading, ())
+            if (figure := draw(result)) is not None
+        ]
+    return Section(heading, (table,), drawings=tuple(drawn))

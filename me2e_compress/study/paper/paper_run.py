@@ -5,36 +5,21 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import Me2eError, StudyError
 from me2e_compress.manager.report import versions
-from me2e_compress.runtime.energy.models import measure_energy
-from me2e_compress.runtime.providers import CPU
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.outcome import this_machine
 from me2e_compress.study.paper.accident import FILE as ACCIDENT
 from me2e_compress.study.paper.accident import Accident, first_accident, watched
-from me2e_compress.study.paper.model_facts import (
-    FILE,
-    ModelFacts,
-    facts_of,
-    load_facts,
-    save_facts,
-    weighed,
-)
+from me2e_compress.study.paper.paper_drives import FILE, KeptFacts, ModelFacts
 from me2e_compress.study.paper.paper_result import PaperResult
+from me2e_compress.study.paper.weigh import weigh, weighed
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.study_blocks import StudyBlock
 from me2e_compress.study.study_result import StudyResult
-from me2e_compress.study.timing import Clock
 from me2e_compress.study.workload import held_frames
-from me2e_compress.workflows.listener import Listener
-from me2e_compress.workflows.profile import ProfileOptions, profile
-
-PROFILED = 100
-"""Inferences under a profiler, for the figure of modules."""
 
 
 def drive_blocks(
@@ -50,7 +35,7 @@ def drive_blocks(
     facts about other stacks' files, for table 4.
     """
     study, clock = setup.study, setup.clock
-    facts = _facts(setup, prepared, others)
+    facts = weigh(setup, prepared, others)
     machine = this_machine(clock.load)
     result = PaperResult(
         study, (), (), (), clock.scale, machine, versions(), facts=facts
@@ -68,31 +53,29 @@ def drive_blocks(
 
 
 def read_paper(
-    study: Study, records: str | Path, weigh: Sequence[Path] = ()
+    study: Study, records: str | Path, stacks: Sequence[Path] = ()
 ) -> PaperResult:
     """Read finished cells (``records/`` of a run); nothing is made or driven.
 
-    ``weigh`` adds folders of other stacks' files to table 4.
+    ``stacks`` are folders of other stacks' files, for table 4.
     """
     # finished cells, and facts of their files
     folder = Path(records)
     accident = folder / ACCIDENT
-    about, facts = load_facts(folder / FILE)
+    kept = KeptFacts.load(folder / FILE)
     found = [DriveRecord.load(path) for path in sorted(folder.glob("*.jsonl"))]
-    scale = about.get("device_scale")
-    if not isinstance(scale, float | int):
-        raise StudyError(f"{folder / FILE}: no device_scale")
     # other stacks' files may be counted anew
     names = [each.name for each in study.variants]
-    facts |= {found.variant: found for each in weigh for found in weighed(each)}
+    more = {found.variant: found for each in stacks for found in weighed(each)}
+    facts = kept.by_variant | more
     weighed_too = (each for each in facts.values() if each.of_another_stack)
     return PaperResult(
         _of_these_routes(study, found, folder),
         (),
         tuple(found),
         (),
-        float(scale),
-        str(about.get("machine", "")),
+        kept.device_scale,
+        kept.machine,
         {},
         facts=(*(facts[name] for name in names if name in facts), *weighed_too),
         accident=Accident.load(accident) if accident.is_file() else None,
@@ -125,14 +108,12 @@ def _accident(
     study = setup.study
     driver = next(each for each in prepared if each.variant is study.reference)
     for condition in sorted(study.conditions, key=partial(held_frames, study)):
-        record = result.cell(study.baseline, condition.name)
-        happened = None if record is None else first_accident(record)
-        if record is None or happened is None:
+        record = result.drive(study.baseline, condition.name)
+        happened = first_accident(record)
+        job = None if happened is None else setup.job(driver, condition)
+        if happened is None or job is None:
             continue
         # drive the route again, this time watched
-        job = setup.job(driver, condition)
-        if job is None:
-            continue
         route = next(each for each in study.routes if each.id == happened.route)
         found = watched(record, happened, route, job)
         if found.moments:
@@ -163,78 +144,3 @@ def _driven(
                 drives.append(DriveRecord(*key, reason=str(error)))
                 setup.listener.on_warning(f"{', '.join(key)}: {error}")
     return replace(result, drives=tuple(drives))
-
-
-def _facts(
-    setup: DriveSetup,
-    prepared: Sequence[PreparedVariant],
-    others: tuple[ModelFacts, ...],
-) -> tuple[ModelFacts, ...]:
-    """Collect facts of every variant, and profile the baseline, unless known."""
-    study, clock, listener = setup.study, setup.clock, setup.listener
-    path = setup.workspace.folder / "records" / FILE
-    known = load_facts(path)[1] if path.is_file() else {}
-    found = list[ModelFacts]()
-    for done, each in enumerate(prepared):
-        listener.on_progress("weigh", done, len(prepared), each.variant.name)
-        facts = facts_of(each, clock, known)
-        if each.variant is study.reference and not facts.modules_us:
-            facts = replace(facts, modules_us=_by_module(study, each, clock, listener))
-        found.append(facts)
-    found = [*_with_joules(study, prepared, found, listener), *others]
-    names = [each.variant for each in found]
-    more = [each for name, each in known.items() if name not in names]
-    about = {"machine": this_machine(clock.load), "device_scale": clock.scale}
-    save_facts(path, (*found, *more), about)
-    return (*found, *(each for each in more if each.of_another_stack))
-
-
-def _with_joules(
-    study: Study,
-    prepared: Sequence[PreparedVariant],
-    found: Sequence[ModelFacts],
-    listener: Listener,
-) -> list[ModelFacts]:
-    """Measure joules per frame if this machine has a counter."""
-    # models whose energy is not known yet
-    models = {
-        each.variant.name: each.model
-        for each, facts in zip(prepared, found, strict=True)
-        if each.model is not None and facts.joules is None
-    }
-    if study.held_out is None or not models:
-        return list(found)
-    # all models are measured in one run
-    measured = measure_energy(
-        models,
-        CalibrationSet(study.held_out),
-        threads=study.timing.threads,
-        provider=study.provider,
-        on_window=lambda done, total, name: listener.on_progress(
-            "energy", done, total, name
-        ),
-    )
-    return [
-        each.with_energy(measured[each.variant]) if each.variant in measured else each
-        for each in found
-    ]
-
-
-def _by_module(
-    study: Study, prepared: PreparedVariant, clock: Clock, listener: Listener
-) -> dict[str, tuple[int, ...]]:
-    """Profile a model, on the scale of the device."""
-    on_cpu = study.provider.native == CPU.native  # elsewhere nodes are not timed
-    if prepared.model is None or study.held_out is None or not on_cpu:
-        return {}
-    options = ProfileOptions(
-        samples=PROFILED,
-        by_module=True,
-        module_map=prepared.variant.module_map,
-        threads=study.timing.threads,
-    )
-    trace = profile(prepared.model, study.held_out, None, options, listener).trace
-    return {
-        module: tuple(round(each * clock.scale) for each in samples)
-        for module, samples in trace.modules_us.items()
-    }

@@ -4,32 +4,30 @@ The paper's own figures are of other stacks, roads and traffic: they have column
 their own.
 """
 
-from me2e_compress.driving.realtime import skipped_decisions
+from collections.abc import Iterator, Sequence
+
+from me2e_compress.metrics.route_summary import PERCENTS
+from me2e_compress.study.cells import MISSING
 from me2e_compress.study.paper import published
-from me2e_compress.study.paper.energy_columns import (
+from me2e_compress.study.paper.paper_cells import (
     EER,
     ENERGY,
-    EnergyColumns,
-    ranking_note,
-)
-from me2e_compress.study.paper.paper_counts import partners, table_4
-from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.study.paper.score_cells import (
     GIVEN,
     GIVEN_ENERGY,
     SCORES,
     against,
+    energy_cells,
     given_cells,
-    given_energy,
-    less_cell,
+    held_at,
     plain_cell,
+    ranking_note,
     rate_cells,
     score_cells,
-    times,
 )
-from me2e_compress.study.route_summary import PERCENTS
+from me2e_compress.study.paper.paper_counts import partners, table_4
+from me2e_compress.study.paper.paper_drives import PaperDrives
+from me2e_compress.study.paper.published import PublishedDrive
 from me2e_compress.study.study_blocks import StudyBlock
-from me2e_compress.study.tables import MISSING
 from me2e_compress.study.workload import held_frames
 from me2e_compress.workflows.result import Cell, Table
 
@@ -38,6 +36,9 @@ OURS = (
     " are of UniAD in CARLA, which drives on after a collision; here a route ends at"
     " the first. Compare directions, not numbers."
 )
+
+
+RATE = ("FPS", "driven as", "n", "decisions a second", *SCORES)
 
 
 def all_paper_tables(result: PaperDrives) -> tuple[Table, ...]:
@@ -49,52 +50,35 @@ def all_paper_tables(result: PaperDrives) -> tuple[Table, ...]:
         "table-6": table_6,
         "tail": tail,
     }
-    found = [
-        makers[block.name](result, block)
-        for block in result.study.blocks
-        if block.name in makers
-    ]
-    found.append(table_4(result))
-    found.sort(key=lambda table: table.title)
-    return (*found, partners(result))
+    blocks = [each for each in result.study.blocks if each.name in makers]
+    found = [table_4(result), *(makers[each.name](result, each) for each in blocks)]
+    return (*sorted(found, key=lambda table: table.title), partners(result))
 
 
 def table_2(result: PaperDrives, block: StudyBlock) -> Table:
     """Show one driver at the paper's rates, and at latencies of its own."""
-    # the condition of each number of held frames
-    study, name = result.study, block.variants[0]
-    conditions = [each for each in study.conditions if each.name in block.conditions]
-    held = {held_frames(study, each): each.name for each in reversed(conditions)}
     # the paper's rates
-    rows = []
-    for given in published.RATES:
-        frames = skipped_decisions(round(1e6 / given.fps)) + 1
-        condition = held.get(frames, "")
-        rows.append(
-            (
-                Cell(f"{given.fps:g}"),
-                Cell(condition or MISSING),
-                *rate_cells(frames),
-                *score_cells(result, name, condition),
-                *given_cells(given),
-            )
-        )
+    study, name = result.study, block.variants[0]
+    rows = [
+        (*cells, *given_cells(given))
+        for given, cells in _at_rates(result, block, published.RATES)
+    ]
     # the driver's own latencies
     own = published.RATES_RT["UniAD"]
-    for each in conditions:
-        if each.traced or each.mean_of:
-            rows.append(
-                (
-                    Cell("own" if each.traced else "own mean"),
-                    Cell(each.name),
-                    *rate_cells(held_frames(study, each)),
-                    *score_cells(result, name, each.name),
-                    *given_cells(own if each.traced else None),
-                )
-            )
+    rows += [
+        (
+            Cell("own" if each.traced else "own mean"),
+            Cell(each.name),
+            *rate_cells(held_frames(study, each)),
+            *score_cells(result, name, each.name),
+            *given_cells(own if each.traced else None),
+        )
+        for each in study.conditions
+        if each.name in block.conditions and (each.traced or each.mean_of)
+    ]
     return Table(
-        f"Table 2: {name} at rates of decisions{result.preview}",
-        ("FPS", "driven as", "n", "decisions a second", *SCORES, *GIVEN),
+        f"Table 2: {name} at rates of decisions{result.study.preview}",
+        (*RATE, *GIVEN),
         tuple(rows),
         "n of equation 4 at a step of 50 ms: decisions skipped; the new control acts"
         " n + 1 frames later, so the rate in the world is 20 / (n + 1). Rates of one n"
@@ -109,29 +93,26 @@ def table_3(result: PaperDrives, block: StudyBlock) -> Table:
     """Show the driver without some modules, each variant at its own latency."""
     # all variants drive under one condition
     condition = block.conditions[0]
-    base = result.fact("exact")
-    energy = EnergyColumns.of(result, block.variants, condition)
+    base, exact = result.study.baseline, result.fact("exact")
+    energy = energy_cells(result, block.variants, condition)
     rows = []
     for name in block.variants:
         # sizes are relative to the whole graph
-        fact = result.fact(name)
-        whole = name in (result.study.baseline, base.variant)
-        given = published.MODULES_AWAY.get(name)
+        fact, given = result.fact(name), published.MODULES_AWAY.get(name)
+        whole = name in (base, exact.variant)
+        parameters = _less(exact.parameters, fact.parameters, 1e6)
+        macs = _less(exact.macs, fact.macs, 1e9)
         rows.append(
             (
                 Cell(name),
-                Cell("") if whole else less_cell(base.parameters, fact.parameters, 1e6),
-                Cell("") if whole else less_cell(base.macs, fact.macs, 1e9),
-                plain_cell(fact.fps, ".2f", fact.failure or "not measured"),
-                *score_cells(result, name, condition),
-                against(result, name, result.study.baseline, condition),
-                *energy.cells(name),
-                *given_cells(given),
-                *given_energy(given),
+                *([Cell("")] * 2 if whole else [parameters, macs]),
+                *_scored(result, name, condition, base),
+                *energy[name],
+                *given_cells(given, energy=True),
             )
         )
     return Table(
-        f"Table 3: modules away, under {condition}{result.preview}",
+        f"Table 3: modules away, under {condition}{result.study.preview}",
         (
             "scheme",
             "M parameters away",
@@ -158,23 +139,19 @@ def table_5(result: PaperDrives, block: StudyBlock) -> Table:
     rankings = [ranking_note(result, block.variants, each) for each in block.conditions]
     rows = []
     for condition in block.conditions:
-        energy = EnergyColumns.of(result, block.variants, condition)
-        for name in block.variants:
-            fact, given = result.fact(name), published.INT8.get(name)
-            rows.append(
-                (
-                    Cell(name),
-                    Cell(condition),
-                    plain_cell(fact.fps, ".2f", fact.failure or "not measured"),
-                    *score_cells(result, name, condition),
-                    against(result, name, base, condition),
-                    *energy.cells(name),
-                    *given_cells(given),
-                    *given_energy(given),
-                )
+        energy = energy_cells(result, block.variants, condition)
+        rows += [
+            (
+                Cell(name),
+                Cell(condition),
+                *_scored(result, name, condition, base),
+                *energy[name],
+                *given_cells(published.INT8.get(name), energy=True),
             )
+            for name in block.variants
+        ]
     return Table(
-        f"Table 5: int8 by module{result.preview}",
+        f"Table 5: int8 by module{result.study.preview}",
         (
             *("scheme", "condition", "FPS", *SCORES, f"DS to {base}"),
             *(*ENERGY, *GIVEN, *GIVEN_ENERGY),
@@ -191,40 +168,24 @@ def table_5(result: PaperDrives, block: StudyBlock) -> Table:
 
 def table_6(result: PaperDrives, block: StudyBlock) -> Table:
     """Show the driver with its rate limited."""
-    # the condition of each number of held frames
-    study, name = result.study, block.variants[0]
-    held = {
-        held_frames(study, each): each.name
-        for each in reversed(study.conditions)
-        if each.name in block.conditions
-    }
-    rows = []
-    for given in published.LIMITED:
-        # the paper's rates; watts are not measured here
-        frames = skipped_decisions(round(1e6 / given.fps)) + 1
-        condition = held.get(frames, "")
-        fact = result.fact(name)
-        joules = None if fact.joules is None else fact.joules[0]
-        modelled = fact.modelled_j
-        rows.append(
-            (
-                Cell(f"{given.fps:g}"),
-                Cell(condition or MISSING),
-                *rate_cells(frames),
-                *score_cells(result, name, condition),
-                Cell(MISSING, reason="power at a limited rate is not measured"),
-                plain_cell(times(joules, given.fps), ".3g", fact.no_joules),
-                plain_cell(times(modelled, given.fps), ".3g", "not counted"),
-                *given_cells(given),
-                Cell("" if given.watts is None else f"{given.watts:.0f}"),
-            )
-        )
-    return Table(
-        f"Table 6: {name} with its rate limited{result.preview}",
+    # watts are not measured here
+    name = block.variants[0]
+    fact = result.fact(name)
+    joules = None if fact.joules is None else fact.joules[0]
+    rows = [
         (
-            *("FPS", "driven as", "n", "decisions a second"),
-            *(*SCORES, "W", "J/frame x FPS", "modelled J x FPS", *GIVEN, "paper's W"),
-        ),
+            *cells,
+            Cell(MISSING, reason="power at a limited rate is not measured"),
+            plain_cell(_times(joules, given.fps), ".3g", fact.no_joules),
+            plain_cell(_times(fact.modelled_j, given.fps), ".3g", "not counted"),
+            *given_cells(given),
+            Cell("" if given.watts is None else f"{given.watts:.0f}"),
+        )
+        for given, cells in _at_rates(result, block, published.LIMITED)
+    ]
+    return Table(
+        f"Table 6: {name} with its rate limited{result.study.preview}",
+        (*RATE, "W", "J/frame x FPS", "modelled J x FPS", *GIVEN, "paper's W"),
         tuple(rows),
         "A faster model waits: latency = max(its own, 1 / FPS). E x FPS is the paper's"
         " own formula, not a measurement: its watts at 4 FPS are 34.6 J a frame, those"
@@ -249,7 +210,7 @@ def tail(result: PaperDrives, block: StudyBlock) -> Table:
         for name in block.variants
     ]
     return Table(
-        f"The long tail{result.preview}",
+        f"The long tail{result.study.preview}",
         (
             *("variant", "condition", "mean ms", "slowest ms", "decisions a second"),
             *(*SCORES, f"DS to {base}"),
@@ -266,18 +227,59 @@ def tail(result: PaperDrives, block: StudyBlock) -> Table:
     )
 
 
+def _at_rates(
+    result: PaperDrives, block: StudyBlock, rates: Sequence[PublishedDrive]
+) -> Iterator[tuple[PublishedDrive, list[Cell]]]:
+    """Yield the paper's rates, each with the scores of its condition here."""
+    # the condition of each number of held frames
+    study, name = result.study, block.variants[0]
+    held = {
+        held_frames(study, each): each.name
+        for each in reversed(study.conditions)
+        if each.name in block.conditions
+    }
+    for given in rates:
+        frames = held_at(given.fps)
+        condition = held.get(frames, "")
+        driven = [Cell(f"{given.fps:g}"), Cell(condition or MISSING)]
+        scores = score_cells(result, name, condition)
+        yield given, [*driven, *rate_cells(frames), *scores]
+
+
+def _scored(
+    result: PaperDrives, name: str, condition: str, base: str
+) -> tuple[Cell, ...]:
+    """Show inferences a second, scores, and the driving score against another's."""
+    fact = result.fact(name)
+    return (
+        plain_cell(fact.fps, ".2f", fact.failure or "not measured"),
+        *score_cells(result, name, condition),
+        against(result, name, base, condition),
+    )
+
+
+def _less(whole: int | None, left: int | None, unit: float) -> Cell:
+    """Show the reduction from one size to another."""
+    if whole is None or left is None:
+        return Cell(MISSING, reason="not counted")
+    return Cell(f"{(whole - left) / unit:.3f}")
+
+
+def _times(joules: float | None, fps: float) -> float | None:
+    """Multiply joules per frame by frames per second."""
+    return None if joules is None else joules * fps
+
+
 def _latency(result: PaperDrives, name: str, condition: str) -> tuple[Cell, Cell, Cell]:
-    cell = result.cell(name, condition)
-    mean_us = None if cell is None else cell.mean_latency_us
-    if cell is None or mean_us is None:
-        reason = result.why_not(name, condition)
-        missing = Cell(MISSING, reason=reason)
+    drive = result.drive(name, condition)
+    mean_us = drive.mean_latency_us
+    if mean_us is None:
+        missing = Cell(MISSING, reason=drive.reason or "no decision was taken")
         return missing, missing, missing
-    ends = [
-        each.latency_us[PERCENTS.index(100)] for each in cell.routes if each.decisions
-    ]
+    slowest = PERCENTS.index(100)
+    ends = [each.latency_us[slowest] for each in drive.routes if each.decisions]
     return (
         Cell(f"{mean_us / 1e3:.0f}"),
         Cell(f"{max(ends) / 1e3:.0f}"),
-        Cell(f"{cell.decisions_a_second:.2f}"),
+        Cell(f"{drive.decisions_a_second:.2f}"),
     )

@@ -105,5 +105,3 @@ INT8_COUNTS = {
     ("VAD", "full"): PublishedInt8(194, 155, 77, 83.32),
 }
 """Table 4: counts of int8 parts."""
-STATIC_COLLISIONS_WITHOUT_MAP = 0.5507
-"""Share of collisions with static structures, of all, in schemes 2 and 6."""

@@ -3,7 +3,7 @@
 No answer is written down: every verdict follows from the drives.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -14,20 +14,11 @@ from me2e_compress.metrics.eer import eer
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.metrics.intervals import intervals, mean_estimate
 from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.route_values import DS, POINTS, RouteColumn
+from me2e_compress.study.cells import estimate_cell
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.paper.energy_columns import (
-    Energy,
-    joules_by_variant,
-    measures_by_variant,
-)
+from me2e_compress.study.paper.paper_cells import Energy, measures_by_variant
 from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.study.route_columns import (
-    DS,
-    Column,
-    mean_of,
-    paired,
-)
-from me2e_compress.study.tables import MISSING, estimate_cell
 from me2e_compress.workflows.result import Cell, Table
 
 
@@ -38,37 +29,6 @@ class Verdict(StrEnum):
     NOT_CONFIRMED = "not confirmed"
     OPPOSITE = "opposite"
     NOT_TESTED = "not tested"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A question about a finding of the paper, and the answer.
-
-    The question is phrased so that the paper's answer is yes; ``paper`` and ``test``
-    say in words what the paper found and what is computed here.
-    """
-
-    question: str
-    paper: str
-    test: str
-    verdict: Verdict
-    estimate: Estimate | None = None
-    reason: str = ""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return all fields."""
-        return {
-            "question": self.question,
-            "paper": self.paper,
-            "test": self.test,
-            "verdict": self.verdict.value,
-            "estimate": None if self.estimate is None else self.estimate.to_json(),
-            "reason": self.reason or None,
-        }
-
-
-class UntestedError(Exception):
-    """Data that a test needs are missing; the message names them."""
 
 
 Rule = Callable[[Estimate], Verdict]
@@ -129,40 +89,36 @@ class Evidence:
         """Seed of bootstraps."""
         return self.result.study.seed
 
-    def cell(self, name: CellName) -> DriveRecord:
-        """Return a drive, or raise an `UntestedError` that says why it is missing."""
-        found = self.result.cell(*name)
-        if found is None:
-            raise UntestedError(self.result.why_not(*name))
-        return found
-
-    def mean(self, name: CellName, column: Column) -> float:
-        """Return a mean over the routes of a drive."""
-        found = mean_of(self.cell(name), column, self.seed)
-        if found.value is None:
-            raise UntestedError(found.measure.reason)
-        return found.value
+    def drive(self, name: CellName) -> DriveRecord:
+        """Return a drive; one that was not made says why."""
+        return self.result.drive(*name)
 
     def difference(
-        self, one: CellName, other: CellName, column: Column = DS
+        self, one: CellName, other: CellName, column: RouteColumn = DS
     ) -> Estimate:
         """Return the mean of one minus the other over the same routes."""
-        return paired(self.cell(one), self.cell(other), column, self.seed)
+        return self.drive(one).minus(self.drive(other), column, self.seed)
 
     def change_of_change(
         self, first: CellName, middle: CellName, last: CellName
     ) -> Estimate:
         """Return how much more DS changes from first to middle than to last."""
-        drives = (self.cell(name) for name in (first, middle, last))
-        early, halfway, late = (DS.values(each.routes) for each in drives)
+        drives = [self.drive(name) for name in (first, middle, last)]
+        if why := _missing(drives):
+            return Estimate.missing(POINTS, why)
+        early, halfway, late = (each.values(DS) for each in drives)
         return ((halfway - early) - (late - halfway)).mean(self.seed)
 
     def static_share(self, one: CellName, other: CellName) -> Estimate:
         """Return the increase of the share of collisions with static objects."""
-        drives = self.cell(one), self.cell(other)
+        drives = self.drive(one), self.drive(other)
+        if why := _missing(drives):
+            return Estimate.missing("ratio", why)
         counts = np.array([_static_and_all(drive) for drive in drives], np.float64)
         if not counts[:, :, 1].sum(axis=1).all():
-            raise UntestedError("a drive without a collision has no shares")
+            return Estimate.missing(
+                "ratio", "a drive without a collision has no shares"
+            )
 
         def gap(weights: np.ndarray[Any, np.dtype[np.float64]]) -> Any:
             static, every = (weights @ counts[:, :, at].T for at in (0, 1))
@@ -179,26 +135,26 @@ class Evidence:
         """Return the difference in EER_AV, scored with all of table 5."""
         block = next((b for b in self.result.study.blocks if b.name == "table-5"), None)
         if block is None:
-            raise UntestedError("the study has no block table-5")
-        joules = joules_by_variant(self.result, block.variants, energy)
-        found = eer(measures_by_variant(self.result, joules, condition))
+            return Estimate.missing(POINTS, "the study has no block table-5")
+        variants = measures_by_variant(self.result, block.variants, energy, condition)
+        found = eer(variants)
         for name in (one, other):
             if name not in found.routes:
-                score = found.scores.get(name)
-                why = self.result.why_not(name, condition)
-                raise UntestedError(why if score is None else score.measure.reason)
+                score, drive = found.scores.get(name), self.drive((name, condition))
+                why = drive.reason if score is None else score.measure.reason
+                return Estimate.missing(POINTS, why)
         gaps_by_route = (found.routes[one] - found.routes[other]).tolist()
         if any(found.left_out.values()):
             types = [""] * len(gaps_by_route)
         else:
-            types = [each.scenario for each in self.cell((one, condition)).routes]
-        return mean_estimate(gaps_by_route, types, "points", self.seed)
+            types = [each.scenario for each in self.drive((one, condition)).routes]
+        return mean_estimate(gaps_by_route, types, POINTS, self.seed)
 
     def faster_by(self, one: str, other: str) -> Estimate:
         """Return by how many ms the median latency of one is below the other's."""
         samples = [self.result.fact(name).latency_us for name in (one, other)]
         if not all(samples):
-            raise UntestedError(f"no latencies of {one} and {other}")
+            return Estimate.missing("ms", f"no latencies of {one} and {other}")
         random = np.random.default_rng(self.seed)
         drawn = [
             np.median(random.choice(each, (2_000, len(each))), axis=1)
@@ -209,6 +165,11 @@ class Evidence:
         return Estimate(Measure(value, "ms"), float(low), float(high), len(samples[0]))
 
 
+def _missing(drives: Sequence[DriveRecord]) -> str:
+    """Say why the first drive is missing, if one is."""
+    return next((each.reason for each in drives if each.reason), "")
+
+
 def _static_and_all(drive: DriveRecord) -> list[tuple[int, int]]:
     kinds = [[kind for kind, _ in each.collisions] for each in drive.routes]
     return [(each.count(InfractionKind.COLLISION_LAYOUT), len(each)) for each in kinds]
@@ -216,7 +177,11 @@ def _static_and_all(drive: DriveRecord) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class PaperQuestion:
-    """A finding of the paper before it is tested; ``rule`` may read the drives."""
+    """A question about a finding of the paper, whose answer is yes.
+
+    ``paper`` and ``test`` say in words what the paper found and what is computed here;
+    ``rule`` may read the drives.
+    """
 
     question: str
     paper: str
@@ -224,36 +189,49 @@ class PaperQuestion:
     compute: Callable[[Evidence], Estimate]
     rule: Callable[[Evidence], Rule] = lambda evidence: rises
 
-    def answer(self, result: PaperDrives) -> Finding:
-        """Compute and judge."""
+    def answer(self, result: PaperDrives) -> "Finding":
+        """Compute and judge; without an estimate nothing was tested."""
         evidence = Evidence(result)
-        try:
-            found = self.compute(evidence)
-            if found.value is None:
-                raise UntestedError(found.measure.reason)
+        found, verdict = self.compute(evidence), Verdict.NOT_TESTED
+        if found.value is not None:
             verdict = self.rule(evidence)(found)
-        except UntestedError as error:
-            words = self.question, self.paper, self.test
-            return Finding(*words, Verdict.NOT_TESTED, reason=str(error))
-        return Finding(self.question, self.paper, self.test, verdict, found)
+        return Finding(self, verdict, found)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The answer to a question, and the estimate that it follows from."""
+
+    asked: PaperQuestion
+    verdict: Verdict
+    estimate: Estimate
+
+    def to_json(self) -> dict[str, Any]:
+        """Return question, verdict, and the estimate or why there is none."""
+        reason = self.estimate.measure.reason
+        return {
+            "question": self.asked.question,
+            "paper": self.asked.paper,
+            "test": self.asked.test,
+            "verdict": self.verdict.value,
+            "estimate": None if reason else self.estimate.to_json(),
+            "reason": reason or None,
+        }
 
 
 def findings_table(found: tuple[Finding, ...], preview: str) -> Table:
     """Show every question with its verdict and interval."""
-    # an untested finding has a reason instead of a difference
     rows = [
         (
-            Cell(each.question),
-            Cell(each.paper),
-            Cell(each.test if each.estimate else each.reason),
+            Cell(each.asked.question),
+            Cell(each.asked.paper),
+            Cell(each.estimate.measure.reason or each.asked.test),
             Cell(each.verdict.value),
-            Cell(MISSING, reason=each.reason)
-            if each.estimate is None
-            else _shown(each.estimate),
+            _shown(each.estimate),
         )
         for each in found
     ]
-    tested = sum(each.estimate is not None for each in found)
+    tested = sum(each.estimate.value is not None for each in found)
     return Table(
         f"The paper's findings{preview}",
         ("is it so that", "the paper", "the test", "here", "difference"),
@@ -267,6 +245,7 @@ def findings_table(found: tuple[Finding, ...], preview: str) -> Table:
 
 
 def _shown(estimate: Estimate) -> Cell:
-    form = ".1f" if estimate.measure.unit != "ratio" else ".3f"
-    cell = estimate_cell(estimate, form, signed=True)
-    return Cell(f"{cell.text} {estimate.measure.unit}", cell.detail, cell.reason)
+    cell = estimate_cell(estimate, signed=True)
+    if cell.reason:
+        return cell
+    return Cell(f"{cell.text} {estimate.measure.unit}", cell.detail)

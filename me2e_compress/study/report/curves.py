@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -17,7 +18,7 @@ ENOUGH = 3
 Score = Callable[[Scores], Estimate]
 
 
-def curves(outcome: StudyOutcome) -> str | None:
+def curves(outcome: StudyOutcome) -> Markup | None:
     """Draw driving score and success rate as SVG; None below three conditions."""
     if len(outcome.study.conditions) < ENOUGH:
         return None

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.outcome import StudyOutcome
-from me2e_compress.study.report.findings import sure
 from me2e_compress.study.report.style import (
     ACCENT,
     BASELINE,
@@ -58,7 +58,7 @@ def front(points: Sequence[Point]) -> list[Point]:
     return kept
 
 
-def pareto(outcome: StudyOutcome, condition: Condition) -> str | None:
+def pareto(outcome: StudyOutcome, condition: Condition) -> Markup | None:
     """Draw driving score against latency and against size; None below two points."""
     # panels with at least two points
     latency = _points(outcome, condition, "latency")
@@ -87,14 +87,13 @@ def pareto(outcome: StudyOutcome, condition: Condition) -> str | None:
         return svg(figure)
 
 
-def forest(outcome: StudyOutcome) -> str | None:
+def forest(outcome: StudyOutcome) -> Markup | None:
     """Draw every difference to the baseline with its interval; None without one."""
     # drives that have a difference to the baseline
     rows = [each for each in outcome.drives if each.difference is not None]
     if not rows:
         return None
-    several = len(outcome.study.conditions) > 1
-    names = [f"{r.variant}, {r.condition}" if several else r.variant for r in rows]
+    names = [outcome.label(each) for each in rows]
     with styled():
         height = 0.9 + 0.26 * len(rows)
         figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
@@ -177,7 +176,7 @@ def _whiskers(axes: Axes, found: Sequence[Estimate]) -> None:
     axes.axvline(0.0, color=INK, linewidth=0.8)
     for row, estimate in enumerate(found):
         low, high = estimate.low, estimate.high
-        colour = ACCENT if sure(estimate) else MUTED
+        colour = ACCENT if estimate.sign else MUTED
         if low is not None and high is not None:
             axes.plot([low, high], [row, row], color=colour, linewidth=1.6)
         axes.plot(estimate.value or 0.0, row, "o", color=colour, markersize=5)

@@ -4,6 +4,7 @@ import io
 from contextlib import AbstractContextManager
 from pathlib import Path
 
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
@@ -20,12 +21,12 @@ def styled() -> AbstractContextManager[None]:
     return context(STYLE, after_reset=True)
 
 
-def svg(figure: Figure) -> str:
+def svg(figure: Figure) -> Markup:
     """Write a figure as an SVG element, reproducibly."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
-    return text[text.index("<svg") :].replace("'DejaVu Sans'", PAGE_FONT)
+    return Markup(text[text.index("<svg") :].replace("'DejaVu Sans'", PAGE_FONT))
 
 
 def bare(axes: Axes) -> None:

@@ -1,7 +1,6 @@
 """What tables need of one driven route: a line of numbers, without frames."""
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -17,6 +16,7 @@ from me2e_compress.metrics.infraction import COLLISIONS, InfractionKind
 PERCENTS = (50, 90, 99, 100)
 """Percentiles of the latencies of a route's decisions."""
 DIGITS = 6
+"""Digits that files keep of what is not a score."""
 
 WORDS = {
     InfractionKind.COLLISION_PEDESTRIAN: "collision with a pedestrian",
@@ -97,10 +97,11 @@ class RouteSummary:
 
     @classmethod
     def of(cls, episode: Episode) -> Self:
-        """Summarize an episode."""
+        """Summarize an episode; a real run may log steps instead of decisions."""
         # percentiles of the latency that the drive was charged
         charged = [each.latency_us for each in episode.decisions]
         latency_us = np.percentile(charged or [0], PERCENTS, method="higher")
+        steps = 0 if episode.given is None else len(episode.frames)
         return cls(
             episode.route,
             episode.scenario,
@@ -109,19 +110,25 @@ class RouteSummary:
             episode.succeeded,
             episode.ending.value,
             tuple((e.kind.value, e.time_us, e.detail) for e in episode.infractions),
-            _rounded(efficiency(episode).value),
-            _rounded(comfort(episode).value),
+            efficiency(episode).value,
+            comfort(episode).value,
             episode.frames[-1].time_us if episode.frames else 0,
-            len(charged),
+            len(charged) or steps,
             tuple(int(each) for each in latency_us) if charged else (),
             sum(charged),
-            _rounded(near.ttc_exposure(episode).value),
-            _rounded(near.smallest_ttc(episode).value),
-            _rounded(near.smallest_pet(episode).value),
-            _rounded(near.smallest_distance(episode).value),
+            near.ttc_exposure(episode).value,
+            near.smallest_ttc(episode).value,
+            near.smallest_pet(episode).value,
+            near.smallest_distance(episode).value,
             near.at_fault_collision(episode),
         )
 
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else round(value, DIGITS)
+    def rounded(self) -> Self:
+        """Return it with as many digits as files keep."""
+        measured = (
+            *("efficiency", "comfort", "ttc_exposure"),
+            *("smallest_ttc", "smallest_pet", "smallest_distance"),
+        )
+        found = {name: getattr(self, name) for name in measured}
+        known = {name: each for name, each in found.items() if each is not None}
+        return replace(self, **{n: round(each, DIGITS) for n, each in known.items()})

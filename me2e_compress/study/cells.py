@@ -1,0 +1,47 @@
+"""Cells of a study's tables: one content for the terminal, Markdown and HTML."""
+
+from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.study.plan_fidelity import EXACT
+from me2e_compress.workflows.result import Cell
+from me2e_compress.workflows.result import number as plain_number
+
+MISSING = "\N{EN DASH}"
+"""Shown if nothing was measured."""
+INFINITE = "\N{INFINITY}"
+MINUS = "\N{MINUS SIGN}"
+
+
+def estimate_cell(
+    estimate: Estimate, form: str = ".1f", *, signed: bool = False
+) -> Cell:
+    """Show a mean with its interval."""
+    measure, sign = estimate.measure, "+" if signed else ""
+    if measure.value is None:
+        return Cell(MISSING, reason=measure.reason)
+    form = f"{sign}{'.3f' if measure.unit == 'ratio' else form}"
+    text = number(measure.value, form)
+    if estimate.low is None or estimate.high is None:
+        return Cell(text)
+    low, high = (number(each, form) for each in (estimate.low, estimate.high))
+    return Cell(text, f"{low} to {high}")
+
+
+def anew_cell(estimate: Estimate) -> Cell:
+    """Show the interval of a difference over types drawn anew, alone."""
+    low, high = estimate.anew_low, estimate.anew_high
+    if low is None or high is None:
+        return Cell(MISSING, reason="too few scenario types")
+    return Cell(f"{number(low, '+.1f')} to {number(high, '+.1f')}")
+
+
+def measure_cell(measure: Measure, form: str) -> Cell:
+    """Show a number, or a dash with its reason."""
+    if measure.value is None:
+        infinite = measure.reason == EXACT
+        return Cell(INFINITE if infinite else MISSING, reason=measure.reason)
+    return Cell(number(measure.value, form))
+
+
+def number(value: float, form: str) -> str:
+    """Format a number with a true minus sign and no negative zero."""
+    return plain_number(value, form).replace("-", MINUS)

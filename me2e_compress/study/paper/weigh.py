@@ -1,0 +1,184 @@
+"""Weigh the files of the paper's variants: size, int8 parts, latency and energy."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from me2e_compress import graph
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import StudyError
+from me2e_compress.graph import WEIGHTED
+from me2e_compress.quantization.plan import plan_of
+from me2e_compress.runtime.energy.modelled import DEFAULT_PROCESS
+from me2e_compress.runtime.energy.models import measure_energy
+from me2e_compress.runtime.providers import CPU
+from me2e_compress.study.definition import Study
+from me2e_compress.study.drives import DriveSetup
+from me2e_compress.study.outcome import this_machine
+from me2e_compress.study.paper.paper_drives import (
+    FILE,
+    SCHEMES,
+    Int8Counts,
+    KeptFacts,
+    ModelFacts,
+)
+from me2e_compress.study.prepared import PreparedVariant
+from me2e_compress.study.timing import Clock
+from me2e_compress.workflows.inspect import inspect
+from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.profile import ProfileOptions, profile
+
+PROFILED = 100
+"""Inferences under a profiler, for the figure of modules."""
+
+
+def weighed(folder: Path) -> tuple[ModelFacts, ...]:
+    """Count the files of another stack, for table 4 only.
+
+    The folder has the stack's name and some of ``exact.onnx``, ``prediction.onnx``,
+    ``feature-ext.onnx`` and ``full.onnx``.
+    """
+    files = [(scheme, folder / f"{scheme}.onnx") for scheme in SCHEMES]
+    there = [(scheme, path) for scheme, path in files if path.is_file()]
+    if not there:
+        raise StudyError(f"{folder}: none of {', '.join(SCHEMES)} as .onnx")
+    return tuple(
+        ModelFacts(
+            f"{folder.resolve().name} {scheme}",
+            graph.sha256_of(path),
+            size_bytes=graph.file_bytes(path),
+            int8=int8_counts(path),
+        )
+        for scheme, path in there
+    )
+
+
+def int8_counts(path: Path) -> Int8Counts | None:
+    """Count the int8 part of a file; None for one that carries no plan."""
+    loaded = graph.load(path)
+    plan = plan_of(loaded)
+    if plan is None:
+        return None
+    ops = [each.op for each in plan.placed]
+    return Int8Counts(
+        sum(node.op_type == "QuantizeLinear" for node in loaded.graph.all_nodes()),
+        len(ops),
+        sum(op in WEIGHTED for op in ops),
+    )
+
+
+def weigh(
+    setup: DriveSetup,
+    prepared: Sequence[PreparedVariant],
+    others: tuple[ModelFacts, ...],
+) -> tuple[ModelFacts, ...]:
+    """Collect facts of every variant, and profile the baseline, unless known.
+
+    ``others`` are facts about other stacks' files, for table 4.
+    """
+    study, clock, listener = setup.study, setup.clock, setup.listener
+    path = setup.workspace.folder / "records" / FILE
+    known = KeptFacts.load(path).by_variant if path.is_file() else {}
+    found = list[ModelFacts]()
+    for done, each in enumerate(prepared):
+        listener.on_progress("weigh", done, len(prepared), each.variant.name)
+        facts = _facts_of(each, clock, known)
+        if each.variant is study.reference and not facts.modules_us:
+            facts = replace(facts, modules_us=_by_module(study, each, clock, listener))
+        found.append(facts)
+    found = [*_with_joules(study, prepared, found, listener), *others]
+    # what is known of other files stays known
+    names = [each.variant for each in found]
+    more = [each for name, each in known.items() if name not in names]
+    KeptFacts(clock.scale, (*found, *more), this_machine(clock.load)).save(path)
+    return (*found, *(each for each in more if each.of_another_stack))
+
+
+def _facts_of(
+    prepared: PreparedVariant, clock: Clock, known: Mapping[str, ModelFacts]
+) -> ModelFacts:
+    """Collect the facts of a variant's file, unless they are already known."""
+    # latencies are scaled to the device
+    name = prepared.variant.name
+    trace = clock.traces.get(name)
+    latency_us = () if trace is None else _scaled(trace.samples_us, clock.scale)
+    # known facts are reused if the file is the same
+    before = known.get(name)
+    if prepared.model is None:
+        return ModelFacts(name, failure=prepared.failure)
+    if before and before.modelled_j and before.sha256 == prepared.sha256:
+        return (
+            before
+            if before.latency_us == latency_us
+            else replace(before, latency_us=latency_us, modules_us={})
+        )
+    # otherwise count the graph anew
+    module_map = prepared.variant.module_map
+    found = inspect(prepared.model, module_map, None, DEFAULT_PROCESS)
+    modelled = found.modelled_energy
+    return ModelFacts(
+        name,
+        prepared.sha256,
+        prepared.pipeline,
+        prepared.size_bytes,
+        sum(each.parameters for each in found.modules),
+        found.macs,
+        int8_counts(prepared.model),
+        latency_us,
+        modelled_j=None if modelled is None else modelled.modelled_j_per_frame,
+    )
+
+
+def _with_joules(
+    study: Study,
+    prepared: Sequence[PreparedVariant],
+    found: Sequence[ModelFacts],
+    listener: Listener,
+) -> list[ModelFacts]:
+    """Measure joules per frame if this machine has a counter."""
+    # models whose energy is not known yet
+    models = {
+        each.variant.name: each.model
+        for each, facts in zip(prepared, found, strict=True)
+        if each.model is not None and facts.joules is None
+    }
+    if study.held_out is None or not models:
+        return list(found)
+    # all models are measured in one run
+    measured = measure_energy(
+        models,
+        CalibrationSet(study.held_out),
+        threads=study.timing.threads,
+        provider=study.provider,
+        on_window=lambda done, total, name: listener.on_progress(
+            "energy", done, total, name
+        ),
+    )
+    return [
+        each.with_energy(measured[each.variant]) if each.variant in measured else each
+        for each in found
+    ]
+
+
+def _by_module(
+    study: Study, prepared: PreparedVariant, clock: Clock, listener: Listener
+) -> dict[str, tuple[int, ...]]:
+    """Profile a model, on the scale of the device."""
+    on_cpu = study.provider.native == CPU.native  # elsewhere nodes are not timed
+    if prepared.model is None or study.held_out is None or not on_cpu:
+        return {}
+    options = ProfileOptions(
+        samples=PROFILED,
+        by_module=True,
+        module_map=prepared.variant.module_map,
+        threads=study.timing.threads,
+    )
+    trace = profile(prepared.model, study.held_out, None, options, listener).trace
+    return {
+        module: _scaled(samples, clock.scale)
+        for module, samples in trace.modules_us.items()
+    }
+
+
+def _scaled(samples_us: Iterable[int], scale: float) -> tuple[int, ...]:
+    return tuple(round(each * scale) for each in samples_us)
