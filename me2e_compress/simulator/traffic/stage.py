@@ -3,7 +3,6 @@
 import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from types import GeneratorType
 
 import numpy as np
 from highway_env.vehicle.objects import RoadObject
@@ -49,8 +48,6 @@ class Stage:
         self.parameters: dict[str, Parameter] = {}
         # set by layouts and scripts
         self.network = Network()
-        self.layout = ""
-        self.script_names: list[str] = []
         self.scripts: list[Script] = []
         self.bodies: list[Car | Walker] = []
         self.static_objects: list[StaticObject] = []
@@ -121,10 +118,8 @@ class Stage:
         """Add a script.
 
         It runs up to its first ``yield`` at once, so that its actors are there at frame
-        0. Its function's name becomes the script's name.
+        0.
         """
-        if isinstance(script, GeneratorType):
-            self.script_names.append(script.__name__)
         if next(script, self) is not self:
             self.scripts.append(script)
 
@@ -143,16 +138,17 @@ class Stage:
 
     def car(
         self,
-        lanes: Sequence[LaneIndex],
+        chain: Sequence[LaneIndex],
         s_m: float,
         speed_mps: float,
         target_mps: float | None = None,
         kind: ActorKind = ActorKind.CAR,
         behaviour: Behaviour | None = None,
     ) -> Car:
-        """Put a car on a chain of lanes."""
+        """Put a car on a chain of lanes, at an arc length from its beginning."""
+        lanes, s = self.network.rest(chain, s_m)
         car = Car(
-            self._id(), self.network, lanes, s_m, speed_mps, target_mps, kind, behaviour
+            self._id(), self.network, lanes, s, speed_mps, target_mps, kind, behaviour
         )
         self.bodies.append(car)
         return car
@@ -190,6 +186,11 @@ class Stage:
         regulator = Regulator(number, kind, line, line_s, state, width_m=width_m)
         self.regulators.append(regulator)
         return regulator
+
+    def add_crosswalk(self, corners: Sequence[Pose]) -> None:
+        """Paint a crosswalk between four corners."""
+        a, b, c, d = ((corner.x, corner.y) for corner in corners)
+        self.crosswalks.append((a, b, c, d))
 
     def route_pose(self, s_m: float, left_m: float = 0.0) -> Pose:
         """Return a pose beside the route."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
+from me2e_compress.simulator.scenarios.layouts.streets import Street
 from me2e_compress.simulator.scenarios.scripts.synchronise import steps_out
 from me2e_compress.simulator.scene import ActorKind
 from me2e_compress.simulator.traffic.bodies import Walker
@@ -14,7 +15,7 @@ from me2e_compress.simulator.traffic.stage import Script, Stage
 HALF_LANE_M = LANE_WIDTH_M / 2
 
 
-def walker_behind_van(stage: Stage) -> Script:
+def walker_behind_van(stage: Stage, _: Street) -> Script:
     """Send a pedestrian out from behind a van that stands at the kerb."""
     s = stage.uniform("crossing_m", 60.0, 85.0)
     speed = stage.uniform("walk_mps", 1.5, 2.5)
@@ -25,7 +26,7 @@ def walker_behind_van(stage: Stage) -> Script:
     stage.fire("walker_behind_van", walker)
 
 
-def walker_between_cars(stage: Stage) -> Script:
+def walker_between_cars(stage: Stage, _: Street) -> Script:
     """Send a pedestrian out between two parked cars."""
     s = stage.uniform("crossing_m", 60.0, 85.0)
     speed = stage.uniform("walk_mps", 1.4, 2.2)
@@ -37,7 +38,7 @@ def walker_between_cars(stage: Stage) -> Script:
     stage.fire("walker_between_cars", walker)
 
 
-def walkers_on_zebra(stage: Stage) -> Script:
+def walkers_on_zebra(stage: Stage, _: Street) -> Script:
     """Send two to four people over the crosswalk from both sides."""
     s = float(stage.parameters["crosswalk_m"])
     count = stage.integer("walkers", 2, 4)

@@ -20,16 +20,6 @@ NEAR_M = 30.0
 TOUCH_M = 1.0
 
 
-def on_chain(
-    network: Network, chain: Sequence[LaneIndex], s_m: float
-) -> tuple[list[LaneIndex], float]:
-    """Return the rest of a chain from an arc length on, and that in its first lane."""
-    lanes = list(chain)
-    while len(lanes) > 1 and s_m > network.length(lanes[0]):
-        s_m -= network.length(lanes.pop(0))
-    return lanes, s_m
-
-
 def chain_points(network: Network, chain: Sequence[LaneIndex]) -> tuple[Floats, Floats]:
     """Return the centre line [N, 2] of a chain and the arc length [N] of each point."""
     points, stations, done = list[Floats](), list[Floats](), 0.0
