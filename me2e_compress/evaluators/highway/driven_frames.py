@@ -10,7 +10,6 @@ from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.realtime import DT_US
 from me2e_compress.errors import FramesError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
-from me2e_compress.evaluators.highway.durations import EXPERT_S
 from me2e_compress.evaluators.highway.endings import EndingRules
 from me2e_compress.evaluators.highway.expert import Expert
 from me2e_compress.evaluators.highway.generate import propose, seed_of
@@ -18,6 +17,7 @@ from me2e_compress.evaluators.highway.observe import ObservationBuilder
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
 from me2e_compress.simulator.routes import Route, load_routes
+from me2e_compress.simulator.scenarios.catalogue import EXPERT_S
 from me2e_compress.simulator.world import World
 
 STEP_US = 500_000

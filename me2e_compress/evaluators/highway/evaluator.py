@@ -7,13 +7,13 @@ from typing import ClassVar
 
 from me2e_compress.driving.policies import opened
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.durations import longest_first
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scenarios.catalogue import EXPERT_S
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,14 @@ class HighwayEvaluator:
                 "it, so they are driven one at a time"
             )
         return LocalEngine(1)
+
+
+def longest_first(routes: Sequence[Route]) -> list[Route]:
+    """Order routes by the typical duration of their type, longest first.
+
+    A long route that starts last would keep all other workers waiting.
+    """
+    return sorted(routes, key=lambda route: (-EXPERT_S[route.scenario], route.id))
 
 
 def progress_of(episodes: Sequence[Episode], total: int) -> DrivingProgress:

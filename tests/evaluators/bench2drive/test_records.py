@@ -11,7 +11,6 @@ from me2e_compress.evaluators.bench2drive.records import (
     number_of,
     read_record,
 )
-from me2e_compress.evaluators.bench2drive.scenario_types import TYPES
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Ending, Given
 from me2e_compress.metrics.infraction import InfractionKind
@@ -169,19 +168,6 @@ def test_whatever_stands_in_a_record(data: st.DataObject, value: Any) -> None:
 
     with contextlib.suppress(BrokenRecordError):
         read_record(raw)
-
-
-def test_the_types_are_as_many_as_bench2drive_has() -> None:
-    counts = {ability: len(types) for ability, types in TYPES.items()}
-
-    assert counts == {
-        "Overtaking": 9,
-        "Merging": 16,
-        "Emergency_Brake": 12,
-        "Give_Way": 2,
-        "Traffic_Signs": 19,
-    }
-    assert len({each for types in TYPES.values() for each in types}) == 44
 
 
 def test_numbers_are_found_as_the_tools_find_them() -> None:
