@@ -14,11 +14,9 @@ import numpy.typing as npt
 
 from me2e_compress.agents.carla_interface import SensorData
 from me2e_compress.agents.carla_rig import GPS, IMU, SPEED, CarlaRig, Triple
-from me2e_compress.agents.geo_reference import GeoReference
-from me2e_compress.agents.route_follower import RouteFollower
-from me2e_compress.driving.can_bus import can_bus_between
-from me2e_compress.driving.contract import Observation
-from me2e_compress.driving.ego_kinematics import EgoKinematics
+from me2e_compress.agents.route_follower import GeoReference, RouteFollower
+from me2e_compress.driving.contract import EgoKinematics, Observation
+from me2e_compress.driving.ego_track import can_bus_between
 from me2e_compress.errors import MissingExtraError
 
 if find_spec("cv2") is None:

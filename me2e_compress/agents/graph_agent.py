@@ -4,6 +4,7 @@ from pathlib import Path
 
 from pydantic import Field
 
+from me2e_compress.agents.agent_logs import MetricInfo
 from me2e_compress.agents.agent_options import AgentOptions, conf_parts, route_folder
 from me2e_compress.agents.carla_interface import (
     CarlaControl,
@@ -25,7 +26,6 @@ from me2e_compress.agents.carla_rig import (
     Triple,
 )
 from me2e_compress.agents.forwarding import ForwardingAgent
-from me2e_compress.agents.metric_info import MetricInfo
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import PedalsAndWheel

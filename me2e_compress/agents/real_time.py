@@ -13,23 +13,24 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from me2e_compress.agents.agent_module import (
+from me2e_compress.agents.agent_logs import DecisionLog, DecisionRecord, MetricInfo
+from me2e_compress.agents.agent_options import (
+    AgentOptions,
     agent_class,
     agent_module,
+    conf_parts,
     function_named,
+    route_folder,
 )
-from me2e_compress.agents.agent_options import AgentOptions, conf_parts, route_folder
 from me2e_compress.agents.carla_interface import (
     CarlaControl,
     SensorData,
     SensorSpecs,
+    agents_around,
     carla_control,
     copy_of,
 )
-from me2e_compress.agents.decision_log import DecisionLog, DecisionRecord
 from me2e_compress.agents.forwarding import ForwardingAgent
-from me2e_compress.agents.metric_info import MetricInfo
-from me2e_compress.agents.traffic_around import agents_around
 from me2e_compress.driving.latency import (
     Charge,
     DecisionFacts,

@@ -29,9 +29,26 @@ from typing import ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.ego_kinematics import EgoKinematics
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.runtime.trajectory import Trajectory
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class EgoKinematics:
+    """Pose and motion of the ego in a right-handed world, x east, y north.
+
+    The heading is in radians counter-clockwise from east; vectors are in the ego frame.
+    """
+
+    x: float
+    y: float
+    heading: float
+    speed_mps: float
+    acceleration_mps2: Triple
+    angular_velocity_radps: Triple
+
 
 __all__ = [
     "CAN_BUS_SIZE",

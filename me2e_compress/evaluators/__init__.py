@@ -16,7 +16,7 @@ EVALUATORS: Registry[Evaluator] = Registry(
     _HERE,
     EvaluationError,
     {
-        "highway": f"{_HERE}.highway.evaluation_options:HighwayEvaluation",
+        "highway": f"{_HERE}.highway.evaluator:HighwayEvaluation",
         "bench2drive": f"{_HERE}.bench2drive.real_results:Bench2DriveResults",
     },
 )

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.simulator.cameras import paint_texture
@@ -135,6 +137,9 @@ def _chosen(baseline: str, drives: Sequence[DriveRecord], limit: int) -> list[_P
     return chosen
 
 
+_FORGOTTEN = np.zeros((0, 0, 0, 3), np.uint8)
+
+
 @dataclass
 class _Film:
     """Keeps all positions, and the camera images of the latest moment only."""
@@ -144,7 +149,7 @@ class _Film:
 
     def see(self, moment: Moment) -> None:
         if self.moments:
-            self.moments[-1] = replace(self.moments[-1], images=None)
+            self.moments[-1] = replace(self.moments[-1], images=_FORGOTTEN)
         self.moments.append(moment)
         if moment.scene.time_us >= self.until_us:
             raise _Enough

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from me2e_compress.driving.latency_source import DecisionFacts
+from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import LatencyModel, skipped_decisions
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.catalogue import EXPERT_S

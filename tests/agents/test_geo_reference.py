@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.agents.geo_reference import GeoReference
+from me2e_compress.agents.route_follower import GeoReference
 from tests.agents.small_leaderboard import LATITUDE, LONGITUDE, gps_of
 
 metres = st.floats(-8000, 8000)

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from me2e_compress.agents.traffic_around import agents_around
+from me2e_compress.agents.carla_interface import agents_around
 from tests.agents.small_leaderboard import World
 
 

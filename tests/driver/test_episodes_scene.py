@@ -163,7 +163,7 @@ def signal(
 
 
 def test_a_signal_is_told_in_the_ego_frame() -> None:
-    phase = Phase(5, 32.0, SignalState.YELLOW, None)
+    phase = Phase(5, 32.0, SignalState.YELLOW)
 
     rows = signals(
         frame(signal(5, 12.0, state=SignalState.YELLOW), phases=(phase,)), 20.0
@@ -182,7 +182,7 @@ def test_no_signal_is_no_red_light() -> None:
 def test_signals_of_the_route_come_first() -> None:
     far, near, nearer = signal(1, 40.0), signal(2, 9.0), signal(3, 5.0)
 
-    rows = signals(frame(near, nearer, far, phases=(Phase(1, 60.0, None, None),)), 0.0)
+    rows = signals(frame(near, nearer, far, phases=(Phase(1, 60.0, None),)), 0.0)
 
     assert rows[:3, 2] == pytest.approx([40.0, 5.0, 9.0])
     assert np.isnan(rows[:, 6]).tolist() == [False, True, True, True]

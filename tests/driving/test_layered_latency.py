@@ -3,8 +3,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from me2e_compress.driving.latency import LATENCY_SOURCES, parse_latency
-from me2e_compress.driving.latency_source import DecisionFacts, LatencySource
+from me2e_compress.driving.latency import (
+    LATENCY_SOURCES,
+    DecisionFacts,
+    LatencySource,
+    parse_latency,
+)
 from me2e_compress.driving.layered_latency import AgentsLatency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions

@@ -9,8 +9,7 @@ from typing import ClassVar
 import pytest
 
 from me2e_compress.driving.contract import Policy
-from me2e_compress.driving.policies import Driver, driver_named, opened
-from me2e_compress.driving.python_policy import PythonDriver
+from me2e_compress.driving.policies import Driver, PythonDriver, driver_named, opened
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver

@@ -9,16 +9,16 @@ from typing import ClassVar
 
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.bench2drive.drive_recordings import DriveRecordings
-from me2e_compress.evaluators.bench2drive.logged_decisions import read_decisions
 from me2e_compress.evaluators.bench2drive.recordings import (
     TICK_S,
     BrokenRecordingError,
     RecordedRoute,
+    read_decisions,
     read_recording,
 )
 from me2e_compress.evaluators.bench2drive.records import RouteRecord
 from me2e_compress.evaluators.bench2drive.result_files import (
+    DriveRecordings,
     FoundFiles,
     ResultFile,
     find_files,

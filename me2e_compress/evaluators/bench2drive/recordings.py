@@ -8,12 +8,15 @@ CARLA's left-handed world. They write no time; it is inferred from the motion.
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from me2e_compress.metrics.episode import LARGEST, EgoFrame
+from me2e_compress import documents
+from me2e_compress.metrics.episode import LARGEST, EgoFrame, InferenceRecord
 
 TICK_S = 0.05
 """Simulated seconds between two ticks of a leaderboard run."""
@@ -211,3 +214,26 @@ def _vector(step: str, values: object, part: str, size: int) -> Sequence[float]:
     if not all(abs(each) <= LARGEST for each in vector):  # NaN compares as false
         raise BrokenRecordingError(f"step {step}: {part} is not finite")
     return vector[:size]
+
+
+_Count = Annotated[int, Field(ge=0, le=LARGEST)]
+
+
+class _Line(BaseModel):
+    model_config = ConfigDict(strict=True, extra="ignore")
+    frame: _Count
+    latency_us: _Count
+
+
+def read_decisions(path: Path) -> tuple[InferenceRecord, ...]:
+    """Read a ``decisions.jsonl``."""
+    found = list[InferenceRecord]()
+    lines = documents.content(path, documents.LARGEST_LOG_BYTES).splitlines()
+    for number, line in enumerate(lines, 1):
+        try:
+            noted = _Line.model_validate(documents.from_json(line))
+        except (documents.MalformedError, ValidationError) as error:
+            raise BrokenRecordingError(f"line {number} is no decision") from error
+        time_us = round(1e6 * TICK_S * noted.frame)
+        found.append(InferenceRecord(time_us, noted.latency_us))
+    return tuple(found)

@@ -29,10 +29,11 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from me2e_compress.driving.answer import timed
-from me2e_compress.driving.contract import Plan, Trajectory
+from me2e_compress.driving.contract import PedalsAndWheel, Plan, Trajectory
 from me2e_compress.simulator.bicycle import (
     advance,
     slip_of,
+    steering_of,
     steering_through,
 )
 from me2e_compress.simulator.plane_geometry import Floats, resample
@@ -77,9 +78,7 @@ class AnchoredPlan:
         times = np.concatenate([[0.0], trajectory.times_s])
         knots, travel = _advance_only(points)
         local = _smooth(knots, slip_of(ego.steering_rad))
-        cos, sin = math.cos(ego.heading), math.sin(ego.heading)
-        turn = np.array([[cos, sin], [-sin, cos]])
-        return cls(time_us, local @ turn + (ego.x, ego.y), travel, times)
+        return cls(time_us, ego.placed(local), travel, times)
 
     def nearest(self, x: float, y: float) -> float:
         """Return the arc length (m) of the curve point nearest to a position."""
@@ -203,3 +202,25 @@ def _smooth(knots: Floats, course: float) -> Floats:
     # the straight extension, and even spacing
     beyond = curve[-1] + np.linspace(0.0, BEYOND_M, 2)[1:, None] * tangent
     return resample(np.vstack([curve, beyond]), STATION_M)
+
+
+STEER_GAIN_RAD = 0.36848336
+FRONT_AXLE_M, REAR_AXLE_M = -0.090769015, 1.4178275
+"""World on Rails: wheel angle of a full steer, axles from the centre."""
+
+
+def control_of(asked: PedalsAndWheel, length_m: float) -> Control:
+    """Return acceleration and front wheel angle; steer to the right is positive."""
+    braking, thrust = ACCELERATION_RANGE_MPS2
+    curvature = curvature_by(-asked.steer)
+    sine = min(max(curvature * length_m / 2, -1.0), 1.0)
+    return Control(
+        asked.throttle * thrust + asked.brake * braking, steering_of(math.asin(sine))
+    )
+
+
+def curvature_by(steer: float) -> float:
+    """Return the curvature (1/m) of the circle that CARLA's car drives at a steer."""
+    share = REAR_AXLE_M / (FRONT_AXLE_M + REAR_AXLE_M)
+    slip = math.atan(share * math.tan(STEER_GAIN_RAD * steer))
+    return math.sin(slip) / REAR_AXLE_M

@@ -10,10 +10,10 @@ from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.realtime import DT_US
 from me2e_compress.errors import FramesError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
-from me2e_compress.evaluators.highway.endings import EndingRules
 from me2e_compress.evaluators.highway.expert import Expert
 from me2e_compress.evaluators.highway.generate import propose, seed_of
 from me2e_compress.evaluators.highway.observe import ObservationBuilder
+from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
 from me2e_compress.simulator.routes import Route, load_routes

@@ -10,14 +10,19 @@ from highway_env.vehicle.objects import RoadObject
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import Floats, Point, RoutePath
 from me2e_compress.simulator.routes import Parameter, Route
-from me2e_compress.simulator.scene import ActorKind, SignalKind, SignalState
+from me2e_compress.simulator.scene import (
+    ActorKind,
+    Event,
+    EventKind,
+    SignalKind,
+    SignalState,
+)
 from me2e_compress.simulator.traffic.bodies import (
     EgoVehicle,
     StaticObject,
     Walker,
 )
 from me2e_compress.simulator.traffic.cars import Behaviour, Car
-from me2e_compress.simulator.traffic.events import Event, EventKind
 from me2e_compress.simulator.traffic.legs import Leg, build_path
 from me2e_compress.simulator.traffic.network import (
     LANE_WIDTH_M,

@@ -1,6 +1,6 @@
 """The world that a route unfolds in."""
 
-from me2e_compress.simulator.traffic.events import (
+from me2e_compress.simulator.scene import (
     INFRACTIONS,
     Event,
     EventKind,

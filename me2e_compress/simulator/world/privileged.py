@@ -40,13 +40,11 @@ class Phase:
         signal_id: As in the scene.
         line_s: Arc length at which the route crosses its line, m.
         state: Phase of a light, None for signs.
-        remaining_s: Seconds until the phase changes; None if that depends on the ego.
     """
 
     signal_id: int
     line_s: float
     state: SignalState | None
-    remaining_s: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +72,7 @@ def phase_of(regulator: Regulator) -> Phase | None:
     """Return a signal on the ego's route; None if the route does not meet it."""
     if regulator.line_s is None:
         return None
-    return Phase(regulator.id, regulator.line_s, regulator.state, regulator.remaining_s)
+    return Phase(regulator.id, regulator.line_s, regulator.state)
 
 
 def _way(car: Car) -> Floats:

@@ -7,10 +7,9 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import Roadmap, RoutePath
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.builders import Builder, stage_of
-from me2e_compress.simulator.scene import Actor, Control, Scene
+from me2e_compress.simulator.scene import Actor, Control, Event, EventKind, Scene
 from me2e_compress.simulator.traffic.bodies import StaticObject, Walker
 from me2e_compress.simulator.traffic.cars import Car
-from me2e_compress.simulator.traffic.events import Event, EventKind
 from me2e_compress.simulator.traffic.traffic_road import TrafficRoad
 from me2e_compress.simulator.world.privileged import (
     Privileged,

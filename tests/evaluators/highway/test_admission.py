@@ -3,10 +3,12 @@ from dataclasses import replace
 import pytest
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.admission import Admission, DryRun, examine
 from me2e_compress.evaluators.highway.generate import (
+    Admission,
+    DryRun,
     ScenarioRoutes,
     admitted_routes,
+    examine,
     generate,
     propose,
     seed_of,

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.collision_optimizer import CollisionOptimizer
 from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
-from me2e_compress.driving.host_stage import HostStage, HostWork
+from me2e_compress.driving.host_stage import CollisionOptimizer, HostStage, HostWork
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions

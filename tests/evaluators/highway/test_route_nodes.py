@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from me2e_compress.evaluators.highway.route_nodes import APART_M, RouteNodes
+from me2e_compress.evaluators.highway.observe import APART_M, RouteNodes
 from me2e_compress.simulator.scene import Ego, RoutePath
 
 

@@ -1,7 +1,7 @@
 import pytest
 
 from me2e_compress.driving.contract import PedalsAndWheel
-from me2e_compress.evaluators.highway.vehicle_map import control_of, curvature_by
+from me2e_compress.evaluators.highway.controller import control_of, curvature_by
 from me2e_compress.simulator.bicycle import MAX_STEERING_RAD, curvature_of
 
 LENGTH_M = 5.0

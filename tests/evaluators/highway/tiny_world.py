@@ -111,7 +111,7 @@ class TinyWorld:
         return Scene(self.time_us, self.ego, self.actors, self.signals)
 
     def privileged(self) -> Privileged:
-        phases = (Phase(s.id, s.stop_line[0][0], s.state, None) for s in self.signals)
+        phases = (Phase(s.id, s.stop_line[0][0], s.state) for s in self.signals)
         return Privileged(self.intents, tuple(phases))
 
     def step(self, control: Control) -> None:

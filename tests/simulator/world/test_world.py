@@ -214,7 +214,7 @@ def test_a_script_may_add_actors_while_it_runs() -> None:
 def test_cars_that_leave_the_map_are_gone() -> None:
     def leaver(stage: Stage) -> None:
         street = two_way(stage)
-        stage.car(street.ahead(0), street.road.length_m - 6.0, 10.0)
+        stage.car(street.ahead(0), stage.network.length(street.ahead()[0]) - 6.0, 10.0)
 
     world = World(route_of(), builder=leaver)
     assert len(world.scene().actors) == 1

@@ -24,7 +24,7 @@ from me2e_compress.evaluators.highway.expert.speed_limits import (
     slowed,
 )
 from me2e_compress.evaluators.highway.observe import scene_and_world
-from me2e_compress.evaluators.highway.reentry import in_ego_frame, slope_of
+from me2e_compress.evaluators.highway.reentry import slope_of
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import RoutePath, Scene
 from me2e_compress.simulator.world.privileged import Privileged
@@ -100,7 +100,7 @@ def decide(
     target = float(future.target_m[best])
     columns = future.x[best, WAYPOINTS], future.y[best, WAYPOINTS]
     return ExpertDecision(
-        in_ego_frame(*columns, ego),
+        ego.seen(*columns),
         float(future.acceleration[best]),
         target,
         float(cost[best]),

@@ -8,9 +8,8 @@ from me2e_compress.simulator.scenarios.scripts.synchronise import (
     nearest_station,
     patience,
 )
-from me2e_compress.simulator.scene import ActorKind, SignalState
+from me2e_compress.simulator.scene import ActorKind, Event, EventKind, SignalState
 from me2e_compress.simulator.traffic.cars import Behaviour
-from me2e_compress.simulator.traffic.events import Event, EventKind
 from me2e_compress.simulator.traffic.stage import Script, Stage
 
 YELLOW_S = 2.0

@@ -1,4 +1,4 @@
-"""The use of each output of a graph, whether or not the model could drive."""
+"""The use of each input and output of a graph, whether or not it could drive."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,12 +6,88 @@ from typing import Self
 
 from me2e_compress.driving.adapter.adapter import Adapter
 from me2e_compress.driving.adapter.controls import ControlAdapter, output_named
+from me2e_compress.driving.adapter.feeds import Feed
+from me2e_compress.driving.adapter.image_inputs import ImageInput
+from me2e_compress.driving.adapter.inputs import ModelInputs
 from me2e_compress.driving.adapter.outputs import ModelOutputs
-from me2e_compress.driving.adapter.port_use import PortUse, element_type
-from me2e_compress.driving.ports import Shape
+from me2e_compress.driving.adapter.recurrent import ZEROS
+from me2e_compress.driving.input_sources import INPUT_SOURCES
+from me2e_compress.driving.ports import Shape, zeros
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.plan_adapter import CONTRACT_STEP_S, PlanAdapter
+from me2e_compress.runtime.session import DTYPES, SessionPort
+
+
+@dataclass(frozen=True)
+class PortUse:
+    """One input or output of a graph, and its part in driving.
+
+    ``use`` is an input's feed or how an output is read, None for nothing; ``problem``
+    says why the model cannot drive so, and is empty where it can.
+    """
+
+    name: str
+    shape: Shape
+    type: str
+    use: str | None
+    problem: str = ""
+
+
+def element_type(of_port: str) -> str:
+    """Return ``int64`` of ``tensor(int64)``."""
+    return of_port.removeprefix("tensor(").removesuffix(")")
+
+
+def input_uses(
+    session: AnySession, adapter: Adapter, recurrent: Mapping[str, str]
+) -> tuple[PortUse, ...]:
+    """List the inputs of a graph, in its order, with what each is fed."""
+    found, problems = ModelInputs.found(session, adapter, recurrent)
+    # each input's feed in words
+    words = {
+        name: f"{answer} of the frame before" for name, answer in recurrent.items()
+    }
+    words |= {name: image_words(table) for name, table in found.tables.items()}
+    words |= {name: feed_words(feed) for name, feed in found.given.items()}
+    # faults of types and first values
+    for name, port in session.inputs.items():
+        if port.type not in DTYPES:
+            problems[name] = f"input {name} is {port.type}: it cannot be fed"
+        elif name in recurrent:
+            entry = (adapter.recurrent or {}).get(name)
+            if entry is None or entry.first == ZEROS:
+                problems |= _no_start(name, port)
+    return tuple(
+        PortUse(
+            name,
+            port.shape,
+            element_type(port.type),
+            words.get(name),
+            problems.get(name, ""),
+        )
+        for name, port in session.inputs.items()
+    )
+
+
+def image_words(table: ImageInput) -> str:
+    """Tell which cameras an image shows."""
+    count = len(table.cameras)
+    words = "the six cameras" if count == 6 else ", ".join(table.cameras)
+    return f"{words}, side by side" if table.stitch else words
+
+
+def feed_words(feed: Feed) -> str:
+    """Tell what an input is made of, with the options that were chosen."""
+    return ", ".join(INPUT_SOURCES.text(part.source) for part in feed.parts)
+
+
+def _no_start(name: str, port: SessionPort) -> dict[str, str]:
+    try:
+        zeros(name, port)
+    except EvaluationError as error:
+        return {name: str(error)}
+    return {}
 
 
 @dataclass(frozen=True)
