@@ -18,12 +18,12 @@ from multiprocessing import get_context
 
 from me2e_compress.driving.realtime import HeldControl
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
-from me2e_compress.evaluators.highway.expert import Memory, ceiling, decide
+from me2e_compress.evaluators.highway.expert.expert_policy import Memory, decide
+from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
-from me2e_compress.simulator.scene import Control
-from me2e_compress.simulator.world import INFRACTIONS, EndReason, EventKind
-from me2e_compress.simulator.world.world import World
+from me2e_compress.simulator.scene import INFRACTIONS, Control, EventKind
+from me2e_compress.simulator.world import EndReason, World
 
 FIRST_SEED = 900_000
 TIME_LIMIT_S = 90.0

@@ -16,7 +16,7 @@ from driver.episodes.agents import (
 )
 from driver.episodes.jpeg import pictures
 from driver.episodes.recording_policy import LabelledFrame
-from me2e_compress.evaluators.highway.expert import decide
+from me2e_compress.evaluators.highway.expert.expert_policy import decide
 from me2e_compress.evaluators.highway.observe import can_bus_of
 from me2e_compress.evaluators.highway.reentry import beyond
 from me2e_compress.simulator.cameras import (
@@ -26,8 +26,9 @@ from me2e_compress.simulator.cameras import (
 )
 from me2e_compress.simulator.cameras.birdseye import ground_classes
 from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.privileged import Privileged
 from me2e_compress.simulator.scene import RoutePath, Signal, SignalKind, SignalState
-from me2e_compress.simulator.world import Privileged, World
+from me2e_compress.simulator.world import World
 
 SIGNALS = 4
 SIGNAL_COLUMNS = 8

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
@@ -21,16 +21,8 @@ class AgentOptions(BaseModel):
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a TOML file."""
-        try:
+        with documents.reading(path, EvaluationError, "not options of an agent"):
             return cls.model_validate(documents.from_toml(documents.content(path)))
-        except OSError as error:
-            raise EvaluationError(f"{path}: {error.strerror}") from error
-        except documents.MalformedError as error:
-            raise EvaluationError(f"{path}: not TOML: {error}") from error
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            where = ".".join(map(str, first["loc"])) or "the file"
-            raise EvaluationError(f"{path}: {where}: {first['msg']}") from error
 
 
 def conf_parts(text: str) -> tuple[Path, str]:

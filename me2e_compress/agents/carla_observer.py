@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -40,16 +40,6 @@ class CarlaReading:
     command: int
     node: tuple[float, float]
     node_after: tuple[float, float]
-
-
-class Preprocessing(Protocol):
-    """Makes the observation of a tick that decides, from sensors and reading."""
-
-    def observe(
-        self, sensors: SensorData, reading: CarlaReading, time_us: int
-    ) -> Observation:
-        """Return what the policy gets from all of the tick's data and its reading."""
-        ...
 
 
 class RouteReader:

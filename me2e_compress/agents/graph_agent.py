@@ -8,6 +8,7 @@ from me2e_compress.agents.agent_logs import MetricInfo
 from me2e_compress.agents.agent_options import AgentOptions, conf_parts, route_folder
 from me2e_compress.agents.carla_interface import (
     CarlaControl,
+    ForwardingAgent,
     SensorData,
     SensorSpecs,
     autonomous_agent_class,
@@ -16,7 +17,6 @@ from me2e_compress.agents.carla_interface import (
 from me2e_compress.agents.carla_observer import (
     CarlaObserver,
     CarlaReading,
-    Preprocessing,
     RouteReader,
 )
 from me2e_compress.agents.carla_rig import (
@@ -25,7 +25,6 @@ from me2e_compress.agents.carla_rig import (
     CarlaRig,
     Triple,
 )
-from me2e_compress.agents.forwarding import ForwardingAgent
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import PedalsAndWheel
@@ -124,7 +123,7 @@ class GraphAgent(ForwardingAgent):
         self._policy = options.policy()
         observer = options.observer(self._policy)
         self._specs = observer.rig.specs(observer.seen)
-        self._observer: Preprocessing = observer
+        self._observer = observer
         self._pid = WaypointPid(options.pid)
         self._reader: RouteReader | None = None
         self._began_s: float | None = None

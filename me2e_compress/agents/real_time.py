@@ -24,13 +24,13 @@ from me2e_compress.agents.agent_options import (
 )
 from me2e_compress.agents.carla_interface import (
     CarlaControl,
+    ForwardingAgent,
     SensorData,
     SensorSpecs,
     agents_around,
     carla_control,
     copy_of,
 )
-from me2e_compress.agents.forwarding import ForwardingAgent
 from me2e_compress.driving.latency import (
     Charge,
     DecisionFacts,

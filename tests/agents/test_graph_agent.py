@@ -307,7 +307,7 @@ def test_a_plan_that_is_not_finite_ends_the_route(
         ('model = "m.onnx"\njpeg_quality = 101', "jpeg_quality"),
         ('model = "m.onnx"\n[[cameras]]\nid = "A"\nx = 0\ny = 0\nyaw = 0', "cameras"),
         ('model = "m.onnx"\n[pid]\nturn_kq = 1', "pid.turn_kq"),
-        ("model = ", "not TOML"),
+        ("model = ", "not options of an agent"),
     ],
 )
 def test_bad_options_are_one_line(

@@ -11,7 +11,8 @@ from driver.episodes import GRID
 from driver.episodes.agents import agents
 from driver.episodes.episode_arrays import Arrays, signals
 from driver.episodes.recording_policy import LabelledFrame
-from me2e_compress.evaluators.highway.expert import ExpertDecision, Memory
+from me2e_compress.evaluators.highway.expert.expert_policy import ExpertDecision, Memory
+from me2e_compress.simulator.privileged import Phase
 from me2e_compress.simulator.scene import (
     DIMENSIONS,
     Actor,
@@ -22,7 +23,6 @@ from me2e_compress.simulator.scene import (
     SignalKind,
     SignalState,
 )
-from me2e_compress.simulator.world import Phase
 
 NORTH = Ego(100.0, 50.0, math.pi / 2, 8.0, 0.0, 0.0, 0.0, 0.0, 5.0, 2.0)
 """Looks north: 10 m ahead is (100, 60), 3 m to its left (97, 50)."""

@@ -11,7 +11,7 @@ from me2e_compress.driving.contract import Policy
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind
 from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.expert import Expert
+from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import InfractionKind
@@ -19,7 +19,8 @@ from me2e_compress.runtime.children import pool
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.builders import stage_of
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES, VARIANTS
-from me2e_compress.simulator.world import Event, EventKind, World
+from me2e_compress.simulator.scene import EventKind
+from me2e_compress.simulator.world import World
 
 ENDS_ONLY = (
     InfractionKind.ROUTE_TIMEOUT,
@@ -52,9 +53,9 @@ class DryRun:
 
 def dry_run(route: Route, policy: Policy) -> DryRun:
     """Drive a route once with a policy that decides at every frame."""
-    seen = _WorldListener()
-    episode = drive(route, policy, Conditions(), Listeners(on_query=seen.watch))
-    kinds = [event.kind for event in seen.events]
+    worlds = list[World]()
+    episode = drive(route, policy, Conditions(), Listeners(on_query=worlds.append))
+    kinds = [event.kind for event in worlds[-1].events]
     faults = [found.kind for found in episode.infractions]
     return DryRun(
         tuple(dict.fromkeys(kind for kind in faults if kind not in ENDS_ONLY)),
@@ -64,18 +65,6 @@ def dry_run(route: Route, policy: Policy) -> DryRun:
         episode.frames[-1].time_us / 1e6 if episode.frames else 0.0,
         episode.failure,
     )
-
-
-class _WorldListener:
-    def __init__(self) -> None:
-        self._world: World | None = None
-
-    def watch(self, world: World) -> None:
-        self._world = world
-
-    @property
-    def events(self) -> tuple[Event, ...]:
-        return () if self._world is None else self._world.events
 
 
 @dataclass(frozen=True, slots=True)

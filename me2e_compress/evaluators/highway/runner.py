@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +11,6 @@ import numpy.typing as npt
 from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import (
     HostedPolicy,
-    Observation,
     PedalsAndWheel,
     Policy,
     Trajectory,
@@ -93,6 +93,7 @@ class EndingRules:
 
 
 Plan = npt.NDArray[np.float64]
+T = TypeVar("T")
 
 
 class PolicyFailedError(Exception):
@@ -163,7 +164,7 @@ class _Drive:
         # record, decide and step until a rule ends the route
         try:
             self.listeners.on_query(world)
-            _reset(self.policy, self.route)
+            _ask(lambda: self.policy.reset(self.route))
             self.listeners.on_answer()
             while ending is None:
                 self.recorder.record(scene)
@@ -186,7 +187,7 @@ class _Drive:
         observation = self.observer.observe(scene)
         self.listeners.on_query(self.world)
         begun = time.perf_counter_ns()
-        answer = _ask(self.policy, observation)
+        answer = _ask(lambda: self.policy.plan(observation))
         took_us = (time.perf_counter_ns() - begun) // 1_000
         self.listeners.on_answer()
         # the latency source may use the measured time
@@ -215,19 +216,14 @@ class _Drive:
             self.listeners.on_moment(Moment(scene, images, plan, self.world.events))
 
 
-def _reset(policy: Policy, route: Route) -> None:
-    try:
-        policy.reset(route)
-    except Exception as error:
-        raise _failure(error) from error
-
-
-def _ask(policy: Policy, observation: Observation) -> object:
+def _ask(call: Callable[[], T]) -> T:
     """Call the policy; whatever it raises is its failure, not ours."""
     try:
-        return policy.plan(observation)
+        return call()
     except Exception as error:
-        raise _failure(error) from error
+        words = " ".join(str(error).split())
+        told = f"{type(error).__name__}: {words}" if words else repr(error)
+        raise PolicyFailedError(told) from error
 
 
 def _host_work(policy: Policy) -> tuple[int, int]:
@@ -235,13 +231,6 @@ def _host_work(policy: Policy) -> tuple[int, int]:
     if not isinstance(policy, HostedPolicy):
         return 0, 0
     return policy.host_iterations, policy.host_cells
-
-
-def _failure(error: Exception) -> PolicyFailedError:
-    words = " ".join(str(error).split())
-    return PolicyFailedError(
-        f"{type(error).__name__}: {words}" if words else repr(error)
-    )
 
 
 def _checked(answer: object) -> Trajectory | PedalsAndWheel:

@@ -7,13 +7,13 @@ from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation
 from me2e_compress.driving.realtime import HeldControl
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
-from me2e_compress.evaluators.highway.expert import Expert, Memory, ceiling, decide
+from me2e_compress.evaluators.highway.expert.expert_policy import Expert, Memory, decide
+from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.evaluators.highway.generate import dry_run
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
-from me2e_compress.simulator.scene import Control
-from me2e_compress.simulator.world import INFRACTIONS
-from me2e_compress.simulator.world.world import World
+from me2e_compress.simulator.scene import INFRACTIONS, Control
+from me2e_compress.simulator.world import World
 
 SEED = 77_001
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
-from me2e_compress.evaluators.highway.expert import Memory, ceiling, decide
+from me2e_compress.evaluators.highway.expert.expert_policy import Memory, decide
+from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.simulator.bicycle import advance
 from me2e_compress.simulator.plane_geometry import (
     Command,
@@ -14,6 +15,11 @@ from me2e_compress.simulator.plane_geometry import (
     RoutePath,
     polyline_headings,
     resample,
+)
+from me2e_compress.simulator.privileged import (
+    Intent,
+    Phase,
+    Privileged,
 )
 from me2e_compress.simulator.scene import (
     DIMENSIONS,
@@ -25,11 +31,6 @@ from me2e_compress.simulator.scene import (
     Signal,
     SignalKind,
     SignalState,
-)
-from me2e_compress.simulator.world.privileged import (
-    Intent,
-    Phase,
-    Privileged,
 )
 
 DT_US = 50_000

@@ -10,10 +10,10 @@ from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.simulator.plane_geometry import resample
 from me2e_compress.simulator.scenarios.layouts.streets import two_way
-from me2e_compress.simulator.scene import ActorKind, Control
+from me2e_compress.simulator.scene import ActorKind, Control, EventKind
 from me2e_compress.simulator.traffic.cars import Behaviour
 from me2e_compress.simulator.traffic.stage import Script, Stage
-from me2e_compress.simulator.world import EndReason, EventKind, World
+from me2e_compress.simulator.world import EndReason, World
 from tests.simulator.world.driving import (
     coast,
     drive_blind,

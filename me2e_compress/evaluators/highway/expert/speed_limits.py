@@ -7,6 +7,7 @@ import numpy as np
 
 from me2e_compress.evaluators.highway.expert.forecast import NOW_S, Forecast
 from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.privileged import Phase
 from me2e_compress.simulator.scene import (
     Ego,
     RoutePath,
@@ -15,7 +16,6 @@ from me2e_compress.simulator.scene import (
     SignalKind,
     SignalState,
 )
-from me2e_compress.simulator.world.privileged import Phase
 
 LATERAL_MPS2 = 2.2
 """Lateral acceleration in bends; the comfort bound of nuPlan is 4.89."""

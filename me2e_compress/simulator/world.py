@@ -5,17 +5,17 @@ from enum import StrEnum
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import Roadmap, RoutePath
+from me2e_compress.simulator.privileged import (
+    Privileged,
+    intent_of,
+    phase_of,
+)
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.builders import Builder, stage_of
 from me2e_compress.simulator.scene import Actor, Control, Event, EventKind, Scene
 from me2e_compress.simulator.traffic.bodies import StaticObject, Walker
 from me2e_compress.simulator.traffic.cars import Car
 from me2e_compress.simulator.traffic.traffic_road import TrafficRoad
-from me2e_compress.simulator.world.privileged import (
-    Privileged,
-    intent_of,
-    phase_of,
-)
 
 DT_US = 50_000
 """20 Hz, as Bench2Drive."""
