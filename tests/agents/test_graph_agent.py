@@ -261,23 +261,6 @@ def test_images_are_rgb_scaled_and_padded_with_the_mean(
     assert found[0][3:6] == pytest.approx([0.0, 0.0, 0.0])
 
 
-def test_the_state_is_fed_forward_and_new_on_every_route(
-    board: Leaderboard, tmp_path: Path
-) -> None:
-    model = straight_on(
-        tmp_path / "m.onnx",
-        inputs="float[1, 6, 2] steps",
-        body="steps_out = Add (steps, one) plan = Identity (steps_out)",
-        outputs="float[1, 6, 2] plan, float[1, 6, 2] steps_out",
-        initializers=", float one = {1.0}",
-    )
-    for _ in range(2):
-        agent = board.make(graph_agent, str(model))
-        found = heard(agent)
-        board.run(agent, 3)
-        assert [each[0] for each in found] == [1.0, 2.0, 3.0]
-
-
 def test_metric_info_is_written_where_the_leaderboard_looks(
     board: Leaderboard, tmp_path: Path
 ) -> None:
@@ -307,6 +290,8 @@ def test_a_plan_that_is_not_finite_ends_the_route(
         ('model = "m.onnx"\njpeg_quality = 101', "jpeg_quality"),
         ('model = "m.onnx"\n[[cameras]]\nid = "A"\nx = 0\ny = 0\nyaw = 0', "cameras"),
         ('model = "m.onnx"\n[pid]\nturn_kq = 1', "pid.turn_kq"),
+        ('model = "m.onnx"\n[pid]\nmax_throttle = -1.0', "pid.max_throttle"),
+        ('model = "m.onnx"\n[pid]\nturn_kp = nan', "pid.turn_kp"),
         ("model = ", "not options of an agent"),
     ],
 )

@@ -14,17 +14,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.agents import real_time
-from me2e_compress.driving.latency import DecisionFacts, parse_latency
 from me2e_compress.driving.realtime import DT_US, LatencyModel, control_clock
-from me2e_compress.errors import EvaluationError, MissingPackageError
+from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.real_results import Bench2DriveResults
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from tests.agents import small_leaderboard
 from tests.agents.small_leaderboard import (
     SAVE_NAME,
     Leaderboard,
-    VehicleControl,
-    World,
     installed,
     written,
 )
@@ -109,20 +106,6 @@ def test_measured_latency_holds_the_control(board: Leaderboard, tmp_path: Path) 
     assert kept == tuple(took_us[1 : agent.decisions])
 
 
-def test_the_trace_is_one_that_evaluate_takes(
-    board: Leaderboard, tmp_path: Path
-) -> None:
-    agent = board.make(real_time, f"{config(tmp_path)}+{SAVE_NAME}")
-    ticks = count(0, 7_000_000)
-    agent.now_ns = lambda: next(ticks)
-    board.run(agent, 5)
-    agent.destroy()
-
-    source = parse_latency(f"trace:{agent.save_path / 'latency.json'}")
-
-    assert source.on_route("any")(DecisionFacts(0)) == 7_000
-
-
 @pytest.mark.parametrize("name", ["vad.onnx", "vad.pth"])
 def test_the_trace_names_the_model(
     board: Leaderboard, tmp_path: Path, name: str
@@ -146,29 +129,6 @@ def test_every_decision_is_a_line(board: Leaderboard, tmp_path: Path) -> None:
     assert [each["latency_us"] for each in found] == [200_000] * 3
     assert [each["time_s"] for each in found] == pytest.approx([0.05, 0.25, 0.45])
     assert all(each["wall_s"] >= 0 for each in found)
-
-
-def test_the_brake_is_pressed_until_the_first_control_acts(
-    board: Leaderboard, tmp_path: Path
-) -> None:
-    board.drive(real_time, config(tmp_path, latency="fps:5"), 5)
-
-    assert board.seen == [BRAKING] * 4 + [seen_as(1)]
-
-
-def test_no_frame_shares_its_control_with_another(
-    board: Leaderboard, tmp_path: Path
-) -> None:
-    agent = board.drive(real_time, config(tmp_path, latency="fps:5"), 8)
-
-    assert len({id(each) for each in board.returned}) == 8
-    assert agent.control.steer == 0.001 * agent.decisions
-
-
-def test_skipped_frames_go_on_counting(board: Leaderboard, tmp_path: Path) -> None:
-    agent = board.drive(real_time, config(tmp_path, latency="fps:5"), 10)
-
-    assert (agent.step, agent.ticks, agent.decisions) == (9, 10, 3)
 
 
 def test_metric_info_has_every_frame(board: Leaderboard, tmp_path: Path) -> None:
@@ -270,19 +230,6 @@ def test_a_run_step_that_raises_leaves_trace_and_metrics(
     assert agent.gone
 
 
-def test_a_cheap_part_that_raises_leaves_metrics(
-    board: Leaderboard, tmp_path: Path
-) -> None:
-    agent = board.make(real_time, f"{config(tmp_path, latency='fps:5')}+{SAVE_NAME}")
-    board.run(agent, 2)
-    agent._inner.tick = lambda data: 1 / 0
-
-    with pytest.raises(ZeroDivisionError):
-        board.run(agent, 1)
-
-    assert len(json.loads((agent.save_path / "metric_info.json").read_text())) == 2
-
-
 def test_another_rate_is_refused(
     board: Leaderboard, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -363,16 +310,6 @@ def test_a_trace_is_not_written_over(board: Leaderboard, tmp_path: Path) -> None
         board.drive(real_time, other, 3)
 
 
-def test_without_carla_the_message_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "carla", None)
-    agent = real_time.RealTimeAgent("localhost", 2000)
-
-    with pytest.raises(MissingPackageError, match="carla is not installed"):
-        agent.setup(config(tmp_path))
-
-
 CROWD = "agents{source=none, per_agent_us=100000, range_m=30.0, fov_deg=90.0}"
 
 
@@ -400,17 +337,3 @@ def test_without_a_hero_such_a_latency_is_refused(
 
     with pytest.raises(EvaluationError, match="does not tell where others are"):
         board.make(real_time, config(tmp_path, latency=CROWD, agent=agent))
-
-
-def test_the_world_goes_on_meanwhile(board: Leaderboard, tmp_path: Path) -> None:
-    agent = board.make(real_time, f"{config(tmp_path, latency='fps:5')}+{SAVE_NAME}")
-    speeds = []
-
-    def look(world: World) -> None:
-        speeds.append(world.speed)
-
-    board.run(agent, 10, look)
-
-    assert speeds[4] == 0.0  # braking
-    assert speeds[9] > speeds[6] > 0.0
-    assert isinstance(board.returned[0], VehicleControl)

@@ -137,11 +137,6 @@ def test_a_driver_that_opens_no_policy() -> None:
         opened(Empty())
 
 
-def test_no_such_module() -> None:
-    with pytest.raises(EvaluationError, match="No module named 'nowhere_at_all'"):
-        driver_named("nowhere_at_all:make").open()
-
-
 def test_another_form_is_refused() -> None:
     with pytest.raises(EvaluationError, match=r"not of the form package\.module:func"):
         driver_named("python:here")

@@ -6,7 +6,6 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.generate import (
     Admission,
     DryRun,
-    ScenarioRoutes,
     admitted_routes,
     examine,
     generate,
@@ -98,7 +97,3 @@ def test_every_type_and_attempt_has_a_seed_of_its_own() -> None:
 
     assert len(seeds) == 4
     assert seed_of(1, "Accident", 0) not in seeds
-
-
-def test_a_harvest_counts_what_it_refused() -> None:
-    assert ScenarioRoutes("Accident", (route_of(),), ("no", "no")).tried == 3

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation
 from me2e_compress.driving.realtime import HeldControl
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert, Memory, decide
 from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
@@ -81,14 +79,3 @@ def test_a_decision_that_takes_long_drives_worse() -> None:
         world.step(held.advance())
     wrong = [event.kind for event in world.events if event.kind in INFRACTIONS]
     assert wrong or not world.done
-
-
-def test_without_a_world_it_says_what_is_missing() -> None:
-    nothing = Observation(
-        *(0, None, np.zeros((6, 4, 4), np.float32)),
-        can_bus=np.zeros(CAN_BUS_SIZE, np.float32),
-        command=3,
-        speed_mps=0.0,
-    )
-    with pytest.raises(EvaluationError, match="expert needs a highway-env world"):
-        Expert().plan(nothing)

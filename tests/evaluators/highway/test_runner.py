@@ -12,7 +12,6 @@ from me2e_compress.driving.latency import FixedLatency, parse_latency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.episode_recorder import junction_m
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.observe import can_bus_of, road_users
 from me2e_compress.evaluators.highway.runner import Listeners, drive
@@ -200,14 +199,6 @@ def test_the_layout_of_the_can_bus() -> None:
     expected[17] = np.degrees(-0.5 + 0.1)
     assert bus.dtype == np.float32
     assert bus == pytest.approx(expected, abs=1e-4)
-
-
-def test_a_junction_begins_after_its_announcement() -> None:
-    found = junction_m(World(GREEN).path)
-
-    assert found is not None
-    assert 20.0 <= found < World(GREEN).path.goal_m
-    assert junction_m(World(PARKED).path) is None
 
 
 def test_a_step_must_divide_50_ms() -> None:

@@ -51,21 +51,6 @@ def test_what_ran_before_in_the_process_does_not_matter() -> None:
     assert trace(route_of("HazardAtSideLane", 3)) == alone
 
 
-def test_two_worlds_may_be_stepped_in_turn() -> None:
-    route, seen = route_of("EnterActorFlow", 4), list[object]()
-    one, other = World(route), World(route_of("EnterActorFlow", 5))
-    for _ in range(80):
-        one.step(Control(0.5, 0.0))
-        other.step(Control(-1.0, 0.0))
-        seen.append(one.scene())
-
-    assert seen == trace(route, 80)[:80]
-
-
-def test_another_seed_is_another_route() -> None:
-    assert trace(route_of(seed=1), 3) != trace(route_of(seed=2), 3)
-
-
 def test_a_given_parameter_changes_that_one_alone() -> None:
     drawn = World(route_of(seed=1)).parameters
     given = World(route_of(seed=1, obstacle_m=70.5)).parameters
