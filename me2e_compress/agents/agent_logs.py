@@ -1,7 +1,7 @@
 """What an agent writes: its motion, a line per decision, and a latency trace."""
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -61,22 +61,6 @@ LINES = "decisions.jsonl"
 TRACE = "latency.json"
 
 
-@dataclass(frozen=True)
-class DecisionRecord:
-    """One decision, what it took here and what latency it was charged with.
-
-    Times are simulated (``time_s``) and on this machine's clock since the first tick
-    (``wall_s``): their ratio tells how much slower than the world the machine is, which
-    is no latency.
-    """
-
-    frame: int
-    time_s: float
-    wall_s: float
-    measured_us: int
-    latency_us: int
-
-
 @dataclass
 class DecisionLog:
     """Writes the decisions of one route into an existing folder.
@@ -100,13 +84,33 @@ class DecisionLog:
         except OSError as error:
             raise EvaluationError(f"{path}: {error.strerror}") from error
 
-    def note(self, decision: DecisionRecord) -> None:
-        """Write one decision; the first one is no sample of the trace."""
+    def note(
+        self,
+        *,
+        frame: int,
+        time_s: float,
+        wall_s: float,
+        measured_us: int,
+        latency_us: int,
+    ) -> None:
+        """Write one decision; the first one is no sample of the trace.
+
+        ``time_s`` is simulated, ``wall_s`` on this machine's clock since the first
+        tick: their ratio tells how much slower than the world the machine is, which is
+        no latency.
+        """
+        decision = {
+            "frame": frame,
+            "time_s": time_s,
+            "wall_s": wall_s,
+            "measured_us": measured_us,
+            "latency_us": latency_us,
+        }
         if self._warm:
-            self.samples_us.append(decision.measured_us)
+            self.samples_us.append(measured_us)
         self._warm = True
         with (self.folder / LINES).open("a", encoding="utf-8") as lines:
-            lines.write(json.dumps(asdict(decision)) + "\n")
+            lines.write(json.dumps(decision) + "\n")
 
     def write_trace(self) -> None:
         """Write the trace, if there is a sample."""

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from me2e_compress.agents.agent_logs import DecisionLog, DecisionRecord, MetricInfo
+from me2e_compress.agents.agent_logs import DecisionLog, MetricInfo
 from me2e_compress.agents.agent_options import (
     AgentOptions,
     agent_class,
@@ -204,7 +204,11 @@ class RealTimeAgent(ForwardingAgent):
         wall_s = round((done - self._began_ns) / 1e9, 6)
         if self._log is not None:
             self._log.note(
-                DecisionRecord(self._frame, timestamp, wall_s, measured_us, latency_us)
+                frame=self._frame,
+                time_s=timestamp,
+                wall_s=wall_s,
+                measured_us=measured_us,
+                latency_us=latency_us,
             )
 
     def _facts(self, measured_us: int) -> DecisionFacts:

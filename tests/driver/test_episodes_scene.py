@@ -147,7 +147,7 @@ def frame(
     *lights: Signal, phases: tuple[Phase, ...], served: int = -1
 ) -> LabelledFrame:
     memory = Memory(served=frozenset({served}))
-    decision = ExpertDecision(np.zeros((6, 2)), 0.0, 0.0, 0.0, memory)
+    decision = ExpertDecision(np.zeros((6, 2)), 0.0, 0.0, memory)
     return LabelledFrame(scene(signals=lights), phases, 3, Memory(), decision)
 
 

@@ -44,6 +44,8 @@ from me2e_compress.simulator.traffic.bodies import (
     STEERING_LAG_S,
 )
 
+LOOKAHEAD_S, SHORTEST_LOOKAHEAD_M = 0.5, 3.0
+"""Lookahead of the pursuit: seconds of travel, and metres at walking pace."""
 AHEAD_S = (0.5, 1.0)
 """Seconds ahead at which the planned positions set the acceleration."""
 MIN_STEP_M = 0.3
@@ -105,57 +107,39 @@ class AnchoredPlan:
         beyond = max(seconds - times[-1], 0.0) * last_speed
         return float(np.interp(seconds, times, self.travel_m) + beyond)
 
+    def control(self, ego: Ego, time_us: int) -> Control:
+        """Return the control that follows the plan from the ego's present state.
 
-@dataclass(frozen=True)
-class Controller:
-    """Tracks an anchored plan; stateless.
+        The runner asks once per decision, at the frame of the observation; the latency
+        model says when the control acts and for how long (`driving.realtime`). It does
+        not steer between two decisions.
+        """
+        age_s = (time_us - self.time_us) / 1e6
+        return Control(self._acceleration(ego, age_s), self._steering(ego))
 
-    The runner calls it once per decision, at the frame of the observation; the latency
-    model says when its control acts and for how long (`driving.realtime`). It does not
-    steer between two decisions.
-
-    Args:
-        lookahead_s: Lookahead of the pursuit, in seconds of travel.
-        min_lookahead_m: Lookahead at walking pace.
-        wheel_lag_s: Lag of the steering: pursuit starts where the ego will be then.
-        thrust_lag_s: Lag of brakes and engine (`traffic.bodies`).
-        acceleration_mps2: (strongest braking, strongest acceleration).
-    """
-
-    lookahead_s: float = 0.5
-    min_lookahead_m: float = 3.0
-    wheel_lag_s: float = STEERING_LAG_S
-    thrust_lag_s: float = ACCELERATION_LAG_S
-    acceleration_mps2: tuple[float, float] = ACCELERATION_RANGE_MPS2
-
-    def control(self, plan: AnchoredPlan, ego: Ego, time_us: int) -> Control:
-        """Return the control that follows a plan from the ego's present state."""
-        age = (time_us - plan.time_us) / 1e6
-        return Control(self._acceleration(plan, ego, age), self._steering(plan, ego))
-
-    def _acceleration(self, plan: AnchoredPlan, ego: Ego, age_s: float) -> float:
+    def _acceleration(self, ego: Ego, age_s: float) -> float:
         """Return the least-squares fit to the positions in 0.5 s and 1 s, with lag."""
-        here, speed = plan.nearest(ego.x, ego.y), ego.speed_mps
-        asked = weight = 0.0
+        here, speed = self.nearest(ego.x, ego.y), ego.speed_mps
+        lag, asked, weight = ACCELERATION_LAG_S, 0.0, 0.0
         for ahead in AHEAD_S:
             # distance lost to the lag, distance coasted, distance per m/s2 asked for
-            late = self.thrust_lag_s * (ahead - self.thrust_lag_s)
-            late += self.thrust_lag_s**2 * math.exp(-ahead / self.thrust_lag_s)
+            late = lag * (ahead - lag)
+            late += lag**2 * math.exp(-ahead / lag)
             free = speed * ahead + ego.acceleration_mps2 * late
             gain = ahead**2 / 2 - late
-            asked += gain * (plan.travel_at(age_s + ahead) - here - free)
+            asked += gain * (self.travel_at(age_s + ahead) - here - free)
             weight += gain * gain
-        low, high = self.acceleration_mps2
+        low, high = ACCELERATION_RANGE_MPS2
         return min(max(asked / weight, low), high)
 
-    def _steering(self, plan: AnchoredPlan, ego: Ego) -> float:
+    def _steering(self, ego: Ego) -> float:
         # from where the ego is once the wheels have turned
-        travel = ego.speed_mps * self.wheel_lag_s
+        travel = ego.speed_mps * STEERING_LAG_S
         pose = (ego.x, ego.y, ego.heading)
         x, y, heading = advance(*pose, ego.steering_rad, travel, ego.length)
         # to the point of the curve one lookahead further
-        lookahead = max(self.min_lookahead_m, self.lookahead_s * ego.speed_mps)
-        target_x, target_y = plan.point(plan.nearest(x, y) + lookahead)
+        lookahead = max(SHORTEST_LOOKAHEAD_M, LOOKAHEAD_S * ego.speed_mps)
+        target_x, target_y = self.point(self.nearest(x, y) + lookahead)
         cos, sin = math.cos(heading), math.sin(heading)
         forward = cos * (target_x - x) + sin * (target_y - y)
         left = cos * (target_y - y) - sin * (target_x - x)

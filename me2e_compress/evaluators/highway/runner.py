@@ -21,7 +21,6 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.controller import (
     AnchoredPlan,
-    Controller,
     control_of,
 )
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
@@ -148,7 +147,6 @@ class _Drive:
             conditions.latency_model, Control(0.0, 0.0), conditions.dt_us
         )
         self.charge = conditions.latency.on_route(route.id)
-        self.controller = Controller()
         rig = CameraRig(*conditions.image_size)
         self.cameras = None
         if policy.needs_images or listeners.on_moment is not None:
@@ -203,7 +201,7 @@ class _Drive:
             return control_of(answer, scene.ego.length)
         self.plan = scene.ego, np.asarray(answer.points, np.float64)
         anchored = AnchoredPlan.of(answer, scene.ego, scene.time_us)
-        return self.controller.control(anchored, scene.ego, scene.time_us)
+        return anchored.control(scene.ego, scene.time_us)
 
     def show(self, scene: Scene) -> None:
         """Render this frame for the listener that draws pictures."""

@@ -41,14 +41,13 @@ class GroundPlan:
 
     west_m: float
     north_m: float
-    resolution_m: float
     colours: Bytes
     classes: Bytes
 
     def texels(self, points: Floats) -> Floats:
         """Convert world points [..., 2] to continuous texels (column, row)."""
         offset = np.asarray(points) - (self.west_m, self.north_m)
-        return np.asarray(offset * (1.0, -1.0) / self.resolution_m)
+        return np.asarray(offset * (1.0, -1.0) / RESOLUTION_M)
 
     def near(self, points: Floats) -> bool:
         """Return whether a polyline may touch the rasters."""
@@ -65,7 +64,7 @@ class GroundPlan:
         Antialiased, it rounds them out by half a texel on each side: taken off here.
         """
         aliased = self._quads(line, width_m)
-        smooth = self._quads(line, width_m - self.resolution_m)
+        smooth = self._quads(line, width_m - RESOLUTION_M)
         for sharp, soft in zip(aliased, smooth, strict=True):
             cv2.fillConvexPoly(
                 self.classes, sharp, (int(kind),), cv2.LINE_8, SUBPIXEL_BITS
@@ -181,13 +180,10 @@ class GroundTexture:
             raster.flags.writeable = False
 
 
-def paint_texture(
-    roadmap: Roadmap, route: npt.NDArray[np.float64], *, seed: int = 0
-) -> GroundTexture:
+def paint_texture(roadmap: Roadmap, route: npt.NDArray[np.float64]) -> GroundTexture:
     """Paint lanes, markings, stop lines, crosswalks and the verge.
 
     The texture covers the bounding box of ``route``, [N, 2] metres, and 60 m around.
-    ``seed`` is that of the grain of grass and asphalt.
     """
     # the raster's extent
     west, south = route.min(axis=0) - MARGIN_M
@@ -196,14 +192,13 @@ def paint_texture(
     plan = GroundPlan(
         west_m=float(west),
         north_m=float(north),
-        resolution_m=RESOLUTION_M,
         colours=np.empty((height, width, 3), np.uint8),
         classes=np.full((height, width), PixelClass.TERRAIN, np.uint8),
     )
     # from grass up: lanes, grain, then everything painted on top
     plan.colours[:] = GRASS
     paint_lanes(plan, roadmap)
-    _add_grain(plan, np.random.default_rng(seed))
+    _add_grain(plan, np.random.default_rng(0))
     paint_markings(plan, roadmap)
     paint_stop_lines(plan, roadmap)
     paint_crosswalks(plan, roadmap)

@@ -1,4 +1,4 @@
-"""Pictures of recorded moments, and their PNG and GIF files."""
+"""Pictures of recorded moments, and their PNG and GIF files; two drives overlaid."""
 
 import os
 import tempfile
@@ -20,7 +20,14 @@ from me2e_compress.simulator.pictures.canvas import (
     text_width,
     write,
 )
-from me2e_compress.simulator.pictures.top_view import INK, PAPER, BirdsEye
+from me2e_compress.simulator.pictures.top_view import (
+    EGO,
+    INK,
+    OTHER,
+    PAPER,
+    BirdsEye,
+    OtherDrive,
+)
 from me2e_compress.simulator.scene import INFRACTIONS, Event, Scene
 
 Bytes = npt.NDArray[np.uint8]
@@ -49,13 +56,8 @@ class Moment:
 
     scene: Scene
     images: Bytes
-    plan: npt.NDArray[np.floating] | None = None
+    plan: Floats | None = None
     events: tuple[Event, ...] = ()
-
-    @property
-    def waypoints(self) -> Floats | None:
-        """The plan in float64, or None."""
-        return None if self.plan is None else np.asarray(self.plan, float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +124,7 @@ class RoutePicture:
         moment = self.moments[index]
         trail = self.trail[: index + 1]
         return self.birdseye.draw(
-            moment.scene, trail, moment.waypoints, self.infractions(index), size
+            moment.scene, trail, moment.plan, self.infractions(index), size
         )
 
     def words(self, index: int, colour: Colour, row: int) -> list[Text]:
@@ -228,3 +230,39 @@ def _replace(
         raise EvaluationError(
             f"{path}: the picture cannot be written: {error.strerror or error}"
         ) from error
+
+
+FRONT = ("FRONT_LEFT", "FRONT", "FRONT_RIGHT")
+
+
+def overlay(one: RoutePicture, other: RoutePicture) -> npt.NDArray[np.uint8]:
+    """Draw the last moments of two drives: uint8 [H, W, 3].
+
+    On the left are the front cameras of both, the other's above; on the right is one
+    view from above, the other drive under the first in grey. The traffic shown is that
+    of ``one``, the drive in colour.
+    """
+    last, before = len(one.moments) - 1, len(other.moments) - 1
+    # front cameras of both drives
+    rows = [
+        in_row([drive.tile(index, name) for name in FRONT])
+        for drive, index in ((other, before), (one, last))
+    ]
+    cameras = in_column(rows)
+    height = cameras.shape[0]
+    # one view from above
+    moment, then = one.moments[last], other.moments[before]
+    view = one.birdseye.draw(
+        moment.scene,
+        one.trail,
+        moment.plan,
+        (*other.infractions(before), *one.infractions(last)),
+        (height, round(height * 0.82)),
+        OtherDrive(then.scene.ego, other.trail, then.plan),
+    )
+    picture = in_row([cameras, view])
+    # a caption line for each
+    caption = np.full((2 * CAPTION, picture.shape[1], 3), PAPER, np.uint8)
+    words = [*other.words(before, OTHER, 7), *one.words(last, EGO, 7 + CAPTION)]
+    write(caption, words)
+    return in_column([picture, caption])

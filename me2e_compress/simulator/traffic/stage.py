@@ -128,15 +128,13 @@ class Stage:
         if next(script, self) is not self:
             self.scripts.append(script)
 
-    def drive(
-        self, legs: Sequence[Leg], speed_mps: float, goal_m: float = GOAL_M
-    ) -> None:
+    def drive(self, legs: Sequence[Leg], speed_mps: float) -> None:
         """Set the ego's route and put the ego at its beginning."""
-        self._path = build_path(self.network, legs, goal_m)
-        if self._path.length_m < goal_m:
+        self._path = build_path(self.network, legs, GOAL_M)
+        if self._path.length_m < GOAL_M:
             raise EvaluationError(
                 f"{self.route.scenario}: the route is {self._path.length_m:.0f} m "
-                f"long, its goal {goal_m:.0f} m away"
+                f"long, its goal {GOAL_M:.0f} m away"
             )
         (x, y), heading = self._path.points[0], self._path.headings[0]
         self._ego = EgoVehicle(Pose(float(x), float(y), float(heading)), speed_mps)

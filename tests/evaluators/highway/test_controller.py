@@ -11,7 +11,6 @@ from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
 from me2e_compress.evaluators.highway.blind import centre_plan
 from me2e_compress.evaluators.highway.controller import (
     AnchoredPlan,
-    Controller,
     control_of,
     curvature_by,
 )
@@ -46,14 +45,14 @@ def follow(
 ) -> tuple[TinyWorld, list[float]]:
     """Drive the route's centre line at one speed; all lateral offsets."""
     world = TinyWorld(path, ego_at(5.0, offset, speed=speed))
-    controller, offsets, s = Controller(), list[float](), 5.0
+    offsets, s = list[float](), 5.0
     plan = AnchoredPlan.of(np.zeros((6, 2)), world.ego, 0)
     for frame in range(round(seconds * 1e6 / DT_US)):
         if frame % every == 0:
             s, _ = path.project(world.ego.x, world.ego.y, s)
             waypoints = centre_plan(world.ego, path, s, speed)
             plan = AnchoredPlan.of(waypoints, world.ego, world.time_us)
-        world.step(controller.control(plan, world.ego, world.time_us))
+        world.step(plan.control(world.ego, world.time_us))
         offsets.append(path.project(world.ego.x, world.ego.y, s)[1])
     return world, offsets
 
@@ -130,7 +129,7 @@ def test_a_heap_of_waypoints_is_a_stop() -> None:
     ego = ego_at(speed=3.0)
     plan = AnchoredPlan.of(jitter, ego, 0)
     assert plan.travel_m[-1] < 0.3
-    control = Controller().control(plan, ego, 0)
+    control = plan.control(ego, 0)
     assert control.acceleration_mps2 < -3.0
     assert abs(control.steering_rad) < 0.05
 
@@ -162,7 +161,7 @@ def test_a_steady_acceleration_is_asked_for_exactly(rate: float) -> None:
     steady = type(ego)(
         *(ego.x, ego.y, 0.0, speed, rate, 0.0, 0.0, 0.0), length=5.0, width=2.0
     )
-    control = Controller().control(AnchoredPlan.of(waypoints, steady, 0), steady, 0)
+    control = AnchoredPlan.of(waypoints, steady, 0).control(steady, 0)
     assert control.acceleration_mps2 == pytest.approx(rate, abs=1e-6)
 
 
@@ -170,9 +169,9 @@ def test_an_old_plan_is_followed_from_where_it_has_got_to() -> None:
     """After 0.5 s on plan the same control is due as if it were planned anew."""
     waypoints = np.array([[4.0 * k, 0.0] for k in range(1, 7)])
     plan = AnchoredPlan.of(waypoints, ego_at(0.0), 0)
-    control = Controller().control(plan, ego_at(4.0), 500_000)
+    control = plan.control(ego_at(4.0), 500_000)
     assert control.acceleration_mps2 == pytest.approx(0.0, abs=1e-6)
-    late = Controller().control(plan, ego_at(2.0), 500_000)
+    late = plan.control(ego_at(2.0), 500_000)
     assert late.acceleration_mps2 > 2.0
 
 
@@ -189,7 +188,7 @@ def test_the_same_way_in_other_waypoints_is_driven_the_same(
         return Trajectory(bend, times)
 
     six, other = (
-        Controller().control(AnchoredPlan.of(plan, ego, 0), ego, 0)
+        AnchoredPlan.of(plan, ego, 0).control(ego, 0)
         for plan in (
             planned(0.5 * np.arange(1, 7)),
             planned(step_s * np.arange(1, count + 1)),

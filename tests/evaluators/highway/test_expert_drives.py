@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from me2e_compress.driving.realtime import HeldControl
-from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
+from me2e_compress.evaluators.highway.controller import AnchoredPlan
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert, Memory, decide
 from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.evaluators.highway.generate import dry_run
@@ -39,7 +39,7 @@ def test_it_solves_a_fresh_route_of(scenario: str) -> None:
 
 def test_the_planned_waypoints_are_where_the_ego_then_is() -> None:
     """The plan of a moment is driven: within 0.5 m after a second on a ring."""
-    world, controller, memory = World(route("EnterActorFlow")), Controller(), Memory()
+    world, memory = World(route("EnterActorFlow")), Memory()
     top, misses = ceiling(world.path), list[float]()
     planned: list[tuple[float, float]] = []
     while not world.done and world.time_us < 40_000_000:
@@ -55,7 +55,7 @@ def test_the_planned_waypoints_are_where_the_ego_then_is() -> None:
                 scene.ego.y + sin * forward + cos * left,
             )
         )
-        world.step(controller.control(plan, scene.ego, scene.time_us))
+        world.step(plan.control(scene.ego, scene.time_us))
         if len(planned) > 20:
             x, y = planned[-21]
             misses.append(float(np.hypot(scene.ego.x - x, scene.ego.y - y)))
@@ -65,7 +65,7 @@ def test_the_planned_waypoints_are_where_the_ego_then_is() -> None:
 
 def test_a_decision_that_takes_long_drives_worse() -> None:
     """Nobody drives a ring whose every control is 0.85 s old."""
-    held, controller = HeldControl(Control(0.0, 0.0)), Controller()
+    held = HeldControl(Control(0.0, 0.0))
     world, memory = World(route("EnterActorFlow")), Memory()
     top = ceiling(world.path)
     while not world.done and world.time_us < 40_000_000:
@@ -74,7 +74,7 @@ def test_a_decision_that_takes_long_drives_worse() -> None:
             decision = decide(scene, world.privileged(), world.path, top, memory)
             memory = decision.memory
             plan = AnchoredPlan.of(decision.waypoints, scene.ego, scene.time_us)
-            control = controller.control(plan, scene.ego, scene.time_us)
+            control = plan.control(scene.ego, scene.time_us)
             held.decide(control, 850_000)
         world.step(held.advance())
     wrong = [event.kind for event in world.events if event.kind in INFRACTIONS]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
+from me2e_compress.evaluators.highway.controller import AnchoredPlan
 from me2e_compress.evaluators.highway.expert.expert_policy import Memory, decide
 from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.simulator.bicycle import advance
@@ -160,7 +160,7 @@ class TinyWorld:
 
 def drive(world: TinyWorld, seconds: float, every: int = 1) -> list[Scene]:
     """Let the expert drive through the controller; all scenes, the last included."""
-    top, memory, controller = ceiling(world.path), Memory(), Controller()
+    top, memory = ceiling(world.path), Memory()
     scenes, control = [world.scene()], Control(0.0, 0.0)
     for frame in range(round(seconds * 1e6 / DT_US)):
         if frame % every == 0:
@@ -168,7 +168,7 @@ def drive(world: TinyWorld, seconds: float, every: int = 1) -> list[Scene]:
             decision = decide(scene, world.privileged(), world.path, top, memory)
             memory = decision.memory
             plan = AnchoredPlan.of(decision.waypoints, scene.ego, scene.time_us)
-            control = controller.control(plan, scene.ego, scene.time_us)
+            control = plan.control(scene.ego, scene.time_us)
         world.step(control)
         scenes.append(world.scene())
         if world.touches:

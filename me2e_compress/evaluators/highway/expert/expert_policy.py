@@ -57,7 +57,6 @@ class ExpertDecision:
     waypoints: Plan
     acceleration_mps2: float
     target_m: float
-    cost: float
     memory: Memory
 
 
@@ -103,7 +102,6 @@ def decide(
         ego.seen(*columns),
         float(future.acceleration[best]),
         target,
-        float(cost[best]),
         Memory(s, target, stop.served),
     )
 

@@ -14,13 +14,12 @@ from me2e_compress.simulator.traffic.network import (
     Pose,
     Section,
 )
-from me2e_compress.simulator.traffic.stage import Stage
+from me2e_compress.simulator.traffic.stage import GOAL_M, Stage
 
 BEFORE_M = 60.0
 """Road behind the ego's start, from where others catch up."""
 BEYOND_M = 120.0
 """Road beyond the goal."""
-GOAL_M = 150.0
 TOTAL_M = BEFORE_M + GOAL_M + BEYOND_M
 PARKING_M = 2.5
 """Width of a parking lane."""
@@ -176,7 +175,7 @@ def _street(
     road = lay_road(stage.network, "r", start, pieces, section, oncoming, shoulder_m)
     first, *others = road.ahead(lane)
     legs = [Leg(first, enter_m=BEFORE_M), *(Leg(index) for index in others)]
-    stage.drive(legs, start_speed(stage), GOAL_M)
+    stage.drive(legs, start_speed(stage))
     return replace(road, lane=lane)
 
 

@@ -59,14 +59,14 @@ def pedestrians_on_exit(stage: Stage, crossing: Crossing) -> Script:
     """Send three pedestrians across the arm that the ego turns into."""
     speed = stage.uniform("walk_mps", 1.3, 2.0)
     row = _row(stage, crossing, ActorKind.PEDESTRIAN, speed, LANE_WIDTH_M + 1.5, 3, 1.3)
-    yield from _set_off(stage, row, 1, "pedestrians_on_exit")
+    yield from _set_off(stage, row, "pedestrians_on_exit")
 
 
 def cyclists_on_exit(stage: Stage, crossing: Crossing) -> Script:
     """Send three cyclists across the arm that the ego turns into."""
     speed = stage.uniform("ride_mps", 2.8, 4.0)
     row = _row(stage, crossing, ActorKind.BICYCLE, speed, LANE_WIDTH_M + 4.0, 3, 2.4)
-    yield from _set_off(stage, row, 1, "cyclists_on_exit")
+    yield from _set_off(stage, row, "cyclists_on_exit")
 
 
 def bicycle_stream(stage: Stage, crossing: Crossing) -> Script:
@@ -76,7 +76,7 @@ def bicycle_stream(stage: Stage, crossing: Crossing) -> Script:
     spacing = stage.uniform("spacing_m", 2.6, 3.6)
     start = LANE_WIDTH_M + 4.0
     row = _row(stage, crossing, ActorKind.BICYCLE, speed, start, count, spacing)
-    yield from _set_off(stage, row, 1, "bicycle_stream")
+    yield from _set_off(stage, row, "bicycle_stream")
 
 
 @dataclass(frozen=True)
@@ -118,10 +118,10 @@ def _row(
     return row
 
 
-def _set_off(stage: Stage, row: Row, timed: int, name: str) -> Script:
-    """Send a row off so that one of them meets the ego."""
-    who = row.people[timed]
-    yield from steps_out(stage, who, row.route_s, row.reach_m[timed])
+def _set_off(stage: Stage, row: Row, name: str) -> Script:
+    """Send a row off so that the second of them meets the ego."""
+    who = row.people[1]
+    yield from steps_out(stage, who, row.route_s, row.reach_m[1])
     for walker in row.people:
         walker.going = True
     stage.fire(name, who)
