@@ -4,27 +4,6 @@ from pathlib import Path
 
 from pydantic import Field
 
-from me2e_compress.agents.agent_logs import MetricInfo
-from me2e_compress.agents.agent_options import AgentOptions, conf_parts, route_folder
-from me2e_compress.agents.carla_interface import (
-    CarlaControl,
-    ForwardingAgent,
-    SensorData,
-    SensorSpecs,
-    autonomous_agent_class,
-    carla_control,
-)
-from me2e_compress.agents.carla_observer import (
-    CarlaObserver,
-    CarlaReading,
-    RouteReader,
-)
-from me2e_compress.agents.carla_rig import (
-    BENCH2DRIVE_CAMERAS,
-    CarlaCamera,
-    CarlaRig,
-    Triple,
-)
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import PedalsAndWheel
@@ -32,6 +11,31 @@ from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.driving.waypoint_pid import PidOptions, WaypointPid
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.carla.agent_logs import MetricInfo
+from me2e_compress.evaluators.carla.agent_options import (
+    AgentOptions,
+    conf_parts,
+    route_folder,
+)
+from me2e_compress.evaluators.carla.interface import (
+    CarlaControl,
+    ForwardingAgent,
+    SensorData,
+    SensorSpecs,
+    autonomous_agent_class,
+    carla_control,
+)
+from me2e_compress.evaluators.carla.observer import (
+    CarlaObserver,
+    CarlaReading,
+    RouteReader,
+)
+from me2e_compress.evaluators.carla.rig import (
+    BENCH2DRIVE_CAMERAS,
+    CarlaCamera,
+    CarlaRig,
+    Triple,
+)
 from me2e_compress.runtime.providers import PROVIDERS
 
 

@@ -1,6 +1,6 @@
 import pytest
 
-from tests.agents.small_leaderboard import Leaderboard, installed
+from tests.evaluators.carla.small_leaderboard import Leaderboard, installed
 
 
 @pytest.fixture

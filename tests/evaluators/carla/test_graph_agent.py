@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from me2e_compress.agents import graph_agent, real_time
 from me2e_compress.driving.answer import six_waypoints
 from me2e_compress.errors import EvaluationError, MissingPackageError
-from tests.agents.small_leaderboard import (
+from me2e_compress.evaluators.carla import graph_agent, real_time
+from tests.evaluators.carla.small_leaderboard import (
     SAVE_NAME,
     Leaderboard,
     RoadOption,
@@ -179,7 +179,7 @@ def test_the_can_bus_counts_from_the_last_decision(
 ) -> None:
     wrap = written(
         tmp_path / "wrap.toml",
-        f'agent = "me2e_compress.agents.graph_agent"\nconfig = "{echo}"\n'
+        f'agent = "me2e_compress.evaluators.carla.graph_agent"\nconfig = "{echo}"\n'
         f'latency = "fps:5"\nfolder = "{tmp_path}"\n',
     )
     agent = board.make(real_time, f"{wrap}+{SAVE_NAME}")

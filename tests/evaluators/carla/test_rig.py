@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from me2e_compress.agents.carla_rig import BENCH2DRIVE_CAMERAS, CarlaRig
 from me2e_compress.driving.adapter import Axes
+from me2e_compress.evaluators.carla.rig import BENCH2DRIVE_CAMERAS, CarlaRig
 
 LIDAR_M = (-0.39, 0.0, 1.84)
 FULL = CarlaRig(BENCH2DRIVE_CAMERAS, (1600, 900), (900, 1600))

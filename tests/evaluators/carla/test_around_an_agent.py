@@ -6,14 +6,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.agents.agent_options import (
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.carla.agent_options import (
     conf_parts,
     route_folder,
 )
-from me2e_compress.agents.carla_interface import agents_around
-from me2e_compress.agents.route_follower import GeoReference, RouteFollower, command_of
-from me2e_compress.errors import EvaluationError
-from tests.agents.small_leaderboard import LATITUDE, LONGITUDE, World, gps_of, written
+from me2e_compress.evaluators.carla.interface import agents_around
+from me2e_compress.evaluators.carla.route_follower import (
+    GeoReference,
+    RouteFollower,
+    command_of,
+)
+from tests.evaluators.carla.small_leaderboard import (
+    LATITUDE,
+    LONGITUDE,
+    World,
+    gps_of,
+    written,
+)
 
 metres = st.floats(-8000, 8000)
 

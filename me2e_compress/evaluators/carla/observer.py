@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.agents.carla_interface import SensorData
-from me2e_compress.agents.carla_rig import GPS, IMU, SPEED, CarlaRig, Triple
-from me2e_compress.agents.route_follower import GeoReference, RouteFollower
 from me2e_compress.driving.contract import EgoKinematics, Observation
 from me2e_compress.driving.ego_track import can_bus_between
 from me2e_compress.errors import MissingExtraError
+from me2e_compress.evaluators.carla.interface import SensorData
+from me2e_compress.evaluators.carla.rig import GPS, IMU, SPEED, CarlaRig, Triple
+from me2e_compress.evaluators.carla.route_follower import GeoReference, RouteFollower
 
 if find_spec("cv2") is None:
     raise MissingExtraError("cv2", "highway")

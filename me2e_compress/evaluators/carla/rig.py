@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from me2e_compress.agents.carla_interface import SensorSpecs
+from me2e_compress.evaluators.carla.interface import SensorSpecs
 
 Triple = tuple[float, float, float]
 

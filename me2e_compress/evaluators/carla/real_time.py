@@ -13,24 +13,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from me2e_compress.agents.agent_logs import DecisionLog, MetricInfo
-from me2e_compress.agents.agent_options import (
-    AgentOptions,
-    agent_class,
-    agent_module,
-    conf_parts,
-    function_named,
-    route_folder,
-)
-from me2e_compress.agents.carla_interface import (
-    CarlaControl,
-    ForwardingAgent,
-    SensorData,
-    SensorSpecs,
-    agents_around,
-    carla_control,
-    copy_of,
-)
 from me2e_compress.driving.latency import (
     Charge,
     DecisionFacts,
@@ -44,6 +26,24 @@ from me2e_compress.driving.realtime import (
     control_clock,
 )
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.carla.agent_logs import DecisionLog, MetricInfo
+from me2e_compress.evaluators.carla.agent_options import (
+    AgentOptions,
+    agent_class,
+    agent_module,
+    conf_parts,
+    function_named,
+    route_folder,
+)
+from me2e_compress.evaluators.carla.interface import (
+    CarlaControl,
+    ForwardingAgent,
+    SensorData,
+    SensorSpecs,
+    agents_around,
+    carla_control,
+    copy_of,
+)
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.profile import processor
 
@@ -64,7 +64,7 @@ class RealTimeOptions(AgentOptions):
 
     Attributes:
         agent: The wrapped agent's file, or a module such as
-            ``me2e_compress.agents.graph_agent``.
+            ``me2e_compress.evaluators.carla.graph_agent``.
         config: Its own configuration text, without the save name.
         latency: What a decision costs: ``measured`` here, ``fps:F``, ``trace:FILE``.
         latency_model: ``drop`` is equation 4.

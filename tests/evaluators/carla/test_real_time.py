@@ -13,19 +13,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.agents import real_time
 from me2e_compress.driving.realtime import DT_US, LatencyModel, control_clock
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.real_results import Bench2DriveResults
+from me2e_compress.evaluators.carla import real_time
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from tests.agents import small_leaderboard
-from tests.agents.small_leaderboard import (
+from tests.evaluators.bench2drive.files import checkpoint, record, write
+from tests.evaluators.carla import small_leaderboard
+from tests.evaluators.carla.small_leaderboard import (
     SAVE_NAME,
     Leaderboard,
     installed,
     written,
 )
-from tests.evaluators.bench2drive.files import checkpoint, record, write
 from tests.profiles import scaled
 
 NUMBERED = Path(__file__).with_name("numbered_agent.py")
