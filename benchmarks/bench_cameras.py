@@ -20,16 +20,8 @@ from me2e_compress.simulator.cameras import (
     Weather,
     paint_texture,
 )
-from me2e_compress.simulator.scene import (
-    DIMENSIONS,
-    Actor,
-    ActorKind,
-    Ego,
-    Lane,
-    LaneMarking,
-    Roadmap,
-    Scene,
-)
+from me2e_compress.simulator.plane_geometry import Lane, LaneMarking, Roadmap
+from me2e_compress.simulator.scene import DIMENSIONS, Actor, ActorKind, Ego, Scene
 
 LANE_M = 4.0
 LENGTH_M = 150.0

@@ -25,9 +25,9 @@ from me2e_compress.simulator.cameras import (
     paint_texture,
 )
 from me2e_compress.simulator.cameras.birdseye import ground_classes
-from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.plane_geometry import Floats, RoutePath
 from me2e_compress.simulator.privileged import Privileged
-from me2e_compress.simulator.scene import RoutePath, Signal, SignalKind, SignalState
+from me2e_compress.simulator.scene import Signal, SignalKind, SignalState
 from me2e_compress.simulator.world import World
 
 SIGNALS = 4

@@ -1,4 +1,4 @@
-"""Stages that run on the host after the network: their interface and their names.
+"""Stages that run on the host after the network: interface, names, and UniAD's.
 
 To add one: write its class, then add it to the table of names.
 """
@@ -89,6 +89,9 @@ UNIAD_CELL_M = 0.5
 @dataclass(frozen=True)
 class CollisionOptimizer(HostStage):
     """Keeps the plan near itself and away from cells that will be occupied.
+
+    It runs only if cells near the plan are occupied: in critical frames alone, which
+    makes the tail of UniAD's latency.
 
     UniAD's ``CollisionNonlinearOptimizer`` (OpenDriveLab/UniAD, planning head): over
     the six waypoints p, with the network's waypoints r, the occupied cells o within a

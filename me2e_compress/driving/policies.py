@@ -97,58 +97,6 @@ _MEMBERS = ("needs_images", "privileged", "reset", "plan")
 _FACTORY = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
-def driver_named(text: str, adapter: str | Path | None = None) -> Driver:
-    """Build the driver of a text: a policy with its options, or an ONNX file's path.
-
-    Args:
-        text: ``expert``, ``blind:8``, ``onnx{path=M.onnx, adapter=A.toml}``,
-            ``highway`` for the driver that ships, the name of another package's policy,
-            ``package.module:function`` for a Python function's result, or else a path.
-        adapter: TOML file that adapts a model; a policy without models ignores it.
-
-    Raises:
-        EvaluationError: An option that the policy has not, or refuses.
-        MissingExtraError: The package that it needs is not installed.
-    """
-    if name_in(text) in POLICIES.names():
-        driver = POLICIES.parse(text)
-        if not isinstance(driver, Driver):
-            raise EvaluationError(
-                f"policy {name_in(text)!r} is a {type(driver).__name__}, which is no"
-                " Driver: derive it from me2e_compress.driving.policies.Driver"
-            )
-        driver = driver.resolved()
-    elif _FACTORY.fullmatch(text) and not Path(text).exists():
-        driver = POLICIES.build(PYTHON, {"factory": text})
-    else:
-        driver = POLICIES.build(MODEL, {"path": text})
-    if adapter is None or "adapter" not in type(driver).__dataclass_fields__:
-        return driver
-    return POLICIES.with_options(driver, {"adapter": adapter})
-
-
-def opened(driver: Driver) -> Policy:
-    """Open a driver's policy, and check that it has the members of `Policy`.
-
-    Raises:
-        EvaluationError: It cannot be opened, or lacks a member.
-    """
-    policy = driver.open()
-    if lacks := [member for member in _MEMBERS if not hasattr(policy, member)]:
-        raise EvaluationError(
-            f"policy {driver.label}: a {type(policy).__name__} is no policy: it has no"
-            f" {', '.join(lacks)}"
-        )
-    return policy
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-_FACTORY = re.compile(r"(?P<module>[A-Za-z_][\w.]*):(?P<name>[A-Za-z_]\w*)")
-
-
 @dataclass(frozen=True)
 class PythonDriver(Driver):
     """Calls a function, or a class, that makes a policy.
@@ -195,7 +143,52 @@ class PythonDriver(Driver):
         text = POLICIES.text(self)
         if found is None or found.origin is None or not Path(found.origin).is_file():
             return text
-        return f"{text}+{hashlib.sha256(Path(found.origin).read_bytes()).hexdigest()}"
+        return f"{text}+{_sha256(Path(found.origin))}"
+
+
+def driver_named(text: str, adapter: str | Path | None = None) -> Driver:
+    """Build the driver of a text: a policy with its options, or an ONNX file's path.
+
+    Args:
+        text: ``expert``, ``blind:8``, ``onnx{path=M.onnx, adapter=A.toml}``,
+            ``highway`` for the driver that ships, the name of another package's policy,
+            ``package.module:function`` for a Python function's result, or else a path.
+        adapter: TOML file that adapts a model; a policy without models ignores it.
+
+    Raises:
+        EvaluationError: An option that the policy has not, or refuses.
+        MissingExtraError: The package that it needs is not installed.
+    """
+    if name_in(text) in POLICIES.names():
+        driver = POLICIES.parse(text)
+        if not isinstance(driver, Driver):
+            raise EvaluationError(
+                f"policy {name_in(text)!r} is a {type(driver).__name__}, which is no"
+                " Driver: derive it from me2e_compress.driving.policies.Driver"
+            )
+        driver = driver.resolved()
+    elif _FACTORY.fullmatch(text) and not Path(text).exists():
+        driver = POLICIES.build(PYTHON, {"factory": text})
+    else:
+        driver = POLICIES.build(MODEL, {"path": text})
+    if adapter is None or "adapter" not in type(driver).__dataclass_fields__:
+        return driver
+    return POLICIES.with_options(driver, {"adapter": adapter})
+
+
+def opened(driver: Driver) -> Policy:
+    """Open a driver's policy, and check that it has the members of `Policy`.
+
+    Raises:
+        EvaluationError: It cannot be opened, or lacks a member.
+    """
+    policy = driver.open()
+    if lacks := [member for member in _MEMBERS if not hasattr(policy, member)]:
+        raise EvaluationError(
+            f"policy {driver.label}: a {type(policy).__name__} is no policy: it has no"
+            f" {', '.join(lacks)}"
+        )
+    return policy
 
 
 def _look_here() -> None:
@@ -203,3 +196,7 @@ def _look_here() -> None:
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

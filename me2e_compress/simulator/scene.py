@@ -11,34 +11,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from me2e_compress.simulator.plane_geometry import (
-    Command,
-    Floats,
-    Lane,
-    LaneMarking,
-    Roadmap,
-    RoutePath,
-)
-
-__all__ = [
-    "DIMENSIONS",
-    "INFRACTIONS",
-    "Actor",
-    "ActorKind",
-    "Command",
-    "Control",
-    "Ego",
-    "Event",
-    "EventKind",
-    "Lane",
-    "LaneMarking",
-    "Roadmap",
-    "RoutePath",
-    "Scene",
-    "Signal",
-    "SignalKind",
-    "SignalState",
-]
+from me2e_compress.simulator.plane_geometry import Floats
 
 
 class ActorKind(StrEnum):

@@ -116,6 +116,9 @@ class Past(InputSource):
 class LidarToGlobalRotation(InputSource):
     """UniAD's ``l2g_r_mat``: [3, 3].
 
+    From the model's ground frame, whose origin is under the centre of the ego, to the
+    world, x east, y north.
+
     Attributes:
         transposed: For row vectors, p @ R + t, as UniAD of nuScenes takes it; else for
             column vectors, R @ p + t.

@@ -1,4 +1,4 @@
-"""The next node of a route and its command, as Bench2Drive's agents find them."""
+"""GPS to metres; the next node of a route, as Bench2Drive's agents find it."""
 
 import math
 from collections.abc import Iterable

@@ -20,7 +20,8 @@ from me2e_compress.evaluators.highway.reentry import (
     reentry,
     slope_of,
 )
-from me2e_compress.simulator.scene import Ego, RoutePath
+from me2e_compress.simulator.plane_geometry import RoutePath
+from me2e_compress.simulator.scene import Ego
 
 SPEEDS_MPS = (4.0, 8.0, 12.0)
 """Speeds at which the admission gate tries the blind driver."""

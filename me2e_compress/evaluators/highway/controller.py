@@ -1,4 +1,4 @@
-"""Waypoints to acceleration and steering.
+"""Waypoints, or pedals and wheel, to acceleration and steering.
 
 A plan is tracked in the world, from the pose at which it was computed, along a smooth
 curve that starts on the ego's course. Steering is pursuit with the circle of the real
@@ -194,7 +194,18 @@ FRONT_AXLE_M, REAR_AXLE_M = -0.090769015, 1.4178275
 
 
 def control_of(asked: PedalsAndWheel, length_m: float) -> Control:
-    """Return acceleration and front wheel angle; steer to the right is positive."""
+    """Convert CARLA's throttle, brake and steer to the control of this ego.
+
+    Full pedals are the limits of the ego's engine and brakes, as in CARLA: throttle 4
+    m/s2, brake 8 m/s2, both together their difference; with neither the ego keeps its
+    speed (no drag, no creeping).
+
+    A steer (to the right positive) gives the circle that CARLA's car would drive, by
+    the kinematic bicycle that World on Rails (Chen, Koltun and Kraehenbuehl 2021)
+    fitted to CARLA and TransFuser and its successors use. A full steer is a circle of
+    3.7 m there; the wheels of this ego turn to one of 7.7 m, so a steer beyond 0.47
+    changes nothing.
+    """
     braking, thrust = ACCELERATION_RANGE_MPS2
     curvature = curvature_by(-asked.steer)
     sine = min(max(curvature * length_m / 2, -1.0), 1.0)

@@ -21,15 +21,9 @@ from me2e_compress.metrics.infraction import (
     Infraction,
     InfractionKind,
 )
+from me2e_compress.simulator.plane_geometry import Command, RoutePath
 from me2e_compress.simulator.routes import Route
-from me2e_compress.simulator.scene import (
-    ActorKind,
-    Command,
-    Event,
-    EventKind,
-    RoutePath,
-    Scene,
-)
+from me2e_compress.simulator.scene import ActorKind, Event, EventKind, Scene
 from me2e_compress.simulator.traffic.legs import ANNOUNCED_M
 from me2e_compress.simulator.world import World
 

@@ -1,4 +1,9 @@
-"""Generate routes: proposed by scenario types, admitted by the gate."""
+"""Generate routes: proposed by scenario types, admitted by the gate.
+
+A route is admitted if the privileged expert solves it and the blind driver, who keeps
+one speed on the route's centre, commits an infraction at every one of
+`blind.SPEEDS_MPS`. Timing out, standing blocked and leaving the route do not count.
+"""
 
 import zlib
 from collections.abc import Iterator, Sequence

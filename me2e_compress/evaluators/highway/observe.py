@@ -12,7 +12,8 @@ from me2e_compress.driving.contract import EgoKinematics, Observation, Policy
 from me2e_compress.driving.ego_track import can_bus_between
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.cameras import CameraRig, Cameras
-from me2e_compress.simulator.scene import ActorKind, Ego, RoutePath, Scene
+from me2e_compress.simulator.plane_geometry import RoutePath
+from me2e_compress.simulator.scene import ActorKind, Ego, Scene
 from me2e_compress.simulator.world import World
 
 APART_M = 50.0

@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from me2e_compress.simulator.bicycle import slip_of
-from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.scene import Ego, RoutePath
+from me2e_compress.simulator.plane_geometry import Floats, RoutePath
+from me2e_compress.simulator.scene import Ego
 
 STEEPEST = 0.6
 """Largest slope (m of offset per m of route) that a re-entry starts from."""

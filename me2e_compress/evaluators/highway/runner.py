@@ -1,4 +1,7 @@
-"""Drive one route: the policy decides, its latency is charged, an episode results."""
+"""Drive one route: the policy decides, its latency is charged, an episode results.
+
+A route ends by the rules of the CARLA leaderboard, as Bench2Drive sets them.
+"""
 
 import time
 from collections.abc import Callable

@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.simulator.cameras.classes import PixelClass
-from me2e_compress.simulator.plane_geometry import resample
-from me2e_compress.simulator.scene import LaneMarking, Roadmap
+from me2e_compress.simulator.plane_geometry import LaneMarking, Roadmap, resample
 
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]

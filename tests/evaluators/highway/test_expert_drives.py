@@ -8,6 +8,7 @@ from me2e_compress.evaluators.highway.controller import AnchoredPlan
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert, Memory, decide
 from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.evaluators.highway.generate import dry_run
+from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from me2e_compress.simulator.scene import INFRACTIONS, Control
@@ -41,20 +42,13 @@ def test_the_planned_waypoints_are_where_the_ego_then_is() -> None:
     """The plan of a moment is driven: within 0.5 m after a second on a ring."""
     world, memory = World(route("EnterActorFlow")), Memory()
     top, misses = ceiling(world.path), list[float]()
-    planned: list[tuple[float, float]] = []
+    planned = list[Floats]()
     while not world.done and world.time_us < 40_000_000:
         scene = world.scene()
         decision = decide(scene, world.privileged(), world.path, top, memory)
         memory = decision.memory
         plan = AnchoredPlan.of(decision.waypoints, scene.ego, scene.time_us)
-        cos, sin = np.cos(scene.ego.heading), np.sin(scene.ego.heading)
-        forward, left = decision.waypoints[1]
-        planned.append(
-            (
-                scene.ego.x + cos * forward - sin * left,
-                scene.ego.y + sin * forward + cos * left,
-            )
-        )
+        planned.append(scene.ego.placed(np.asarray(decision.waypoints, float))[1])
         world.step(plan.control(scene.ego, scene.time_us))
         if len(planned) > 20:
             x, y = planned[-21]

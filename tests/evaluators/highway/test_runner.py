@@ -260,16 +260,8 @@ def test_a_held_plan_stays_where_it_was_made() -> None:
     assert first.plan is not None
     assert later.plan is not None
 
-    def in_world(moment: Moment, point: npt.NDArray[np.floating]) -> list[float]:
-        ego = moment.scene.ego
-        cos, sin = np.cos(ego.heading), np.sin(ego.heading)
-        return [
-            ego.x + cos * point[0] - sin * point[1],
-            ego.y + sin * point[0] + cos * point[1],
-        ]
-
-    assert in_world(later, later.plan[3]) == pytest.approx(
-        in_world(first, first.plan[3])
+    np.testing.assert_allclose(
+        later.scene.ego.placed(later.plan), first.scene.ego.placed(first.plan)
     )
     assert later.plan[3, 0] < first.plan[3, 0] - 1.0
 
