@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.simulator.camera_rig import SUBPIXEL_BITS, fixed_point
 from me2e_compress.simulator.cameras.classes import PixelClass
 from me2e_compress.simulator.plane_geometry import LaneMarking, Roadmap, resample
 
@@ -31,7 +32,6 @@ DASH_M, DASH_PERIOD_M, DASH_STEP_M = 3.0, 9.0, 0.5
 STOP_LINE_M = 0.5
 BAR_M, BAR_PERIOD_M = 0.5, 1.0
 """Zebra bars."""
-SUBPIXEL_BITS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +73,8 @@ class GroundPlan:
     def _quads(self, line: Floats, width_m: float) -> npt.NDArray[np.int32]:
         """Return [N - 1, 4, 2], the pieces of a band."""
         sides = (offset_line(line, side * width_m) for side in (0.5, -0.5))
-        left, right = (self._fixed(side) for side in sides)
+        left, right = (fixed_point(self.texels(side)) for side in sides)
         return np.stack([left[:-1], right[:-1], right[1:], left[1:]], axis=1)
-
-    def _fixed(self, points: Floats) -> npt.NDArray[np.int32]:
-        """Convert to fixed point for cv2, which has pixel centres at whole numbers."""
-        scaled = (self.texels(points) - 0.5) * (1 << SUBPIXEL_BITS)
-        return np.rint(scaled).astype(np.int32)
 
 
 def offset_line(line: Floats, lateral_m: float) -> Floats:

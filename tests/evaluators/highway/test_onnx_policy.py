@@ -230,14 +230,8 @@ def test_an_adapter_sums_steps_picks_the_mode_and_turns_the_axes(
     [
         ({"inputs": "float[1, 5, 4, 4] lidar2img"}, "lidar2img has shape [1, 5, 4, 4]"),
         ({"inputs": "float[2, 6, 4, 4] lidar2img"}, "it must be [1, 6, 4, 4]"),
-        ({"inputs": "float[17] can_bus"}, "it must be [1, 18]"),
         ({"inputs": "float[2] timestamp"}, "timestamp has shape [2], it must be [1]"),
-        ({"inputs": "float[18] speed"}, "input speed is none of img, lidar2img"),
         ({"inputs": "string[1] command"}, "it cannot be fed"),
-        (
-            {"inputs": "float[1, 6, 3, 16, 24] img"},
-            "image normalisation unknown",
-        ),
         (
             {"outputs": "float[1, 6, 2] way", "body": "way = Identity (ahead)"},
             "no output plan",
