@@ -31,11 +31,11 @@ import numpy as np
 import onnx
 
 from benchmarks.zoo_stubs import Network, RoadOption, install
-from me2e_compress.agents import graph_agent, real_time
 from me2e_compress.driving.adapter import Axes
 from me2e_compress.driving.realtime import HeldControl
 from me2e_compress.driving.waypoint_pid import PidOptions, WaypointPid
-from tests.agents.small_leaderboard import SAVE_NAME, World, gps_of
+from me2e_compress.evaluators.carla import graph_agent, real_time
+from tests.evaluators.carla.small_leaderboard import SAVE_NAME, World, gps_of
 
 LIDAR = Axes.RIGHT_FORWARD
 ROUTE = [

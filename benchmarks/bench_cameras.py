@@ -20,16 +20,8 @@ from me2e_compress.simulator.cameras import (
     Weather,
     paint_texture,
 )
-from me2e_compress.simulator.scene import (
-    DIMENSIONS,
-    Actor,
-    ActorKind,
-    Ego,
-    Lane,
-    LaneMarking,
-    Roadmap,
-    Scene,
-)
+from me2e_compress.simulator.plane_geometry import Lane, LaneMarking, Roadmap
+from me2e_compress.simulator.scene import DIMENSIONS, Actor, ActorKind, Ego, Scene
 
 LANE_M = 4.0
 LENGTH_M = 150.0
@@ -90,7 +82,8 @@ def main() -> None:
     for name, line in (("straight", route), ("diagonal", diagonal)):
         texture = paint_texture(road(), line)
         median, best = milliseconds(partial(paint_texture, road(), line), 5)
-        size = f"{texture.nbytes / 1e6:.1f} MB"
+        rasters = (texture.classes, *texture.levels)
+        size = f"{sum(each.nbytes for each in rasters) / 1e6:.1f} MB"
         print(f"texture {name:9} {median:7.1f} ms (best {best:.1f}), {size}")
     texture = paint_texture(road(), route)
     storm = Weather(fog_m=60.0, night=0.5, rain=0.7, noise=4.0)

@@ -31,7 +31,7 @@ from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator
-from me2e_compress.evaluators.highway.expert import Expert
+from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.abilities import ABILITIES
 from me2e_compress.metrics.measure import Estimate

@@ -17,13 +17,13 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 
 from me2e_compress.driving.realtime import HeldControl
-from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
-from me2e_compress.evaluators.highway.expert import Memory, ceiling, decide
+from me2e_compress.evaluators.highway.controller import AnchoredPlan
+from me2e_compress.evaluators.highway.expert.expert_policy import Memory, decide
+from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
-from me2e_compress.simulator.scene import Control
-from me2e_compress.simulator.world import INFRACTIONS, EndReason, EventKind
-from me2e_compress.simulator.world.world import World
+from me2e_compress.simulator.scene import INFRACTIONS, Control, EventKind
+from me2e_compress.simulator.world import EndReason, World
 
 FIRST_SEED = 900_000
 TIME_LIMIT_S = 90.0
@@ -45,7 +45,7 @@ class Drive:
 
 def drive(job: tuple[Route, float]) -> Drive:
     route, latency_s = job
-    world, controller, memory = World(route), Controller(), Memory()
+    world, memory = World(route), Memory()
     top, held = ceiling(world.path), HeldControl(Control(0.0, 0.0))
     latency_us = round(latency_s * 1e6)
     planning, plans, off = 0.0, 0, 0.0
@@ -59,7 +59,7 @@ def drive(job: tuple[Route, float]) -> Drive:
             planning, plans = planning + time.process_time() - begin, plans + 1
             memory = decision.memory
             coming = AnchoredPlan.of(decision.waypoints, scene.ego, world.time_us)
-            control = controller.control(coming, scene.ego, world.time_us)
+            control = coming.control(scene.ego, world.time_us)
             held.decide(control, latency_us)
         world.step(held.advance())
         off = max(off, world.outside_m)

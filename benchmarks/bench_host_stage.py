@@ -17,8 +17,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.collision_optimizer import CollisionOptimizer
-from me2e_compress.driving.host_stage import HostWork
+from me2e_compress.driving.host_stage import CollisionOptimizer, HostWork
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.runner import drive

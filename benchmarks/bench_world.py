@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 
 from me2e_compress.simulator.routes import Route
-from me2e_compress.simulator.scenarios.layouts.streets import multilane
+from me2e_compress.simulator.scenarios.layouts.streets import BEFORE_M, multilane
 from me2e_compress.simulator.scene import Control
 from me2e_compress.simulator.traffic.stage import Stage
 from me2e_compress.simulator.world import World
@@ -23,7 +23,7 @@ def traffic(cars: int) -> Callable[[Stage], None]:
         street = multilane(stage)
         for k in range(cars):
             lane, row = 2 * (k % 2), k // 2
-            s = street.start_m - 20.0 + 10.0 * row
+            s = BEFORE_M - 20.0 + 10.0 * row
             stage.car(street.ahead(lane), s, 8.0, 9.0 + lane)
 
     return build

@@ -2,8 +2,8 @@
 
 The modules hold just enough for the leaderboard's AutonomousAgent, AgentWrapper and
 SensorInterface and for Bench2DriveZoo's VAD agent to run as they are, in the small
-world of `tests.agents.small_leaderboard`. The network is left out: its plan goes
-straight on, a little to the right, and what it was given is kept.
+world of `tests.evaluators.carla.small_leaderboard`. The network is left out: its plan
+goes straight on, a little to the right, and what it was given is kept.
 """
 
 import datetime
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.agents.small_leaderboard import DT_S, VehicleControl, World
+from tests.evaluators.carla.small_leaderboard import DT_S, VehicleControl, World
 
 
 class RoadOption(IntEnum):

@@ -32,9 +32,8 @@ TORCH = (
     "zoo.resnet",
 )
 PICTURES = (
-    "agents.carla_observer",
-    "agents.graph_agent",
-    "evaluators.highway.admission",
+    "evaluators.carla.observer",
+    "evaluators.carla.graph_agent",
     "evaluators.highway.blind",
     "evaluators.highway.driven_frames",
     "evaluators.highway.expert",
@@ -49,9 +48,8 @@ PICTURES = (
 WORLD = (
     *PICTURES,
     "evaluators.highway.controller",
-    "evaluators.highway.endings",
     "evaluators.highway.episode_recorder",
-    "evaluators.highway.vehicle_map",
+    "simulator.privileged",
     "simulator.scenarios",
     "simulator.traffic",
     "simulator.world",

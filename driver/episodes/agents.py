@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.evaluators.highway.reentry import in_ego_frame
 from me2e_compress.simulator.cameras import BirdseyeGrid, PixelClass
 from me2e_compress.simulator.cameras.birdseye import covered
 from me2e_compress.simulator.cameras.classes import ACTOR_CLASSES
@@ -60,7 +59,7 @@ def _centres(actors: Sequence[Actor], ego: Ego) -> Floats:
     """Return [N, 2] centres in the ego frame."""
     x = np.array([actor.x for actor in actors])
     y = np.array([actor.y for actor in actors])
-    return in_ego_frame(x, y, ego)
+    return ego.seen(x, y)
 
 
 def _nearest(scene: Scene) -> list[Actor]:

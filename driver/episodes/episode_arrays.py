@@ -16,18 +16,19 @@ from driver.episodes.agents import (
 )
 from driver.episodes.jpeg import pictures
 from driver.episodes.recording_policy import LabelledFrame
-from me2e_compress.evaluators.highway.expert import decide
+from me2e_compress.evaluators.highway.expert.expert_policy import decide
 from me2e_compress.evaluators.highway.observe import can_bus_of
-from me2e_compress.evaluators.highway.reentry import beyond, in_ego_frame
+from me2e_compress.evaluators.highway.reentry import beyond
 from me2e_compress.simulator.cameras import (
     CameraRig,
     Cameras,
     paint_texture,
 )
 from me2e_compress.simulator.cameras.birdseye import ground_classes
-from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.scene import RoutePath, Signal, SignalKind, SignalState
-from me2e_compress.simulator.world import Privileged, World
+from me2e_compress.simulator.plane_geometry import Floats, RoutePath
+from me2e_compress.simulator.privileged import Privileged
+from me2e_compress.simulator.scene import Signal, SignalKind, SignalState
+from me2e_compress.simulator.world import World
 
 SIGNALS = 4
 SIGNAL_COLUMNS = 8
@@ -66,7 +67,7 @@ def signals(frame: LabelledFrame, ego_s_m: float) -> npt.NDArray[np.float32]:
     rows = np.zeros((SIGNALS, SIGNAL_COLUMNS), np.float32)
     rows[:, :2], rows[:, 6] = -1.0, np.nan
     for row, signal in enumerate(sorted(frame.scene.signals, key=rank)[:SIGNALS]):
-        x, y = in_ego_frame(np.array(signal.x), np.array(signal.y), ego)
+        x, y = ego.seen(np.array(signal.x), np.array(signal.y))
         turn = signal.heading - ego.heading
         rows[row] = (
             *(KINDS[signal.kind], STATES[signal.state], x, y),
@@ -155,7 +156,7 @@ def _route(frame: LabelledFrame, path: RoutePath, top: Floats) -> Arrays:
     return {
         "plan_alone": alone.waypoints.astype(np.float32),
         "lateral_m": np.array(lateral, np.float32),
-        "path": in_ego_frame(x, y, ego).astype(np.float32),
+        "path": ego.seen(x, y).astype(np.float32),
         "path_attributes": np.stack(attributes, axis=-1).astype(np.float32),
         "signals": signals(frame, s),
     }

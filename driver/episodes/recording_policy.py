@@ -18,16 +18,17 @@ from me2e_compress.driving.contract import (
     Policy,
     RouteInfo,
 )
-from me2e_compress.evaluators.highway.expert import (
+from me2e_compress.evaluators.highway.expert.expert_policy import (
     ExpertDecision,
     Memory,
-    ceiling,
     decide,
 )
+from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.evaluators.highway.observe import scene_and_world
 from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.privileged import Phase
 from me2e_compress.simulator.scene import Scene
-from me2e_compress.simulator.world import Phase, World
+from me2e_compress.simulator.world import World
 
 BURST_S = (0.4, 1.5)
 PAUSE_S = (0.9, 4.8)

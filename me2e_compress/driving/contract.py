@@ -29,15 +29,33 @@ from typing import ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.ego_kinematics import EgoKinematics
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.runtime.trajectory import Trajectory
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class EgoKinematics:
+    """Pose and motion of the ego in a right-handed world, x east, y north.
+
+    The heading is in radians counter-clockwise from east; vectors are in the ego frame.
+    """
+
+    x: float
+    y: float
+    heading: float
+    speed_mps: float
+    acceleration_mps2: Triple
+    angular_velocity_radps: Triple
+
 
 __all__ = [
     "CAN_BUS_SIZE",
     "PLAN_SHAPE",
     "PLAN_STEP_US",
     "Answer",
+    "EgoKinematics",
     "Evaluator",
     "HostedPolicy",
     "Observation",
@@ -45,10 +63,8 @@ __all__ = [
     "Plan",
     "Policy",
     "RouteInfo",
-    "SceneView",
     "SizedEvaluator",
     "Trajectory",
-    "WorldView",
 ]
 
 Plan = npt.NDArray[np.floating]
@@ -90,33 +106,6 @@ class RouteInfo(Protocol):
         ...
 
 
-class SceneView(Protocol):
-    """A snapshot of the scene: ground truth for privileged policies.
-
-    Simulators pass their own scene (highway-env:
-    `me2e_compress.simulator.scene.Scene`); a policy that reads more than the time must
-    check its type first.
-    """
-
-    @property
-    def time_us(self) -> int:
-        """Return the simulated time since the route began, in microseconds."""
-        ...
-
-
-class WorldView(Protocol):
-    """The simulated world: read-only ground truth for privileged policies.
-
-    Simulators pass their own world (highway-env:
-    `me2e_compress.simulator.world.World`); a policy must never step it.
-    """
-
-    @property
-    def route(self) -> RouteInfo:
-        """Return the current route."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class Observation:
     """What a policy gets at one decision.
@@ -138,8 +127,9 @@ class Observation:
         command: Where the route goes next: 0 left, 1 right, 2 straight, 3 follow the
             lane, 4 change lane to the left, 5 change lane to the right.
         speed_mps: The ego's speed.
-        scene: Ground truth at this instant; None unless `Policy.privileged`.
-        world: The simulated world; None unless `Policy.privileged`.
+        scene: Ground truth at this instant, in the simulator's own type (highway-env:
+            `me2e_compress.simulator.scene.Scene`); None unless `Policy.privileged`.
+        world: The simulated world, likewise; a policy must never step it.
         motion: The ego's pose and motion from its own sensors; None if the simulator
             does not provide it. The CAN bus alone has no absolute position.
         target_points: float32 [2, 2], the next node of the route's sparse plan and the
@@ -154,8 +144,8 @@ class Observation:
     can_bus: npt.NDArray[np.float32]
     command: int
     speed_mps: float
-    scene: SceneView | None = None
-    world: WorldView | None = None
+    scene: object | None = None
+    world: object | None = None
     motion: EgoKinematics | None = None
     target_points: npt.NDArray[np.float32] | None = None
 

@@ -1,5 +1,6 @@
 """Latency sources: how long a decision takes on the vehicle."""
 
+import abc
 import functools
 import hashlib
 import zlib
@@ -35,7 +36,26 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class FixedLatency(LatencySource):
+class ConstantLatency(LatencySource):
+    """The same time for every decision: derive a class that says which."""
+
+    @property
+    @abc.abstractmethod
+    def period_us(self) -> int:
+        """Microseconds of a decision."""
+
+    def on_route(self, route: str) -> Charge:
+        """Charge the same on every route."""
+        period_us = self.period_us
+        return lambda _: period_us
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the microseconds."""
+        return {"fixed_us": self.period_us}
+
+
+@dataclass(frozen=True)
+class FixedLatency(ConstantLatency):
     """The same time for every decision.
 
     Attributes:
@@ -51,32 +71,26 @@ class FixedLatency(LatencySource):
                 f"latency fixed: {self.latency_us} us: must be 0 or more"
             )
 
-    def on_route(self, route: str) -> Charge:
-        """Charge the same on every route."""
-        return lambda _: self.latency_us
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the microseconds."""
-        return {"fixed_us": self.latency_us}
+    @property
+    def period_us(self) -> int:
+        """What was given."""
+        return self.latency_us
 
 
 @dataclass(frozen=True)
-class NoLatency(LatencySource):
+class NoLatency(ConstantLatency):
     """No time at all: the ideal."""
 
     name: ClassVar[str] = "none"
 
-    def on_route(self, route: str) -> Charge:
-        """Charge nothing."""
-        return lambda _: 0
-
-    def to_json(self) -> dict[str, Any]:
-        """Return zero microseconds."""
-        return {"fixed_us": 0}
+    @property
+    def period_us(self) -> int:
+        """Nothing."""
+        return 0
 
 
 @dataclass(frozen=True)
-class FrameRate(LatencySource):
+class FrameRate(ConstantLatency):
     """The period of a frame rate for every decision: at 10 fps, 100 ms.
 
     Attributes:
@@ -89,14 +103,10 @@ class FrameRate(LatencySource):
     def __post_init__(self) -> None:
         check_positive("fps", self.fps)
 
-    def on_route(self, route: str) -> Charge:
-        """Charge the period on every route."""
-        period_us = round(1e6 / self.fps)
-        return lambda _: period_us
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the period in microseconds."""
-        return {"fixed_us": round(1e6 / self.fps)}
+    @property
+    def period_us(self) -> int:
+        """The period of the rate."""
+        return round(1e6 / self.fps)
 
 
 @dataclass(frozen=True)
@@ -216,27 +226,15 @@ def with_draws(
 ) -> LatencySource:
     """Say how a source draws from its trace; see `parse_latency`."""
     check_positive("scale", scale)
-    given = {"in_order": in_order, "scale": scale, "seed": seed}
-    default = {"in_order": False, "scale": 1.0, "seed": 0}
-    options: dict[str, object] = {
-        option: value for option, value in given.items() if value != default[option]
-    }
-    return _with_options(source, options)
-
-
-def _with_options(source: LatencySource, options: dict[str, object]) -> LatencySource:
-    """Give options to the source, or to the one below it."""
-    fields = type(source).__dataclass_fields__
     # options belong to the innermost source
-    inner = getattr(source, "source", None)
-    if isinstance(inner, LatencySource):
-        return LATENCY_SOURCES.with_options(
-            source, {"source": _with_options(inner, options)}
-        )
-    # a source that draws nothing has no seed
-    kept = {
-        option: value
-        for option, value in options.items()
-        if option != "seed" or option in fields
-    }
-    return LATENCY_SOURCES.with_options(source, kept) if kept else source
+    below = getattr(source, "source", None)
+    if isinstance(below, LatencySource):
+        drawn = with_draws(below, in_order=in_order, scale=scale, seed=seed)
+        return LATENCY_SOURCES.with_options(source, {"source": drawn})
+    # those at their defaults leave the source as it is; who draws nothing has no seed
+    options: dict[str, object] = {"in_order": True} if in_order else {}
+    if scale != 1.0:
+        options["scale"] = scale
+    if seed and "seed" in type(source).__dataclass_fields__:
+        options["seed"] = seed
+    return LATENCY_SOURCES.with_options(source, options) if options else source

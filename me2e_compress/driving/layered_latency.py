@@ -6,7 +6,7 @@ the work is. They draw nothing themselves.
 """
 
 import abc
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -54,6 +54,12 @@ class LayeredLatency(LatencySource):
     def with_trace(self, samples_us: tuple[int, ...], scale: float) -> Self:
         """Give the source below the latencies of a model."""
         return replace(self, source=self.source.with_trace(samples_us, scale))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the options, and the source below."""
+        named = (each.name for each in fields(self) if each.name != "source")
+        own = {name: getattr(self, name) for name in named}
+        return {**own, "of": self.source.to_json()}
 
     def on_route(self, route: str) -> Charge:
         """Start the clock of the source below, and add to it."""
@@ -135,15 +141,6 @@ class AgentsLatency(LayeredLatency):
         ahead = np.abs(np.arctan2(y, x)) <= np.radians(self.fov_deg) / 2
         return int(np.count_nonzero(near & ahead))
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the options, and the source below."""
-        return {
-            "per_agent_us": self.per_agent_us,
-            "range_m": self.range_m,
-            "fov_deg": self.fov_deg,
-            "of": self.source.to_json(),
-        }
-
 
 @dataclass(frozen=True)
 class HostStageLatency(LayeredLatency):
@@ -181,12 +178,3 @@ class HostStageLatency(LayeredLatency):
             + self.per_iteration_us * facts.host_iterations
             + self.per_cell_us * facts.host_cells
         )
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the options, and the source below."""
-        return {
-            "per_iteration_us": self.per_iteration_us,
-            "per_cell_us": self.per_cell_us,
-            "per_call_us": self.per_call_us,
-            "of": self.source.to_json(),
-        }

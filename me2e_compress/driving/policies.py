@@ -5,10 +5,13 @@ To add a policy: write its class, then add it to this table.
 
 import abc
 import hashlib
+import importlib
+import importlib.util
 import re
+import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, cast, runtime_checkable
 
 from me2e_compress.driving.contract import Policy
 from me2e_compress.errors import EvaluationError
@@ -80,7 +83,7 @@ POLICIES: Registry[Driver] = Registry(
         "blind": f"{_HIGHWAY}:BlindDriver",
         "onnx": f"{_HIGHWAY}:OnnxDriver",
         "highway": "me2e_compress.workflows.shipped_driver:ShippedDriver",
-        "python": "me2e_compress.driving.python_policy:PythonDriver",
+        "python": "me2e_compress.driving.policies:PythonDriver",
     },
 )
 
@@ -92,6 +95,55 @@ PYTHON = "python"
 
 _MEMBERS = ("needs_images", "privileged", "reset", "plan")
 _FACTORY = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+
+
+@dataclass(frozen=True)
+class PythonDriver(Driver):
+    """Calls a function, or a class, that makes a policy.
+
+    Attributes:
+        factory: ``package.module:function``, called without arguments; it returns a
+            policy or a driver. Modules are looked for in the working folder, too.
+    """
+
+    name: ClassVar[str] = "python"
+    factory: str
+
+    def __post_init__(self) -> None:
+        if _FACTORY.fullmatch(self.factory) is None:
+            raise EvaluationError(
+                f"{self.factory!r} is not of the form package.module:function"
+            )
+
+    def open(self) -> Policy:
+        """Import the module and make the policy."""
+        module, name = self.factory.split(":")
+        _look_here()
+        try:
+            make = getattr(importlib.import_module(module), name, None)
+            if not callable(make):
+                raise EvaluationError(f"{module} has no function {name}")
+            made = make()
+            return opened(made) if isinstance(made, Driver) else cast("Policy", made)
+        except Exception as error:  # whatever code of theirs may raise: chained
+            words = " ".join(str(error).split())
+            if not isinstance(error, EvaluationError):
+                words = f"{type(error).__name__}: {words}"
+            raise EvaluationError(f"policy {self.factory}: {words}") from error
+
+    @property
+    def label(self) -> str:
+        """The text as it was given."""
+        return self.factory
+
+    def fingerprint(self) -> str:
+        """Return its text and a digest of the module's file."""
+        _look_here()
+        found = importlib.util.find_spec(self.factory.split(":")[0])
+        text = POLICIES.text(self)
+        if found is None or found.origin is None or not Path(found.origin).is_file():
+            return text
+        return f"{text}+{_sha256(Path(found.origin))}"
 
 
 def driver_named(text: str, adapter: str | Path | None = None) -> Driver:
@@ -137,6 +189,13 @@ def opened(driver: Driver) -> Policy:
             f" {', '.join(lacks)}"
         )
     return policy
+
+
+def _look_here() -> None:
+    """Let modules of the working folder be imported, after all others."""
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
 
 
 def _sha256(path: Path) -> str:

@@ -12,13 +12,6 @@ DEFAULT_IMAGE_SIZE = (96, 160)
 """Rows and columns for a model that takes any size."""
 
 
-def image_size(port: SessionPort) -> tuple[int, int]:
-    """Return rows and columns of an image input that was checked."""
-    found = port.shape[-2:]
-    rows, columns = (side if isinstance(side, int) else None for side in found)
-    return rows or DEFAULT_IMAGE_SIZE[0], columns or DEFAULT_IMAGE_SIZE[1]
-
-
 def zeros(name: str, port: SessionPort) -> Array:
     """Return the first value of a recurrent input."""
     shape = tuple(side for side in port.shape if isinstance(side, int))

@@ -179,8 +179,7 @@ class PipelinedControl(Generic[T]):
             latency_us: How long it took, microseconds.
         """
         ready = self._frame + delayed_frames(latency_us, self.dt_us)
-        before = self._coming[-1][0] if self._coming else 0
-        self._coming.append((max(before, ready), control))
+        self._coming.append((ready, control))
 
     def advance(self) -> T:
         """Return the control that acts in this frame, and go to the next."""

@@ -1,4 +1,4 @@
-"""Evaluators: they drive a compressed model, or read how it drove.
+"""Evaluators: they drive a compressed model, or read how it drove; agents for CARLA.
 
 To add an evaluator: write its class, then add it to this table.
 """
@@ -16,7 +16,7 @@ EVALUATORS: Registry[Evaluator] = Registry(
     _HERE,
     EvaluationError,
     {
-        "highway": f"{_HERE}.highway.evaluation_options:HighwayEvaluation",
+        "highway": f"{_HERE}.highway.evaluator:HighwayEvaluation",
         "bench2drive": f"{_HERE}.bench2drive.real_results:Bench2DriveResults",
     },
 )

@@ -16,6 +16,8 @@ from me2e_compress.errors import EvaluationError
 
 Floats = npt.NDArray[np.float64]
 
+SUBPIXEL_BITS = 4
+"""Binary digits behind the point in what OpenCV is given to draw."""
 CAMERA_HEIGHT_M = 1.6
 HORIZON = 0.42
 """Row of the horizon as a part of the image height: nuScenes-like crops show more
@@ -121,3 +123,8 @@ class CameraRig:
         matrices[:, :3, 3] = np.einsum("kij,kj->ki", self.intrinsics, self.translations)
         matrices[:, 3, 3] = 1.0
         return matrices.astype(np.float32)
+
+
+def fixed_point(pixels: Floats) -> npt.NDArray[np.int32]:
+    """Convert continuous pixels for cv2, which has pixel centres at whole numbers."""
+    return np.rint((pixels - 0.5) * (1 << SUBPIXEL_BITS)).astype(np.int32)

@@ -13,8 +13,6 @@ Ints = npt.NDArray[np.int64]
 Point = tuple[float, float]
 SPACING_M = 1.0
 """Distance between two points of a route, as Bench2Drive's dense routes."""
-LANE_SPACING_M = 2.0
-"""Longest chord that stands for a piece of a lane when we ask who is inside it."""
 
 
 class Command(IntEnum):

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
@@ -75,17 +75,8 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
     Raises:
         EvaluationError: The file is missing, not a manifest, or repeats an id.
     """
-    # a faulty manifest is reported by its first fault
-    try:
+    with documents.reading(path, EvaluationError, "not routes"):
         routes = _MANIFEST.validate_json(documents.content(path), strict=True)
-    except OSError as error:
-        raise EvaluationError(f"{path}: cannot be read: {error.strerror}") from error
-    except documents.MalformedError as error:
-        raise EvaluationError(f"{path}: not routes: {error}") from error
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the file"
-        raise EvaluationError(f"{path}: {where}: {first['msg']}") from error
     # ids are unique
     seen: dict[str, int] = {}
     for index, route in enumerate(routes):

@@ -5,33 +5,13 @@ frame is x forward, y left. highway-env's own world has its y axis pointing down
 `world` knows that, and converts once when it takes a snapshot.
 """
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 
-from me2e_compress.simulator.plane_geometry import (
-    Command,
-    Lane,
-    LaneMarking,
-    Roadmap,
-    RoutePath,
-)
+import numpy as np
 
-__all__ = [
-    "DIMENSIONS",
-    "Actor",
-    "ActorKind",
-    "Command",
-    "Control",
-    "Ego",
-    "Lane",
-    "LaneMarking",
-    "Roadmap",
-    "RoutePath",
-    "Scene",
-    "Signal",
-    "SignalKind",
-    "SignalState",
-]
+from me2e_compress.simulator.plane_geometry import Floats
 
 
 class ActorKind(StrEnum):
@@ -128,6 +108,18 @@ class Ego:
     length: float
     width: float
 
+    def seen(self, x: Floats, y: Floats) -> Floats:
+        """Convert points of the world to the ego frame: [..., 2], forward and left."""
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        dx, dy = x - self.x, y - self.y
+        return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=-1)
+
+    def placed(self, points: Floats) -> Floats:
+        """Convert [N, 2] points of the ego frame to the world."""
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        turn = np.array([[cos, sin], [-sin, cos]])
+        return np.asarray(points @ turn + (self.x, self.y))
+
 
 @dataclass(frozen=True, slots=True)
 class Signal:
@@ -152,3 +144,47 @@ class Scene:
     ego: Ego
     actors: tuple[Actor, ...]
     signals: tuple[Signal, ...]
+
+
+class EventKind(StrEnum):
+    """Kinds of events."""
+
+    TRIGGER = "trigger"
+    """A scenario's script began to act."""
+    COLLISION = "collision"
+    """The ego with another body."""
+    ACTOR_COLLISION = "actor_collision"
+    """Two others; never in a well-written scenario."""
+    STRUCK = "struck"
+    """Another body with the standing ego; counts against nobody."""
+    OUTSIDE_LANES = "outside_lanes"
+    RED_LIGHT = "red_light"
+    STOP_SIGN = "stop_sign"
+    GIVE_WAY = "give_way"
+    YIELD_EMERGENCY = "yield_emergency"
+
+
+INFRACTIONS: frozenset[EventKind] = frozenset(EventKind) - {
+    EventKind.TRIGGER,
+    EventKind.ACTOR_COLLISION,
+    EventKind.STRUCK,
+}
+"""Events that count against the driver."""
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One event.
+
+    ``detail`` names the script, or says in words what happened; x and y (metres) are
+    the ego's position. The actor is the other party, if any.
+    """
+
+    time_us: int
+    kind: EventKind
+    detail: str
+    x: float
+    y: float
+    ego_speed_mps: float
+    actor_id: int | None = None
+    actor_kind: ActorKind | None = None

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.route_summary import RouteSummary
@@ -19,6 +21,8 @@ from me2e_compress.study.prepared import PreparedVariant
 
 SCORED, MOVED_M = 1.0, 0.5
 """Two drives whose scores are closer, and that were never farther apart, look alike."""
+
+_FORGOTTEN = np.zeros((0, 0, 0, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -165,7 +169,7 @@ def watch(job: Job, route: Route, until_us: int) -> list[Moment]:
 
     def see(moment: Moment) -> None:
         if moments:
-            moments[-1] = replace(moments[-1], images=None)
+            moments[-1] = replace(moments[-1], images=_FORGOTTEN)
         moments.append(moment)
         if moment.scene.time_us >= until_us:
             raise _Enough

@@ -16,8 +16,7 @@ from me2e_compress.calibration.logs.base import (
 from me2e_compress.calibration.logs.futures import command_at
 from me2e_compress.calibration.logs.log_frames import changes
 from me2e_compress.calibration.logs.pictures import read_pixels
-from me2e_compress.driving.contract import Observation
-from me2e_compress.driving.ego_kinematics import EgoKinematics
+from me2e_compress.driving.contract import EgoKinematics, Observation
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.runtime.frames import Array

@@ -7,8 +7,7 @@ from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import POLICIES, Driver, driver_named
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
-from me2e_compress.evaluators.highway.evaluation_options import DrivingOptions
-from me2e_compress.evaluators.highway.evaluator import DrivingProgress
+from me2e_compress.evaluators.highway.evaluator import DrivingOptions, DrivingProgress
 from me2e_compress.evaluators.highway.results import MANIFEST, log_beside
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.extras import need_extra

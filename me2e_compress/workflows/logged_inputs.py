@@ -8,7 +8,7 @@ import onnx_ir as ir
 from me2e_compress.calibration.logs.log_frames import InputForm, LoggedInputs
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.driving.adapter import ImageNormalization
-from me2e_compress.driving.adapter.images import Triple
+from me2e_compress.driving.adapter.image_inputs import Triple
 from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.runtime.recurrence import recurrent_inputs
 from me2e_compress.workflows.first_opening import load_interface

@@ -16,8 +16,7 @@ from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, counted, table
 
 if TYPE_CHECKING:  # they take highway-env, an extra and a second to import
-    from me2e_compress.evaluators.highway.admission import Admission
-    from me2e_compress.evaluators.highway.generate import ScenarioRoutes
+    from me2e_compress.evaluators.highway.generate import Admission, ScenarioRoutes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,7 +193,7 @@ def examine_routes(
 ) -> ExaminationResult:
     """Examine a set of routes again; `pick` is ``all``, a number or ``ID,ID``."""
     need_extra("highway", "examining routes")
-    from me2e_compress.evaluators.highway.admission import examine
+    from me2e_compress.evaluators.highway.generate import examine
 
     manifest, verdicts = Path(manifest), []
     picked = pick_routes(load_routes(manifest), pick)

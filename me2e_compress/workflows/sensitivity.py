@@ -216,8 +216,10 @@ def _on_routes(
     from me2e_compress.evaluators.highway.conditions import Conditions
     from me2e_compress.evaluators.highway.drivers import image_size_of
     from me2e_compress.evaluators.highway.engine import LocalEngine
-    from me2e_compress.evaluators.highway.evaluation_options import routes_named
-    from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator
+    from me2e_compress.evaluators.highway.evaluator import (
+        HighwayEvaluator,
+        routes_named,
+    )
     from me2e_compress.evaluators.highway.worker import Job
     from me2e_compress.metrics.scores import score
     from me2e_compress.workflows.evaluate import driver_of

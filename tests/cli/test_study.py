@@ -7,7 +7,7 @@ import pytest
 import me2e_compress.study.run
 from me2e_compress.cli.commands.study import study
 from me2e_compress.errors import StudyError
-from me2e_compress.evaluators.highway import evaluation_options
+from me2e_compress.evaluators.highway import evaluator
 from me2e_compress.marks import IN_JSON
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.study import Study
@@ -46,7 +46,7 @@ latency = "trace"
 def here(monkeypatch: pytest.MonkeyPatch) -> Here:
     """Drive in this process."""
     engine = Here()
-    monkeypatch.setattr(evaluation_options, "engine_of", lambda *words: engine)
+    monkeypatch.setattr(evaluator, "engine_of", lambda *words: engine)
     return engine
 
 

@@ -19,7 +19,8 @@ from driver.episodes.recording_policy import (
 from me2e_compress.driving.contract import Observation, Plan
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.expert import Expert, ceiling
+from me2e_compress.evaluators.highway.expert.expert_policy import Expert
+from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.simulator.cameras import (
     CameraRig,

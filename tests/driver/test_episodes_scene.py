@@ -11,7 +11,8 @@ from driver.episodes import GRID
 from driver.episodes.agents import agents
 from driver.episodes.episode_arrays import Arrays, signals
 from driver.episodes.recording_policy import LabelledFrame
-from me2e_compress.evaluators.highway.expert import ExpertDecision, Memory
+from me2e_compress.evaluators.highway.expert.expert_policy import ExpertDecision, Memory
+from me2e_compress.simulator.privileged import Phase
 from me2e_compress.simulator.scene import (
     DIMENSIONS,
     Actor,
@@ -22,7 +23,6 @@ from me2e_compress.simulator.scene import (
     SignalKind,
     SignalState,
 )
-from me2e_compress.simulator.world import Phase
 
 NORTH = Ego(100.0, 50.0, math.pi / 2, 8.0, 0.0, 0.0, 0.0, 0.0, 5.0, 2.0)
 """Looks north: 10 m ahead is (100, 60), 3 m to its left (97, 50)."""
@@ -147,7 +147,7 @@ def frame(
     *lights: Signal, phases: tuple[Phase, ...], served: int = -1
 ) -> LabelledFrame:
     memory = Memory(served=frozenset({served}))
-    decision = ExpertDecision(np.zeros((6, 2)), 0.0, 0.0, 0.0, memory)
+    decision = ExpertDecision(np.zeros((6, 2)), 0.0, 0.0, memory)
     return LabelledFrame(scene(signals=lights), phases, 3, Memory(), decision)
 
 
@@ -163,7 +163,7 @@ def signal(
 
 
 def test_a_signal_is_told_in_the_ego_frame() -> None:
-    phase = Phase(5, 32.0, SignalState.YELLOW, None)
+    phase = Phase(5, 32.0, SignalState.YELLOW)
 
     rows = signals(
         frame(signal(5, 12.0, state=SignalState.YELLOW), phases=(phase,)), 20.0
@@ -182,7 +182,7 @@ def test_no_signal_is_no_red_light() -> None:
 def test_signals_of_the_route_come_first() -> None:
     far, near, nearer = signal(1, 40.0), signal(2, 9.0), signal(3, 5.0)
 
-    rows = signals(frame(near, nearer, far, phases=(Phase(1, 60.0, None, None),)), 0.0)
+    rows = signals(frame(near, nearer, far, phases=(Phase(1, 60.0, None),)), 0.0)
 
     assert rows[:3, 2] == pytest.approx([40.0, 5.0, 9.0])
     assert np.isnan(rows[:, 6]).tolist() == [False, True, True, True]

@@ -1,6 +1,5 @@
 """An adapter's inputs, held against a graph's."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -118,16 +117,6 @@ def test_uniads_own_inputs(tmp_path: Path) -> None:
     assert first["l2g_r_mat"].shape == (1, 3, 3)
     assert [int(each["use_prev_bev"][0]) for each in (first, second)] == [0, 1]
     assert inputs.feeds(observation(NOW))["use_prev_bev"] == [0]
-
-
-def test_a_dry_run_is_of_an_ego_that_stands_at_the_origin(tmp_path: Path) -> None:
-    inputs = inputs_of(tmp_path, "double[1] v", "[feeds.v]\nsource = 'speed'")
-
-    nothing = inputs.nothing(3)
-
-    assert nothing.motion is not None
-    assert not np.hstack(dataclasses.astuple(nothing.motion)).any()
-    assert (nothing.time_us, nothing.command, nothing.speed_mps) == (0, 3, 0.0)
 
 
 @pytest.mark.parametrize(

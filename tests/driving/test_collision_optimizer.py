@@ -5,8 +5,7 @@ import numpy.typing as npt
 import pytest
 from scipy.optimize import check_grad
 
-from me2e_compress.driving.collision_optimizer import CollisionOptimizer, _Problem
-from me2e_compress.driving.host_stage import HOST_STAGES
+from me2e_compress.driving.host_stage import HOST_STAGES, CollisionOptimizer, _Problem
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
-from me2e_compress.driving.head_fusion import FusionOptions, HeadFusion
+from me2e_compress.driving.waypoint_pid import FusionOptions, HeadFusion
 from me2e_compress.errors import EvaluationError
 
 AHEAD = (0.0, 30.0)

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from me2e_compress.driving.adapter.image_inputs import (
     CAMERA_NAMES,
     ImageInput,
+    ImageNormalization,
     ImagePort,
     rendered_size,
 )
-from me2e_compress.driving.adapter.images import ImageNormalization
 from me2e_compress.driving.adapter.input_images import InputImages
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.cameras import CAMERA_NAMES as RIG_NAMES

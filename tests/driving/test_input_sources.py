@@ -154,11 +154,6 @@ def test_what_an_observation_lacks_is_named(
         source.value(dataclasses.replace(seen, observation=blank))
 
 
-def test_geometry_asks_which_images_there_are() -> None:
-    with pytest.raises(EvaluationError, match="images = 'wide' names no image input"):
-        value("lidar2img:wide")
-
-
 @pytest.mark.parametrize("name", INPUT_SOURCES.names())
 def test_a_source_has_the_form_of_an_addition(name: str) -> None:
     needed: dict[str, dict[str, object]] = {

@@ -9,8 +9,7 @@ from typing import ClassVar
 import pytest
 
 from me2e_compress.driving.contract import Policy
-from me2e_compress.driving.policies import Driver, driver_named, opened
-from me2e_compress.driving.python_policy import PythonDriver
+from me2e_compress.driving.policies import Driver, PythonDriver, driver_named, opened
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
@@ -136,11 +135,6 @@ class Empty(Driver):
 def test_a_driver_that_opens_no_policy() -> None:
     with pytest.raises(EvaluationError, match="empty: a object is no policy: it has"):
         opened(Empty())
-
-
-def test_no_such_module() -> None:
-    with pytest.raises(EvaluationError, match="No module named 'nowhere_at_all'"):
-        driver_named("nowhere_at_all:make").open()
 
 
 def test_another_form_is_refused() -> None:

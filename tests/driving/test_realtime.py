@@ -46,12 +46,6 @@ def test_equation_4_in_exact_fractions(latency_us: int, dt_us: int) -> None:
     assert skipped_decisions(latency_us, dt_us) == max(0, int(seconds / dt) - 1)
 
 
-def test_a_finer_step_tells_fast_policies_apart() -> None:
-    assert skipped_decisions(20_000) == skipped_decisions(90_000) == 0
-    assert skipped_decisions(20_000, 10_000) == 1
-    assert skipped_decisions(90_000, 10_000) == 8
-
-
 def by_the_text(latencies_us: list[int], dt_us: int) -> tuple[list[int], list[int]]:
     """Decision d is number d, the initial control -1: (acting, deciding) frames.
 
@@ -87,20 +81,6 @@ def test_the_clock_follows_the_rule(latencies_us: list[int], dt_us: int) -> None
     assert held.decision_is_due
 
 
-@given(latencies)
-def test_every_frame_has_a_control_and_none_decides_twice(
-    latencies_us: list[int],
-) -> None:
-    held = HeldControl(-1)
-    for number, latency_us in enumerate(latencies_us):
-        assert held.decision_is_due
-        held.decide(number, latency_us)
-        for _ in range(skipped_decisions(latency_us)):
-            held.advance()
-            assert not held.decision_is_due
-        held.advance()
-
-
 @pytest.mark.parametrize(
     ("latency_us", "frames"),
     [(0, 0), (1, 1), (50_000, 1), (50_001, 2), (150_000, 3), (430_000, 9)],
@@ -116,16 +96,6 @@ def acting(clock: PipelinedControl[int], latencies_us: list[int]) -> list[int]:
         clock.decide(frame, latency_us)
         found.append(clock.advance())
     return found
-
-
-def test_a_pipeline_acts_on_every_frame_some_frames_later() -> None:
-    assert acting(PipelinedControl(-1), [120_000] * 6) == [-1, -1, -1, 0, 1, 2]
-
-
-def test_a_fast_decision_does_not_overtake_a_slow_one() -> None:
-    latencies_us = [150_000, 0, 0, 0, 0]
-
-    assert acting(PipelinedControl(-1), latencies_us) == [-1, -1, -1, 3, 4]
 
 
 @given(latencies, steps)

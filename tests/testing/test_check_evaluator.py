@@ -7,7 +7,7 @@ from typing import ClassVar
 import pytest
 
 from me2e_compress.errors import VerificationError
-from me2e_compress.evaluators.highway.evaluation_options import HighwayEvaluation
+from me2e_compress.evaluators.highway.evaluator import HighwayEvaluation
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.testing import check_evaluator

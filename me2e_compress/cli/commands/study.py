@@ -53,7 +53,7 @@ def study(
     """Drive variants under conditions and compare them; run it again to go on."""
     need_extra("highway", "a study")
     # takes highway-env and matplotlib two seconds to import
-    from me2e_compress.evaluators.highway.evaluation_options import engine_of
+    from me2e_compress.evaluators.highway.evaluator import engine_of
     from me2e_compress.study import load_study, study_path
     from me2e_compress.study.run import run_and_report
     from me2e_compress.study.workload import workload

@@ -12,11 +12,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from me2e_compress import documents
 from me2e_compress.driving.adapter.controls import ControlAdapter
 from me2e_compress.driving.adapter.feeds import Feed
-from me2e_compress.driving.adapter.image_inputs import ImageInput
-from me2e_compress.driving.adapter.images import ImageNormalization
+from me2e_compress.driving.adapter.image_inputs import ImageInput, ImageNormalization
 from me2e_compress.driving.adapter.recurrent import RecurrentEntry
 from me2e_compress.driving.axes import Axes
-from me2e_compress.driving.head_fusion import FusionOptions
+from me2e_compress.driving.waypoint_pid import FusionOptions
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter

@@ -10,9 +10,9 @@ from me2e_compress.driving.adapter.image_inputs import (
     CAMERA_NAMES,
     Crop,
     ImageInput,
+    ImageNormalization,
     ImagePort,
 )
-from me2e_compress.driving.adapter.images import ImageNormalization
 from me2e_compress.errors import EvaluationError
 from me2e_compress.extras import explained
 from me2e_compress.runtime.frames import Array

@@ -11,13 +11,12 @@ from me2e_compress.driving.adapter.feeds import Feed
 from me2e_compress.driving.adapter.image_inputs import (
     CAMERA_NAMES,
     ImageInput,
+    ImageNormalization,
     ImagePort,
     rendered_size,
 )
-from me2e_compress.driving.adapter.images import ImageNormalization
 from me2e_compress.driving.adapter.input_images import InputImages
-from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation
-from me2e_compress.driving.ego_kinematics import EgoKinematics
+from me2e_compress.driving.contract import CAN_BUS_SIZE, EgoKinematics, Observation
 from me2e_compress.driving.ego_track import EgoTrack
 from me2e_compress.driving.input_sources import INPUT_SOURCES, Observed
 from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE, Shape, fed, fits
@@ -44,6 +43,7 @@ class ModelInputs:
 
     ports: Mapping[str, SessionPort]
     adapter: Adapter
+    tables: Mapping[str, ImageInput]
     images: Mapping[str, InputImages]
     given: Mapping[str, Feed]
     image_size: tuple[int, int]
@@ -58,19 +58,26 @@ class ModelInputs:
         Raises:
             EvaluationError: Names the first port that cannot be fed.
         """
-        ports = {k: v for k, v in session.inputs.items() if k not in recurrent}
         _check_names(session, adapter, recurrent)
-        # every input is fed by something
-        tables, given = image_tables(adapter, ports), feeds_by_input(adapter, ports)
-        for name in ports:
-            if name not in tables and name not in given:
-                raise EvaluationError(unfed(name))
-        # and by something that fits
-        images, size = images_by_input(session, adapter, tables)
-        found = cls(session.inputs, adapter, images, given, size)
-        for fault in found.faults().values():
-            raise EvaluationError(fault)
+        found, problems = cls.found(session, adapter, recurrent)
+        for problem in problems.values():
+            raise EvaluationError(problem)
         return found
+
+    @classmethod
+    def found(
+        cls, session: AnySession, adapter: Adapter, recurrent: Mapping[str, str]
+    ) -> tuple[Self, dict[str, str]]:
+        """Return what can be fed, and by input why the rest cannot."""
+        ports = {k: v for k, v in session.inputs.items() if k not in recurrent}
+        # every input is fed by something
+        tables, given = _image_tables(adapter, ports), _feeds(adapter, ports)
+        fed_by = {**tables, **given}
+        problems = {name: _unfed(name) for name in ports if name not in fed_by}
+        # and by something that fits
+        images, size, faults = _images(session, adapter, tables)
+        found = cls(session.inputs, adapter, tables, images, given, size)
+        return found, {**problems, **faults, **found.faults()}
 
     @property
     def normalization(self) -> ImageNormalization | None:
@@ -153,19 +160,18 @@ def contract_names(adapter: Adapter) -> dict[str, str]:
     return {ours: ours for ours in (IMAGES, *CONTRACT)} | {**adapter.inputs}
 
 
-def image_tables(
+def _image_tables(
     adapter: Adapter, ports: Mapping[str, SessionPort]
 ) -> dict[str, ImageInput]:
     """Return the settings of each image input, from the adapter and the contract."""
+    tables = {k: v for k, v in adapter.images.items() if k in ports}
     usual = adapter.inputs.get(IMAGES, IMAGES)
     if usual in ports and usual not in {**adapter.images, **adapter.feeds}:
-        return {usual: ImageInput(), **adapter.images}
-    return dict(adapter.images)
+        return {usual: ImageInput(), **tables}
+    return tables
 
 
-def feeds_by_input(
-    adapter: Adapter, ports: Mapping[str, SessionPort]
-) -> dict[str, Feed]:
+def _feeds(adapter: Adapter, ports: Mapping[str, SessionPort]) -> dict[str, Feed]:
     """Return the feed of each other input, from the adapter and the contract."""
     named = {**adapter.images, **adapter.feeds}
     usual = contract_names(adapter)
@@ -173,33 +179,48 @@ def feeds_by_input(
         usual[ours]: Feed.by(INPUT_SOURCES.build(source, {}))
         for ours, source in CONTRACT.items()
         if usual[ours] in ports and usual[ours] not in named
-    } | adapter.feeds
+    } | {k: v for k, v in adapter.feeds.items() if k in ports}
 
 
-def images_by_input(
+def _images(
     session: AnySession, adapter: Adapter, tables: Mapping[str, ImageInput]
-) -> tuple[dict[str, InputImages], tuple[int, int]]:
-    """Return the image inputs, and the size in which the cameras are rendered."""
+) -> tuple[dict[str, InputImages], tuple[int, int], dict[str, str]]:
+    """Return the image inputs, the size of the cameras, and what does not fit."""
+    ports: dict[str, ImagePort] = {}
+    sizes: list[tuple[int, int]] = []
+    found: dict[str, InputImages] = {}
+    faults: dict[str, str] = {}
     # one rendered size serves all inputs: the largest that any of them asks for
-    ports = {
-        name: ImagePort.of(name, session.inputs[name].shape, table)
-        for name, table in tables.items()
-    }
-    sizes = [rendered_size(name, tables[name], port) for name, port in ports.items()]
+    for name, table in tables.items():
+        try:
+            port = ImagePort.of(name, session.inputs[name].shape, table)
+            sizes.append(rendered_size(name, table, port))
+            ports[name] = port
+        except EvaluationError as error:
+            faults[name] = str(error)
     rows, columns = zip(*(sizes or [DEFAULT_IMAGE_SIZE]), strict=True)
     rendered = max(rows), max(columns)
-    # inputs of bytes are not normalised
-    found: dict[str, InputImages] = {}
-    for name, table in tables.items():
-        norm = None
-        if session.inputs[name].type != BYTES:
-            usual = adapter.image
-            if usual is None and table.mean is None:
-                usual = ImageNormalization.of(session.metadata)
-            norm = table.normalization(name, usual)
-        found[name] = InputImages(table, ports[name], rendered, norm)
-        found[name].check(name)
-    return found, rendered
+    for name, port in ports.items():
+        try:
+            norm = _normalization(session, adapter, name, tables[name])
+            made = InputImages(tables[name], port, rendered, norm)
+            made.check(name)
+            found[name] = made
+        except EvaluationError as error:
+            faults[name] = str(error)
+    return found, rendered, faults
+
+
+def _normalization(
+    session: AnySession, adapter: Adapter, name: str, table: ImageInput
+) -> ImageNormalization | None:
+    """Return how an image input is normalised; inputs of bytes are not."""
+    if session.inputs[name].type == BYTES:
+        return None
+    usual = adapter.image
+    if usual is None and table.mean is None:
+        usual = ImageNormalization.of(session.metadata)
+    return table.normalization(name, usual)
 
 
 def _check_names(
@@ -228,7 +249,7 @@ def _exists(name: str, ports: Mapping[str, SessionPort], kind: str) -> None:
         )
 
 
-def unfed(name: str) -> str:
+def _unfed(name: str) -> str:
     """Return the message for an input that nothing feeds."""
     return (
         f"input {name} is none of {', '.join((IMAGES, *CONTRACT))}, no output is known"

@@ -9,7 +9,7 @@ import numpy as np
 from me2e_compress.driving.adapter.adapter import Adapter
 from me2e_compress.driving.adapter.controls import ControlAdapter, output_named
 from me2e_compress.driving.contract import Answer, Observation, Trajectory
-from me2e_compress.driving.head_fusion import HeadFusion
+from me2e_compress.driving.waypoint_pid import HeadFusion
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array

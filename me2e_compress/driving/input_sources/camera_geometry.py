@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.input_sources.base import InputSource, Observed
+from me2e_compress.driving.input_sources import InputSource, Observed
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
 

@@ -1,11 +1,12 @@
-"""Input sources of the route ahead: a command, a point to aim at."""
+"""Input sources of the route ahead, of time, and of constants."""
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
 
-from me2e_compress.driving.input_sources.base import InputSource, Observed
+from me2e_compress.driving.input_sources import InputSource, Observed
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
 
@@ -68,3 +69,70 @@ class TargetPoint(InputSource):
                 "the adapter asks for a target point, and the observation has none"
             )
         return seen.turned(points[0 if self.which == "near" else 1])
+
+
+MICROSECONDS = 1_000_000
+"""Microseconds in a second."""
+
+
+@dataclass(frozen=True)
+class Timestamp(InputSource):
+    """Time since the route began: [].
+
+    Attributes:
+        unit: Seconds, or whole microseconds (nuScenes').
+    """
+
+    name: ClassVar[str] = "timestamp"
+    unit: Literal["s", "us"] = "s"
+
+    def value(self, seen: Observed) -> Array:
+        """Return float64 [], or int64 []."""
+        time_us = seen.observation.time_us
+        if self.unit == "us":
+            return np.asarray(time_us, np.int64)
+        return np.asarray(time_us / MICROSECONDS)
+
+
+@dataclass(frozen=True)
+class UsePrevious(InputSource):
+    """0 at the first decision of a route, then 1 (UniAD's ``use_prev_bev``): []."""
+
+    name: ClassVar[str] = "use-previous"
+
+    def value(self, seen: Observed) -> Array:
+        """Return int64 []."""
+        return np.asarray(int(seen.track.decisions > 1), np.int64)
+
+
+LARGEST = 1e18
+"""The largest value: within int64."""
+
+
+@dataclass(frozen=True)
+class ConstantInput(InputSource):
+    """The same numbers at every decision.
+
+    Attributes:
+        values: The numbers, row by row.
+        shape: Their shape; empty for one row of them.
+    """
+
+    name: ClassVar[str] = "constant"
+    values: tuple[float, ...]
+    shape: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not all(abs(each) <= LARGEST for each in self.values):
+            raise EvaluationError(f"constant: values must be finite, up to {LARGEST:g}")
+        sides = self.shape or (len(self.values),)
+        if min(sides) < 0 or math.prod(sides) != len(self.values):
+            raise EvaluationError(
+                f"constant: {len(self.values)} values have no shape {list(self.shape)}"
+            )
+
+    def value(self, seen: Observed) -> Array:
+        """Return float64, or int64 where all values are whole numbers."""
+        whole = all(each.is_integer() for each in self.values)
+        array = np.array(self.values, np.int64 if whole else np.float64)
+        return array.reshape(self.shape) if self.shape else array

@@ -1,36 +1,41 @@
 """Evaluator that turns results of real CARLA runs into episodes."""
 
 import dataclasses
+import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.bench2drive.drive_recordings import DriveRecordings
-from me2e_compress.evaluators.bench2drive.logged_decisions import read_decisions
 from me2e_compress.evaluators.bench2drive.recordings import (
     TICK_S,
     BrokenRecordingError,
     RecordedRoute,
+    read_decisions,
     read_recording,
 )
 from me2e_compress.evaluators.bench2drive.records import RouteRecord
 from me2e_compress.evaluators.bench2drive.result_files import (
+    DriveRecordings,
     FoundFiles,
     ResultFile,
     find_files,
 )
-from me2e_compress.evaluators.bench2drive.route_sets import (
-    ROUTE_SETS,
-    RouteSet,
-    by_number,
-    likely_set,
-)
 from me2e_compress.metrics.episode import Episode, InferenceRecord
 from me2e_compress.metrics.scores import FULL_SET
+
+RouteSet = Literal["0.0.3", "0.0.4"]
+
+_IDS = json.loads(Path(__file__).with_name("route_ids.json").read_bytes())
+ROUTE_SETS: dict[RouteSet, frozenset[str]] = {
+    version: frozenset(ids) for version, ids in _IDS.items()
+}
+"""The ids of the 220 routes of each version of Bench2Drive: those of
+leaderboard/data/bench2drive220.xml and of bench2drive_0.0.4_val.xml, which share two.
+The ten routes of "dev10" belong to the first."""
 
 
 @dataclass(frozen=True)
@@ -157,13 +162,13 @@ class _Collection:
             self.notes.insert(0, f"{others[0]}{more}: of no record")
         # which routes of the set are missing, and which are foreign
         numbers = [each.number for each in records]
-        route_set = likely_set(numbers)
+        route_set = _likely_set(numbers)
         whole = ROUTE_SETS[route_set] if route_set else frozenset[str]()
         return CollectedResults(
             episodes,
             route_set,
             crashed=tuple(each.episode.route for each in records if each.crashed),
-            missing=tuple(sorted(whole - set(numbers), key=by_number)),
+            missing=tuple(sorted(whole - set(numbers), key=_by_number)),
             foreign=tuple(
                 each.episode.route
                 for each in records
@@ -193,7 +198,7 @@ class _Collection:
         chosen = [self._chosen(route, each) for route, each in by_route.items()]
         for record in chosen:
             self.notes += (f"{record.episode.route}: {note}" for note in record.notes)
-        return sorted(chosen, key=lambda each: (by_number(each.number), each.content))
+        return sorted(chosen, key=lambda each: (_by_number(each.number), each.content))
 
     def _chosen(self, route: str, records: Sequence[RouteRecord]) -> RouteRecord:
         """Choose one record of a route, so that uncertainty never improves a result.
@@ -258,3 +263,14 @@ def _lowest_first(record: RouteRecord) -> tuple[float, bool, str]:
     given = record.episode.given
     composed = given.composed_percent if given else 0.0
     return composed, record.episode.succeeded, record.content
+
+
+def _likely_set(numbers: Collection[str]) -> RouteSet | None:
+    """Return the set that most of the routes belong to, if any."""
+    best = max(ROUTE_SETS, key=lambda name: len(ROUTE_SETS[name] & set(numbers)))
+    return best if ROUTE_SETS[best] & set(numbers) else None
+
+
+def _by_number(number: str) -> tuple[int, str]:
+    """Return a sort key that orders routes by number."""
+    return (int(number), "") if number.isascii() and number.isdecimal() else (0, number)

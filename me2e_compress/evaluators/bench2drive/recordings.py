@@ -8,12 +8,15 @@ CARLA's left-handed world. They write no time; it is inferred from the motion.
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from me2e_compress.metrics.episode import LARGEST, EgoFrame
+from me2e_compress import documents
+from me2e_compress.metrics.episode import LARGEST, EgoFrame, InferenceRecord
 
 TICK_S = 0.05
 """Simulated seconds between two ticks of a leaderboard run."""
@@ -106,7 +109,7 @@ class RecordedRoute:
         stood, the agent's steps are taken as ticks.
         """
         # the best correlated pair of signals
-        found = [each for each in self._ties() if each.likeness > _LIKENESS]
+        found = [each for each in self._correlations() if each.likeness > _LIKENESS]
         moved = max(found, key=lambda each: each.likeness, default=None)
         lasted = None if duration_s is None else _usual(duration_s / len(self.steps))
         # no motion to infer from: duration, or the agent's steps
@@ -119,7 +122,7 @@ class RecordedRoute:
             return lasted
         return _nearest(moved.interval_s)
 
-    def _ties(self) -> Iterator["_Tie"]:
+    def _correlations(self) -> Iterator["_Correlation"]:
         """Compare pairs of signals that differ by a power of the interval.
 
         Second differences of the position are dt^2 times the acceleration. CARLA's
@@ -131,8 +134,8 @@ class RecordedRoute:
         between = (self.yaw_rate_radps[1:] + self.yaw_rate_radps[:-1]) / 2.0
         for part in (slice(2, None), slice(1, -1)):
             pulls = self.acceleration_mps2[part]
-            yield _Tie.of(bends.ravel(), pulls.ravel(), 0.5, _LEAST_MPS2)
-        yield _Tie.of(turns, between, 1.0, _LEAST_RADPS)
+            yield _Correlation.of(bends.ravel(), pulls.ravel(), 0.5, _LEAST_MPS2)
+        yield _Correlation.of(turns, between, 1.0, _LEAST_RADPS)
 
     def _from_steps(self) -> float:
         between = np.diff(self.steps)
@@ -141,14 +144,14 @@ class RecordedRoute:
 
 
 @dataclass(frozen=True)
-class _Tie:
+class _Correlation:
     """The interval that two signals imply, and their correlation, -1 to 1."""
 
     interval_s: float
     likeness: float
 
     @classmethod
-    def of(cls, of: Floats, over: Floats, power: float, least: float) -> "_Tie":
+    def of(cls, of: Floats, over: Floats, power: float, least: float) -> "_Correlation":
         """Compare root mean squares: they are least sensitive to noise."""
         if not over.size:
             return cls(0.0, 0.0)
@@ -211,3 +214,26 @@ def _vector(step: str, values: object, part: str, size: int) -> Sequence[float]:
     if not all(abs(each) <= LARGEST for each in vector):  # NaN compares as false
         raise BrokenRecordingError(f"step {step}: {part} is not finite")
     return vector[:size]
+
+
+_Count = Annotated[int, Field(ge=0, le=LARGEST)]
+
+
+class _Line(BaseModel):
+    model_config = ConfigDict(strict=True, extra="ignore")
+    frame: _Count
+    latency_us: _Count
+
+
+def read_decisions(path: Path) -> tuple[InferenceRecord, ...]:
+    """Read a ``decisions.jsonl``."""
+    found = list[InferenceRecord]()
+    lines = documents.content(path, documents.LARGEST_LOG_BYTES).splitlines()
+    for number, line in enumerate(lines, 1):
+        try:
+            noted = _Line.model_validate(documents.from_json(line))
+        except (documents.MalformedError, ValidationError) as error:
+            raise BrokenRecordingError(f"line {number} is no decision") from error
+        time_us = round(1e6 * TICK_S * noted.frame)
+        found.append(InferenceRecord(time_us, noted.latency_us))
+    return tuple(found)

@@ -12,14 +12,16 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from me2e_compress.evaluators.bench2drive.scenario_types import abilities_of, type_of
 from me2e_compress.metrics.episode import LARGEST, Ending, Episode, Given
 from me2e_compress.metrics.infraction import Infraction, InfractionKind
+from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 
 _PERCENT = re.compile(r"\b\d+\.?\d*%")
 """The first percentage of a message, as efficiency_smoothness_benchmark.py finds it."""
 _OUTSIDE = re.compile(r"\((\d+\.?\d*)% of")
 _PLACE = re.compile(r"\(x=(-?\d+(?:\.\d+)?), y=(-?\d+(?:\.\d+)?)")
+_NUMBER = re.compile(r"_\d+$")
+"""What a scenario's name has after its type: ``ParkingCutIn_1``."""
 _ROUTE = re.compile(r"[\w.-]{1,200}")
 
 _FAILED = "Failed"
@@ -87,11 +89,11 @@ def read_record(raw: object) -> RouteRecord:
     # infractions, ending and scenario
     infractions, ratios, notes = _infractions(record)
     ending = _ending(record.status)
-    scenario = type_of(record.scenario_name or "")
+    scenario = _NUMBER.sub("", record.scenario_name or "")
     episode = Episode(
         route=record.route_id,
         scenario=scenario,
-        abilities=abilities_of(scenario),
+        abilities=SCENARIO_ABILITIES.get(scenario, ()),
         route_length_m=record.meta.route_length,
         completion_percent=record.scores.score_route,
         ending=ending,

@@ -17,11 +17,11 @@ from me2e_compress.driving.contract import (
 from me2e_compress.evaluators.highway.observe import scene_and_world
 from me2e_compress.evaluators.highway.reentry import (
     beyond,
-    in_ego_frame,
     reentry,
     slope_of,
 )
-from me2e_compress.simulator.scene import Ego, RoutePath
+from me2e_compress.simulator.plane_geometry import RoutePath
+from me2e_compress.simulator.scene import Ego
 
 SPEEDS_MPS = (4.0, 8.0, 12.0)
 """Speeds at which the admission gate tries the blind driver."""
@@ -70,4 +70,4 @@ def centre_plan(ego: Ego, path: RoutePath, near_m: float, speed_mps: float) -> P
     slope = slope_of(ego, path, s)
     offsets = reentry(travel[None], lateral, slope, np.zeros(1), length)[0]
     x, y, _ = beyond(path, s + travel, offsets)
-    return in_ego_frame(x, y, ego)
+    return ego.seen(x, y)

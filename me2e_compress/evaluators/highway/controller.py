@@ -1,4 +1,4 @@
-"""Waypoints to acceleration and steering.
+"""Waypoints, or pedals and wheel, to acceleration and steering.
 
 A plan is tracked in the world, from the pose at which it was computed, along a smooth
 curve that starts on the ego's course. Steering is pursuit with the circle of the real
@@ -29,10 +29,11 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from me2e_compress.driving.answer import timed
-from me2e_compress.driving.contract import Plan, Trajectory
+from me2e_compress.driving.contract import PedalsAndWheel, Plan, Trajectory
 from me2e_compress.simulator.bicycle import (
     advance,
     slip_of,
+    steering_of,
     steering_through,
 )
 from me2e_compress.simulator.plane_geometry import Floats, resample
@@ -43,6 +44,8 @@ from me2e_compress.simulator.traffic.bodies import (
     STEERING_LAG_S,
 )
 
+LOOKAHEAD_S, SHORTEST_LOOKAHEAD_M = 0.5, 3.0
+"""Lookahead of the pursuit: seconds of travel, and metres at walking pace."""
 AHEAD_S = (0.5, 1.0)
 """Seconds ahead at which the planned positions set the acceleration."""
 MIN_STEP_M = 0.3
@@ -77,9 +80,7 @@ class AnchoredPlan:
         times = np.concatenate([[0.0], trajectory.times_s])
         knots, travel = _advance_only(points)
         local = _smooth(knots, slip_of(ego.steering_rad))
-        cos, sin = math.cos(ego.heading), math.sin(ego.heading)
-        turn = np.array([[cos, sin], [-sin, cos]])
-        return cls(time_us, local @ turn + (ego.x, ego.y), travel, times)
+        return cls(time_us, ego.placed(local), travel, times)
 
     def nearest(self, x: float, y: float) -> float:
         """Return the arc length (m) of the curve point nearest to a position."""
@@ -106,57 +107,39 @@ class AnchoredPlan:
         beyond = max(seconds - times[-1], 0.0) * last_speed
         return float(np.interp(seconds, times, self.travel_m) + beyond)
 
+    def control(self, ego: Ego, time_us: int) -> Control:
+        """Return the control that follows the plan from the ego's present state.
 
-@dataclass(frozen=True)
-class Controller:
-    """Tracks an anchored plan; stateless.
+        The runner asks once per decision, at the frame of the observation; the latency
+        model says when the control acts and for how long (`driving.realtime`). It does
+        not steer between two decisions.
+        """
+        age_s = (time_us - self.time_us) / 1e6
+        return Control(self._acceleration(ego, age_s), self._steering(ego))
 
-    The runner calls it once per decision, at the frame of the observation; the latency
-    model says when its control acts and for how long (`driving.realtime`). It does not
-    steer between two decisions.
-
-    Args:
-        lookahead_s: Lookahead of the pursuit, in seconds of travel.
-        min_lookahead_m: Lookahead at walking pace.
-        wheel_lag_s: Lag of the steering: pursuit starts where the ego will be then.
-        thrust_lag_s: Lag of brakes and engine (`traffic.bodies`).
-        acceleration_mps2: (strongest braking, strongest acceleration).
-    """
-
-    lookahead_s: float = 0.5
-    min_lookahead_m: float = 3.0
-    wheel_lag_s: float = STEERING_LAG_S
-    thrust_lag_s: float = ACCELERATION_LAG_S
-    acceleration_mps2: tuple[float, float] = ACCELERATION_RANGE_MPS2
-
-    def control(self, plan: AnchoredPlan, ego: Ego, time_us: int) -> Control:
-        """Return the control that follows a plan from the ego's present state."""
-        age = (time_us - plan.time_us) / 1e6
-        return Control(self._acceleration(plan, ego, age), self._steering(plan, ego))
-
-    def _acceleration(self, plan: AnchoredPlan, ego: Ego, age_s: float) -> float:
+    def _acceleration(self, ego: Ego, age_s: float) -> float:
         """Return the least-squares fit to the positions in 0.5 s and 1 s, with lag."""
-        here, speed = plan.nearest(ego.x, ego.y), ego.speed_mps
-        asked = weight = 0.0
+        here, speed = self.nearest(ego.x, ego.y), ego.speed_mps
+        lag, asked, weight = ACCELERATION_LAG_S, 0.0, 0.0
         for ahead in AHEAD_S:
             # distance lost to the lag, distance coasted, distance per m/s2 asked for
-            late = self.thrust_lag_s * (ahead - self.thrust_lag_s)
-            late += self.thrust_lag_s**2 * math.exp(-ahead / self.thrust_lag_s)
+            late = lag * (ahead - lag)
+            late += lag**2 * math.exp(-ahead / lag)
             free = speed * ahead + ego.acceleration_mps2 * late
             gain = ahead**2 / 2 - late
-            asked += gain * (plan.travel_at(age_s + ahead) - here - free)
+            asked += gain * (self.travel_at(age_s + ahead) - here - free)
             weight += gain * gain
-        low, high = self.acceleration_mps2
+        low, high = ACCELERATION_RANGE_MPS2
         return min(max(asked / weight, low), high)
 
-    def _steering(self, plan: AnchoredPlan, ego: Ego) -> float:
+    def _steering(self, ego: Ego) -> float:
         # from where the ego is once the wheels have turned
-        travel = ego.speed_mps * self.wheel_lag_s
+        travel = ego.speed_mps * STEERING_LAG_S
         pose = (ego.x, ego.y, ego.heading)
         x, y, heading = advance(*pose, ego.steering_rad, travel, ego.length)
         # to the point of the curve one lookahead further
-        lookahead = max(self.min_lookahead_m, self.lookahead_s * ego.speed_mps)
-        target_x, target_y = plan.point(plan.nearest(x, y) + lookahead)
+        lookahead = max(SHORTEST_LOOKAHEAD_M, LOOKAHEAD_S * ego.speed_mps)
+        target_x, target_y = self.point(self.nearest(x, y) + lookahead)
         cos, sin = math.cos(heading), math.sin(heading)
         forward = cos * (target_x - x) + sin * (target_y - y)
         left = cos * (target_y - y) - sin * (target_x - x)
@@ -203,3 +186,36 @@ def _smooth(knots: Floats, course: float) -> Floats:
     # the straight extension, and even spacing
     beyond = curve[-1] + np.linspace(0.0, BEYOND_M, 2)[1:, None] * tangent
     return resample(np.vstack([curve, beyond]), STATION_M)
+
+
+STEER_GAIN_RAD = 0.36848336
+FRONT_AXLE_M, REAR_AXLE_M = -0.090769015, 1.4178275
+"""World on Rails: wheel angle of a full steer, axles from the centre."""
+
+
+def control_of(asked: PedalsAndWheel, length_m: float) -> Control:
+    """Convert CARLA's throttle, brake and steer to the control of this ego.
+
+    Full pedals are the limits of the ego's engine and brakes, as in CARLA: throttle 4
+    m/s2, brake 8 m/s2, both together their difference; with neither the ego keeps its
+    speed (no drag, no creeping).
+
+    A steer (to the right positive) gives the circle that CARLA's car would drive, by
+    the kinematic bicycle that World on Rails (Chen, Koltun and Kraehenbuehl 2021)
+    fitted to CARLA and TransFuser and its successors use. A full steer is a circle of
+    3.7 m there; the wheels of this ego turn to one of 7.7 m, so a steer beyond 0.47
+    changes nothing.
+    """
+    braking, thrust = ACCELERATION_RANGE_MPS2
+    curvature = curvature_by(-asked.steer)
+    sine = min(max(curvature * length_m / 2, -1.0), 1.0)
+    return Control(
+        asked.throttle * thrust + asked.brake * braking, steering_of(math.asin(sine))
+    )
+
+
+def curvature_by(steer: float) -> float:
+    """Return the curvature (1/m) of the circle that CARLA's car drives at a steer."""
+    share = REAR_AXLE_M / (FRONT_AXLE_M + REAR_AXLE_M)
+    slip = math.atan(share * math.tan(STEER_GAIN_RAD * steer))
+    return math.sin(slip) / REAR_AXLE_M

@@ -9,15 +9,15 @@ import numpy as np
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.realtime import DT_US
 from me2e_compress.errors import FramesError
-from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
-from me2e_compress.evaluators.highway.durations import EXPERT_S
-from me2e_compress.evaluators.highway.endings import EndingRules
-from me2e_compress.evaluators.highway.expert import Expert
+from me2e_compress.evaluators.highway.controller import AnchoredPlan
+from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.generate import propose, seed_of
 from me2e_compress.evaluators.highway.observe import ObservationBuilder
+from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
 from me2e_compress.simulator.routes import Route, load_routes
+from me2e_compress.simulator.scenarios.catalogue import EXPERT_S
 from me2e_compress.simulator.world import World
 
 STEP_US = 500_000
@@ -90,10 +90,9 @@ def _look(
     policy: OnnxPolicy, route: Route, begin_us: int, count: int
 ) -> Iterator[dict[str, Array]]:
     """Yield the model's feeds from a moment on, until enough or the route ends."""
-    world, expert, controller, rules = (
+    world, expert, rules = (
         World(route),
         Expert(),
-        Controller(),
         EndingRules(),
     )
     # the expert drives, the model looks on
@@ -115,5 +114,5 @@ def _look(
             count -= 1
         plan = expert.plan(driver.observe(scene))
         anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)
-        world.step(controller.control(anchored, scene.ego, scene.time_us))
+        world.step(anchored.control(scene.ego, scene.time_us))
         scene = world.scene()

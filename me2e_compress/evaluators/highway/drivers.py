@@ -25,7 +25,7 @@ class ExpertDriver(Driver):
 
     def open(self) -> Policy:
         """Return the expert."""
-        from me2e_compress.evaluators.highway.expert import Expert
+        from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 
         return Expert()
 

@@ -21,15 +21,11 @@ from me2e_compress.metrics.infraction import (
     Infraction,
     InfractionKind,
 )
+from me2e_compress.simulator.plane_geometry import Command, RoutePath
 from me2e_compress.simulator.routes import Route
-from me2e_compress.simulator.scene import (
-    ActorKind,
-    Command,
-    RoutePath,
-    Scene,
-)
+from me2e_compress.simulator.scene import ActorKind, Event, EventKind, Scene
 from me2e_compress.simulator.traffic.legs import ANNOUNCED_M
-from me2e_compress.simulator.world import Event, EventKind, World
+from me2e_compress.simulator.world import World
 
 NEAR_M = 50.0
 """Range of the vehicles whose speed the ego's is compared with."""
@@ -94,20 +90,8 @@ class EpisodeRecorder:
 
 def failed_episode(route: Route, completion_percent: float, failure: str) -> Episode:
     """Return the episode of a route whose process was lost with its record."""
-    world = World(route)
-    return Episode(
-        route=route.id,
-        scenario=route.scenario,
-        abilities=route.abilities,
-        route_length_m=world.path.goal_m,
-        completion_percent=completion_percent,
-        ending=Ending.POLICY_FAILED,
-        failure=failure,
-        infractions=(),
-        frames=(),
-        decisions=(),
-        junction_m=junction_m(world.path),
-    )
+    blank = EpisodeRecorder(World(route)).episode(Ending.POLICY_FAILED, failure)
+    return replace(blank, completion_percent=completion_percent, conflicts=None)
 
 
 def completion_percent(world: World) -> float:

@@ -1,19 +1,25 @@
 """A whole evaluation: independent routes, resumable, reproducible byte by byte."""
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
 
-from me2e_compress.driving.policies import opened
+from me2e_compress.driving.latency import LatencySource, parse_latency
+from me2e_compress.driving.policies import Driver, driver_named, opened
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.durations import longest_first
-from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
+from me2e_compress.evaluators.highway.conditions import ConditionOptions
+from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
+from me2e_compress.evaluators.highway.engine import Engine, LocalEngine, RayEngine
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
-from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
+from me2e_compress.extras import need_extra
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
-from me2e_compress.simulator.routes import Route
+from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.simulator.routes import Route, load_routes, pick_routes
+from me2e_compress.simulator.scenarios.catalogue import EXPERT_S
 
 
 @dataclass(frozen=True)
@@ -91,6 +97,14 @@ class HighwayEvaluator:
         return LocalEngine(1)
 
 
+def longest_first(routes: Sequence[Route]) -> list[Route]:
+    """Order routes by the typical duration of their type, longest first.
+
+    A long route that starts last would keep all other workers waiting.
+    """
+    return sorted(routes, key=lambda route: (-EXPERT_S[route.scenario], route.id))
+
+
 def progress_of(episodes: Sequence[Episode], total: int) -> DrivingProgress:
     """Return the progress of the episodes so far."""
     if not episodes:
@@ -100,4 +114,146 @@ def progress_of(episodes: Sequence[Episode], total: int) -> DrivingProgress:
         total,
         sum(route_score(one).composed for one in episodes) / len(episodes),
         100.0 * sum(one.succeeded for one in episodes) / len(episodes),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrivingOptions(ConditionOptions):
+    """Which routes are driven, under which conditions and where, whatever drives them.
+
+    Texts are read when they are first needed, and once.
+
+    Attributes:
+        routes: ``all``, a number, ``ID,ID`` or a file of routes.
+        latency: what a decision costs: ``none``, ``fps:F``, ``trace:FILE``,
+            ``measured``.
+        latency_scale: factor on a trace or a measurement.
+        seed: seed of the draws from a trace.
+        workers: routes at a time.
+        adapter: TOML file that adapts the model to the policy contract.
+        frame_limit_s: seconds until a decision counts as hung.
+        engine: ``local``, processes of this machine, or ``ray``, a cluster.
+        address: address of a running Ray cluster; None starts one.
+        provider: what runs the model; policies other than graphs ignore it.
+    """
+
+    routes: str = "all"
+    latency: str = "none"
+    latency_scale: float = 1.0
+    seed: int = 0
+    workers: int = 1
+    adapter: str | Path | None = None
+    frame_limit_s: float = FRAME_LIMIT_S
+    engine: str = "local"
+    address: str | None = None
+    provider: Provider = CPU
+
+    @functools.cached_property
+    def picked(self) -> tuple[tuple[Route, ...], int]:
+        """The routes asked for, and the size of the set they are from.
+
+        Raises:
+            EvaluationError: There is no such route, or no file of routes.
+        """
+        return routes_named(self.routes)
+
+    @functools.cached_property
+    def source(self) -> LatencySource:
+        """The latency of each decision.
+
+        Raises:
+            EvaluationError: There is no such source, or an option is invalid.
+        """
+        return parse_latency(
+            self.latency,
+            in_order=self.in_order,
+            scale=self.latency_scale,
+            seed=self.seed,
+        )
+
+    def driven_by(
+        self,
+        driver: Driver,
+        folder: Path,
+        on_progress: Callable[[DrivingProgress], None] = lambda progress: None,
+        on_warning: Callable[[str], None] = lambda line: None,
+    ) -> HighwayEvaluator:
+        """Return the evaluator of a driver, whose results go to a folder.
+
+        Raises:
+            EvaluationError: An option is invalid, or the driver cannot be opened.
+        """
+        picked, set_size = self.picked
+        conditions = replace(self.settings, latency=self.source)
+        size = image_size_of(opened(driver))
+        return HighwayEvaluator(
+            Job(driver, replace(conditions, image_size=size), self.frame_limit_s),
+            picked,
+            folder,
+            set_size,
+            engine_of(self.engine, self.workers, self.address),
+            on_progress,
+            on_warning,
+        )
+
+
+@dataclass(frozen=True)
+class HighwayEvaluation(DrivingOptions):
+    """Drive a policy over routes of highway-env, resuming an interrupted run.
+
+    Attributes:
+        policy: A policy by name, ``blind:8``, or the path of an ONNX file.
+        folder: Where the results go.
+    """
+
+    name: ClassVar[str] = "highway"
+    policy: str
+    folder: Path
+
+    def episodes(self) -> Iterator[Episode]:
+        """Drive what is missing, then yield all routes in the order given.
+
+        Raises:
+            EvaluationError: An option is invalid, or see `HighwayEvaluator.episodes`.
+        """
+        yield from self.evaluator().episodes()
+
+    def evaluator(self) -> HighwayEvaluator:
+        """Build the evaluator of the policy, which is looked up by name.
+
+        Raises:
+            EvaluationError: An option is invalid.
+            MissingExtraError: The extra ``highway`` is not installed.
+        """
+        need_extra("highway", "driving")
+        driver = driver_named(self.policy, self.adapter)
+        if isinstance(driver, OnnxDriver):
+            driver = replace(driver, provider=self.provider)
+        return self.driven_by(driver, self.folder)
+
+
+def routes_named(text: str, beside: Path = Path()) -> tuple[tuple[Route, ...], int]:
+    """Return the routes asked for, and the size of the set they are from.
+
+    A file of routes is looked up in the folder ``beside``.
+
+    Raises:
+        EvaluationError: There is no such route, or no file of routes.
+    """
+    if text.endswith(".json"):
+        routes = load_routes(beside / text)
+        return routes, len(routes)
+    shipped = load_routes()
+    return pick_routes(shipped, text), len(shipped)
+
+
+def engine_of(name: str, workers: int, address: str | None) -> Engine:
+    """Return the engine of a name; only ``ray`` takes an address."""
+    if name == "local" and address is None:
+        return LocalEngine(workers)
+    if name == "ray":
+        return RayEngine(workers, address)
+    raise EvaluationError(
+        f"engine {name!r} with address {address}: there are local, and ray with or "
+        "without an address"
     )

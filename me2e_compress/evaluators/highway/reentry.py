@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from me2e_compress.simulator.bicycle import slip_of
-from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.scene import Ego, RoutePath
+from me2e_compress.simulator.plane_geometry import Floats, RoutePath
+from me2e_compress.simulator.scene import Ego
 
 STEEPEST = 0.6
 """Largest slope (m of offset per m of route) that a re-entry starts from."""
@@ -43,10 +43,3 @@ def beyond(path: RoutePath, s_m: Floats, lateral_m: Floats) -> tuple[Floats, ...
     x, y, heading = path.at(s_m, lateral_m)
     over = np.maximum(s_m - path.length_m, 0.0) + np.minimum(s_m, 0.0)
     return x + over * np.cos(heading), y + over * np.sin(heading), heading
-
-
-def in_ego_frame(x: Floats, y: Floats, ego: Ego) -> Floats:
-    """Convert points to the ego frame: [N, 2], x forward and y left."""
-    cos, sin = math.cos(ego.heading), math.sin(ego.heading)
-    dx, dy = x - ego.x, y - ego.y
-    return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=-1)

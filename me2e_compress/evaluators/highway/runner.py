@@ -1,9 +1,12 @@
-"""Drive one route: the policy decides, its latency is charged, an episode results."""
+"""Drive one route: the policy decides, its latency is charged, an episode results.
 
-import math
+A route ends by the rules of the CARLA leaderboard, as Bench2Drive sets them.
+"""
+
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +14,6 @@ import numpy.typing as npt
 from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import (
     HostedPolicy,
-    Observation,
     PedalsAndWheel,
     Policy,
     Trajectory,
@@ -20,11 +22,12 @@ from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import control_clock
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
-from me2e_compress.evaluators.highway.endings import EndingRules
+from me2e_compress.evaluators.highway.controller import (
+    AnchoredPlan,
+    control_of,
+)
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
 from me2e_compress.evaluators.highway.observe import ObservationBuilder, road_users
-from me2e_compress.evaluators.highway.vehicle_map import control_of
 from me2e_compress.metrics.episode import Ending, Episode, InferenceRecord
 from me2e_compress.simulator.cameras import (
     CameraRig,
@@ -34,9 +37,65 @@ from me2e_compress.simulator.cameras import (
 from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Control, Ego, Scene
-from me2e_compress.simulator.world import World
+from me2e_compress.simulator.world import EndReason, World
+
+BLOCKED_MPS = 0.1
+BLOCKED_US = 60_000_000
+TIMEOUT_US = 200_000_000
+"""4000 ticks of 50 ms; the leaderboard's own limits are longer."""
+DEVIATION_M = 30.0
+ASTRAY_M = 15.0
+ASTRAY_SHARE = 0.3
+
+
+@dataclass
+class EndingRules:
+    """Decides when one route is over; constants of Bench2Drive's atomic_criteria.py.
+
+    * the goal is reached, or the ego collides: the world itself ends there. CARLA
+      drives on after a collision, so its driving scores multiply more penalties;
+    * deviation: 30 m from the route, or more than 30 % of its length driven at least 15
+      m away from it;
+    * blocked: at most 0.1 m/s for 60 s;
+    * timed out: 200 s.
+    """
+
+    _stopped_at_us: int | None = field(default=None, init=False)
+    _astray_m: float = field(default=0.0, init=False)
+    _last_us: int = field(default=0, init=False)
+
+    def ending(self, world: World, speed_mps: float) -> Ending | None:
+        """Return why the route is over, or None; call it after every step."""
+        if world.reason is not None:
+            reached = world.reason is EndReason.GOAL
+            return Ending.COMPLETED if reached else Ending.COLLISION
+        if self._deviated(world, speed_mps):
+            return Ending.DEVIATION
+        if self._blocked(world, speed_mps):
+            return Ending.BLOCKED
+        return Ending.TIMEOUT if world.time_us >= TIMEOUT_US else None
+
+    def _deviated(self, world: World, speed_mps: float) -> bool:
+        away_m = abs(world.lateral_m)
+        passed_s = (world.time_us - self._last_us) / 1e6
+        self._last_us = world.time_us
+        if away_m >= ASTRAY_M:
+            self._astray_m += speed_mps * passed_s
+        return (
+            away_m >= DEVIATION_M or self._astray_m > ASTRAY_SHARE * world.path.goal_m
+        )
+
+    def _blocked(self, world: World, speed_mps: float) -> bool:
+        if speed_mps > BLOCKED_MPS:
+            self._stopped_at_us = None
+            return False
+        if self._stopped_at_us is None:
+            self._stopped_at_us = world.time_us
+        return world.time_us - self._stopped_at_us >= BLOCKED_US
+
 
 Plan = npt.NDArray[np.float64]
+T = TypeVar("T")
 
 
 class PolicyFailedError(Exception):
@@ -91,7 +150,6 @@ class _Drive:
             conditions.latency_model, Control(0.0, 0.0), conditions.dt_us
         )
         self.charge = conditions.latency.on_route(route.id)
-        self.controller = Controller()
         rig = CameraRig(*conditions.image_size)
         self.cameras = None
         if policy.needs_images or listeners.on_moment is not None:
@@ -107,7 +165,7 @@ class _Drive:
         # record, decide and step until a rule ends the route
         try:
             self.listeners.on_query(world)
-            _reset(self.policy, self.route)
+            _ask(lambda: self.policy.reset(self.route))
             self.listeners.on_answer()
             while ending is None:
                 self.recorder.record(scene)
@@ -130,7 +188,7 @@ class _Drive:
         observation = self.observer.observe(scene)
         self.listeners.on_query(self.world)
         begun = time.perf_counter_ns()
-        answer = _ask(self.policy, observation)
+        answer = _ask(lambda: self.policy.plan(observation))
         took_us = (time.perf_counter_ns() - begun) // 1_000
         self.listeners.on_answer()
         # the latency source may use the measured time
@@ -146,37 +204,27 @@ class _Drive:
             return control_of(answer, scene.ego.length)
         self.plan = scene.ego, np.asarray(answer.points, np.float64)
         anchored = AnchoredPlan.of(answer, scene.ego, scene.time_us)
-        return self.controller.control(anchored, scene.ego, scene.time_us)
+        return anchored.control(scene.ego, scene.time_us)
 
     def show(self, scene: Scene) -> None:
         """Render this frame for the listener that draws pictures."""
         if self.listeners.on_moment is not None and self.cameras is not None:
             images = self.cameras.render(scene)
-            plan = None if self.plan is None else _seen_from(scene.ego, *self.plan)
+            plan = None
+            if self.plan is not None:
+                planned_at, points = self.plan
+                plan = scene.ego.seen(*planned_at.placed(points).T)
             self.listeners.on_moment(Moment(scene, images, plan, self.world.events))
 
 
-def _seen_from(ego: Ego, planned_at: Ego, plan: Plan) -> Plan:
-    """Convert the waypoints of an earlier ego frame to the present one."""
-    cos, sin = math.cos(planned_at.heading), math.sin(planned_at.heading)
-    world = plan @ np.array([[cos, sin], [-sin, cos]]) + (planned_at.x, planned_at.y)
-    cos, sin = math.cos(ego.heading), math.sin(ego.heading)
-    return np.asarray((world - (ego.x, ego.y)) @ np.array([[cos, -sin], [sin, cos]]))
-
-
-def _reset(policy: Policy, route: Route) -> None:
-    try:
-        policy.reset(route)
-    except Exception as error:
-        raise _failure(error) from error
-
-
-def _ask(policy: Policy, observation: Observation) -> object:
+def _ask(call: Callable[[], T]) -> T:
     """Call the policy; whatever it raises is its failure, not ours."""
     try:
-        return policy.plan(observation)
+        return call()
     except Exception as error:
-        raise _failure(error) from error
+        words = " ".join(str(error).split())
+        told = f"{type(error).__name__}: {words}" if words else repr(error)
+        raise PolicyFailedError(told) from error
 
 
 def _host_work(policy: Policy) -> tuple[int, int]:
@@ -184,13 +232,6 @@ def _host_work(policy: Policy) -> tuple[int, int]:
     if not isinstance(policy, HostedPolicy):
         return 0, 0
     return policy.host_iterations, policy.host_cells
-
-
-def _failure(error: Exception) -> PolicyFailedError:
-    words = " ".join(str(error).split())
-    return PolicyFailedError(
-        f"{type(error).__name__}: {words}" if words else repr(error)
-    )
 
 
 def _checked(answer: object) -> Trajectory | PedalsAndWheel:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.simulator.camera_rig import SUBPIXEL_BITS, fixed_point
 from me2e_compress.simulator.cameras.classes import ACTOR_CLASSES, PixelClass
 from me2e_compress.simulator.cameras.texture import RESOLUTION_M, GroundTexture
 from me2e_compress.simulator.scene import Actor, Ego, Scene
@@ -15,8 +16,6 @@ from me2e_compress.simulator.scene import Actor, Ego, Scene
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-
-SUBPIXEL_BITS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +115,5 @@ def _footprint(box: Actor | Ego, ego: Ego) -> Floats:
 
 
 def _fill(labels: Bytes, corners: Floats, value: int, grid: BirdseyeGrid) -> None:
-    scaled = (grid.cells(corners) - 0.5) * (1 << SUBPIXEL_BITS)
-    polygon = np.rint(scaled).astype(np.int32)
+    polygon = fixed_point(grid.cells(corners))
     cv2.fillConvexPoly(labels, polygon, (int(value),), cv2.LINE_8, SUBPIXEL_BITS)

@@ -8,7 +8,9 @@ import numpy.typing as npt
 
 from me2e_compress.simulator.camera_rig import (
     CAMERA_HEIGHT_M,
+    SUBPIXEL_BITS,
     CameraRig,
+    fixed_point,
 )
 from me2e_compress.simulator.cameras.ordering import painting_order
 from me2e_compress.simulator.cameras.solids import Solid
@@ -24,7 +26,6 @@ NEAR_M = 0.2
 """Polygons are cut at this depth."""
 LEAST_PX = np.array([2.0, 0.7])
 """Details whose longer side is less are left out: others, lamps."""
-SUBPIXEL_BITS = 4
 LIMIT_PX = 20_000.0
 """Far outside any image, and safe in cv2's fixed-point numbers."""
 
@@ -236,6 +237,4 @@ def _cut(polygon: list[list[float]]) -> Floats:
 
 
 def _fixed(pixels: Floats) -> npt.NDArray[np.int32]:
-    """Convert to fixed point for cv2, which has pixel centres at whole numbers."""
-    scaled = np.clip(pixels - 0.5, -LIMIT_PX, LIMIT_PX) * (1 << SUBPIXEL_BITS)
-    return np.rint(scaled).astype(np.int32)
+    return fixed_point(np.clip(pixels, 0.5 - LIMIT_PX, 0.5 + LIMIT_PX))

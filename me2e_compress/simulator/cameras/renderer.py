@@ -33,7 +33,6 @@ class Sky:
     """Fills the rows above the horizon with one seeded skyline for all cameras."""
 
     rig: CameraRig
-    seed: int = 0
 
     @property
     def height(self) -> int:
@@ -72,7 +71,7 @@ class Sky:
     @cached_property
     def _panorama(self) -> npt.NDArray[np.uint32]:
         """[ROWS * 2 * COLUMNS] RGBA texels, twice around: no index needs to wrap."""
-        rng = np.random.default_rng(self.seed)
+        rng = np.random.default_rng(0)
         # a gradient from haze to zenith
         elevation = TALLEST * (1.0 - (np.arange(ROWS) + 0.5) / ROWS)[:, None]
         share = np.sqrt(elevation / TALLEST)[..., None]

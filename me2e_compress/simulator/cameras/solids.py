@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.simulator.cameras import actor_shapes, sign_shapes
+from me2e_compress.simulator.cameras import shapes
 from me2e_compress.simulator.cameras.classes import ACTOR_CLASSES, PixelClass
 from me2e_compress.simulator.cameras.template import Slot, Template
 from me2e_compress.simulator.scene import (
@@ -74,21 +74,21 @@ LIT: dict[Slot, Colour] = {
     Slot.LAMP_GREEN: (40, 246, 120),
 }
 TEMPLATES: dict[ActorKind, tuple[Template, ...]] = {
-    ActorKind.CAR: (actor_shapes.car(),),
-    ActorKind.PARKED: (actor_shapes.car(),),
-    ActorKind.VAN: (actor_shapes.van(beacon=False),),
-    ActorKind.EMERGENCY: (actor_shapes.van(beacon=True),),
-    ActorKind.TRUCK: actor_shapes.truck(),
-    ActorKind.PEDESTRIAN: (actor_shapes.pedestrian(),),
-    ActorKind.BICYCLE: (actor_shapes.bicycle(),),
-    ActorKind.CONE: (actor_shapes.cone(),),
-    ActorKind.BARRIER: (actor_shapes.barrier(),),
-    ActorKind.DOOR: (actor_shapes.door(),),
+    ActorKind.CAR: (shapes.car(),),
+    ActorKind.PARKED: (shapes.car(),),
+    ActorKind.VAN: (shapes.van(beacon=False),),
+    ActorKind.EMERGENCY: (shapes.van(beacon=True),),
+    ActorKind.TRUCK: shapes.truck(),
+    ActorKind.PEDESTRIAN: (shapes.pedestrian(),),
+    ActorKind.BICYCLE: (shapes.bicycle(),),
+    ActorKind.CONE: (shapes.cone(),),
+    ActorKind.BARRIER: (shapes.barrier(),),
+    ActorKind.DOOR: (shapes.door(),),
 }
 SIGNS: dict[SignalKind, tuple[Template, PixelClass]] = {
-    SignalKind.TRAFFIC_LIGHT: (sign_shapes.traffic_light(), PixelClass.TRAFFIC_LIGHT),
-    SignalKind.STOP_SIGN: (sign_shapes.stop_sign(), PixelClass.TRAFFIC_SIGN),
-    SignalKind.GIVE_WAY: (sign_shapes.give_way_sign(), PixelClass.TRAFFIC_SIGN),
+    SignalKind.TRAFFIC_LIGHT: (shapes.traffic_light(), PixelClass.TRAFFIC_LIGHT),
+    SignalKind.STOP_SIGN: (shapes.stop_sign(), PixelClass.TRAFFIC_SIGN),
+    SignalKind.GIVE_WAY: (shapes.give_way_sign(), PixelClass.TRAFFIC_SIGN),
 }
 SIGN_RED: Colour = (204, 24, 34)
 STATE_LAMPS = {

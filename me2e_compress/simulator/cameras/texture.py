@@ -4,23 +4,141 @@ Two rasters of the same grid, north up: colours with mip levels, and classes. Th
 classes are painted beside the colours, stroke by stroke, never read off them.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.simulator.camera_rig import SUBPIXEL_BITS, fixed_point
 from me2e_compress.simulator.cameras.classes import PixelClass
-from me2e_compress.simulator.cameras.strokes import (
-    GroundPlan,
-    paint_crosswalks,
-    paint_lanes,
-    paint_markings,
-    paint_stop_lines,
-)
-from me2e_compress.simulator.scene import Roadmap
+from me2e_compress.simulator.plane_geometry import LaneMarking, Roadmap, resample
 
 Bytes = npt.NDArray[np.uint8]
+Floats = npt.NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+ASPHALT = (98, 98, 101)
+SHOULDER = (116, 112, 105)
+KERB = (138, 134, 124)
+WHITE = (238, 238, 238)
+KERB_M = 0.3
+"""A lighter rim around all pavement: where the road ends is seen without a line."""
+LINE_M = 0.2
+"""A little wider than the 0.15 m of real lines: our images are small."""
+DASH_M, DASH_PERIOD_M, DASH_STEP_M = 3.0, 9.0, 0.5
+"""3 m painted, 6 m free, from the start of the lane: the pattern of highway-env."""
+STOP_LINE_M = 0.5
+BAR_M, BAR_PERIOD_M = 0.5, 1.0
+"""Zebra bars."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroundPlan:
+    """The two rasters while they are painted, and where they lie in the world."""
+
+    west_m: float
+    north_m: float
+    colours: Bytes
+    classes: Bytes
+
+    def texels(self, points: Floats) -> Floats:
+        """Convert world points [..., 2] to continuous texels (column, row)."""
+        offset = np.asarray(points) - (self.west_m, self.north_m)
+        return np.asarray(offset * (1.0, -1.0) / RESOLUTION_M)
+
+    def near(self, points: Floats) -> bool:
+        """Return whether a polyline may touch the rasters."""
+        height, width = self.classes.shape
+        low, high = (f(self.texels(points), axis=0) for f in (np.min, np.max))
+        return bool((high > -width).all() and (low < (2 * width, 2 * height)).all())
+
+    def strip(
+        self, line: Floats, width_m: float, colour: Colour, kind: PixelClass
+    ) -> None:
+        """Paint a band along a polyline [N, 2] of world points.
+
+        Piece by piece, since cv2 paints convex polygons without bias and others not.
+        Antialiased, it rounds them out by half a texel on each side: taken off here.
+        """
+        aliased = self._quads(line, width_m)
+        smooth = self._quads(line, width_m - RESOLUTION_M)
+        for sharp, soft in zip(aliased, smooth, strict=True):
+            cv2.fillConvexPoly(
+                self.classes, sharp, (int(kind),), cv2.LINE_8, SUBPIXEL_BITS
+            )
+            cv2.fillConvexPoly(self.colours, soft, colour, cv2.LINE_AA, SUBPIXEL_BITS)
+
+    def _quads(self, line: Floats, width_m: float) -> npt.NDArray[np.int32]:
+        """Return [N - 1, 4, 2], the pieces of a band."""
+        sides = (offset_line(line, side * width_m) for side in (0.5, -0.5))
+        left, right = (fixed_point(self.texels(side)) for side in sides)
+        return np.stack([left[:-1], right[:-1], right[1:], left[1:]], axis=1)
+
+
+def offset_line(line: Floats, lateral_m: float) -> Floats:
+    """Return a polyline [N, 2] moved to its left."""
+    tangent = np.gradient(line, axis=0)
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    normal *= lateral_m / np.linalg.norm(normal, axis=1)[:, None]
+    return np.asarray(line + normal)
+
+
+def paint_lanes(plan: GroundPlan, roadmap: Roadmap) -> None:
+    """Paint all kerbs, then shoulders, then asphalt, so that overlaps join up."""
+    lanes = [lane for lane in roadmap.lanes if plan.near(lane.centre)]
+    shoulders = [lane for lane in lanes if lane.shoulder]
+    driven = [lane for lane in lanes if not lane.shoulder]
+    layers = (
+        (lanes, 2 * KERB_M, KERB, PixelClass.TERRAIN),
+        (shoulders, 0.0, SHOULDER, PixelClass.SHOULDER),
+        (driven, 0.0, ASPHALT, PixelClass.DRIVABLE),
+    )
+    for members, more_m, colour, kind in layers:
+        for lane in members:
+            plan.strip(lane.centre, lane.width + more_m, colour, kind)
+
+
+def paint_markings(plan: GroundPlan, roadmap: Roadmap) -> None:
+    """Paint the left and right edges of every lane as it asks for."""
+    for lane in roadmap.lanes:
+        if not plan.near(lane.centre):
+            continue
+        for marking, side in ((lane.left, 0.5), (lane.right, -0.5)):
+            edge = offset_line(lane.centre, side * lane.width)
+            for line in _pieces(edge, marking):
+                plan.strip(line, LINE_M, WHITE, PixelClass.LANE_MARKING)
+
+
+def _pieces(edge: Floats, marking: LaneMarking) -> Iterator[Floats]:
+    """Yield the polylines to paint along an edge: all of it, its dashes, or none."""
+    if marking is LaneMarking.SOLID:
+        yield edge
+    if marking is LaneMarking.DASHED:
+        dense = resample(edge, DASH_STEP_M)
+        dash, period = (round(m / DASH_STEP_M) for m in (DASH_M, DASH_PERIOD_M))
+        for start in range(0, len(dense) - 1, period):
+            yield dense[start : start + dash + 1]
+
+
+def paint_stop_lines(plan: GroundPlan, roadmap: Roadmap) -> None:
+    """Paint bars of 0.5 m across the lanes."""
+    for ends in roadmap.stop_lines:
+        plan.strip(np.array(ends, float), STOP_LINE_M, WHITE, PixelClass.STOP_LINE)
+
+
+def paint_crosswalks(plan: GroundPlan, roadmap: Roadmap) -> None:
+    """Paint zebra bars along the traffic: parallel to the shorter sides."""
+    for rectangle in roadmap.crosswalks:
+        a, b, c, d = np.array(rectangle, float)
+        if np.linalg.norm(b - a) < np.linalg.norm(c - b):
+            a, b, c, d = b, c, d, a
+        length = float(np.linalg.norm(b - a))
+        for middle in np.arange(BAR_M, length - BAR_M / 2, BAR_PERIOD_M) / length:
+            bar = np.array([a + middle * (b - a), d + middle * (c - d)])
+            plan.strip(bar, BAR_M, WHITE, PixelClass.CROSSWALK)
+
 
 RESOLUTION_M = 0.125
 """Metres of a texel at the finest level: a 0.15 m line is just wider than one."""
@@ -50,24 +168,16 @@ class GroundTexture:
     levels: tuple[Bytes, ...]
     classes: Bytes
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of all rasters in bytes."""
-        return self.classes.nbytes + sum(level.nbytes for level in self.levels)
-
     def __post_init__(self) -> None:
         """Make the rasters read-only: many frames are sampled from them."""
         for raster in (*self.levels, self.classes):
             raster.flags.writeable = False
 
 
-def paint_texture(
-    roadmap: Roadmap, route: npt.NDArray[np.float64], *, seed: int = 0
-) -> GroundTexture:
+def paint_texture(roadmap: Roadmap, route: npt.NDArray[np.float64]) -> GroundTexture:
     """Paint lanes, markings, stop lines, crosswalks and the verge.
 
     The texture covers the bounding box of ``route``, [N, 2] metres, and 60 m around.
-    ``seed`` is that of the grain of grass and asphalt.
     """
     # the raster's extent
     west, south = route.min(axis=0) - MARGIN_M
@@ -76,14 +186,13 @@ def paint_texture(
     plan = GroundPlan(
         west_m=float(west),
         north_m=float(north),
-        resolution_m=RESOLUTION_M,
         colours=np.empty((height, width, 3), np.uint8),
         classes=np.full((height, width), PixelClass.TERRAIN, np.uint8),
     )
     # from grass up: lanes, grain, then everything painted on top
     plan.colours[:] = GRASS
     paint_lanes(plan, roadmap)
-    _add_grain(plan, np.random.default_rng(seed))
+    _add_grain(plan, np.random.default_rng(0))
     paint_markings(plan, roadmap)
     paint_stop_lines(plan, roadmap)
     paint_crosswalks(plan, roadmap)

@@ -8,10 +8,11 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
+from me2e_compress.simulator.camera_rig import SUBPIXEL_BITS, fixed_point
+
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
 Colour = tuple[int, int, int]
-SUBPIXEL_BITS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class Canvas:
 
     def polygon(self, points: npt.ArrayLike, colour: Colour) -> None:
         """Fill a polygon of world points [N, 2]."""
-        fixed = [_fixed(self.to_pixels(points))]
+        fixed = [fixed_point(self.to_pixels(points))]
         cv2.fillPoly(self.pixels, fixed, colour, cv2.LINE_AA, SUBPIXEL_BITS)
 
     def line(
@@ -57,14 +58,14 @@ class Canvas:
         closed: bool = False,
     ) -> None:
         """Draw a polyline of world points [N, 2]."""
-        fixed = [_fixed(self.to_pixels(points))]
+        fixed = [fixed_point(self.to_pixels(points))]
         cv2.polylines(
             self.pixels, fixed, closed, colour, width_px, cv2.LINE_AA, SUBPIXEL_BITS
         )
 
     def dot(self, point: npt.ArrayLike, colour: Colour, radius_px: float) -> None:
         """Fill a disc around a world point."""
-        column, row = _fixed(self.to_pixels(point)).tolist()
+        column, row = fixed_point(self.to_pixels(point)).tolist()
         radius = round(radius_px * (1 << SUBPIXEL_BITS))
         cv2.circle(
             self.pixels, (column, row), radius, colour, -1, cv2.LINE_AA, SUBPIXEL_BITS
@@ -79,10 +80,6 @@ class Canvas:
         centre = np.array([x, y])
         corners = (forward + left, left - forward, -forward - left, forward - left)
         return centre + np.array(corners)
-
-
-def _fixed(pixels: Floats) -> npt.NDArray[np.int32]:
-    return np.rint((pixels - 0.5) * (1 << SUBPIXEL_BITS)).astype(np.int32)
 
 
 @dataclass(frozen=True, slots=True)

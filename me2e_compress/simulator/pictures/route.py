@@ -1,4 +1,4 @@
-"""Pictures of recorded moments, and their PNG and GIF files."""
+"""Pictures of recorded moments, and their PNG and GIF files; two drives overlaid."""
 
 import os
 import tempfile
@@ -20,9 +20,15 @@ from me2e_compress.simulator.pictures.canvas import (
     text_width,
     write,
 )
-from me2e_compress.simulator.pictures.top_view import INK, PAPER, BirdsEye
-from me2e_compress.simulator.scene import Scene
-from me2e_compress.simulator.traffic.events import INFRACTIONS, Event
+from me2e_compress.simulator.pictures.top_view import (
+    EGO,
+    INK,
+    OTHER,
+    PAPER,
+    BirdsEye,
+    OtherDrive,
+)
+from me2e_compress.simulator.scene import INFRACTIONS, Event, Scene
 
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
@@ -33,7 +39,6 @@ of the car is to the right of the image."""
 GAP = 4
 CAPTION = 30
 RED = (208, 16, 32)
-NO_IMAGE = (226, 228, 232)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,24 +47,17 @@ class Moment:
 
     Attributes:
         scene: The whole scene.
-        images: The six cameras, uint8 [6, H, W, 3] RGB; None if not rendered.
+        images: The six cameras, uint8 [6, H, W, 3] RGB.
         plan: [n, 2] metres in the ego frame: the plan in force; None before the first,
             and for a policy that answers controls.
         events: Events, at least since the moment before; a repeated event is drawn
             once.
-        score: Driving score so far, 0 to 100; None if not computed.
     """
 
     scene: Scene
-    images: Bytes | None = None
-    plan: npt.NDArray[np.floating] | None = None
+    images: Bytes
+    plan: Floats | None = None
     events: tuple[Event, ...] = ()
-    score: float | None = None
-
-    @property
-    def waypoints(self) -> Floats | None:
-        """The plan in float64, or None."""
-        return None if self.plan is None else np.asarray(self.plan, float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,13 +89,13 @@ class RoutePicture:
         height = montage.shape[0]
         above = self._from_above(index, (height, round(height * 0.82)))
         picture = in_row([montage, above])
-        return self._captioned(picture, index)
+        caption = np.full((CAPTION, picture.shape[1], 3), PAPER, np.uint8)
+        write(caption, self.words(index, INK, 7))
+        return in_column([picture, caption])
 
-    def frames(self, every: int = 1) -> Iterable[Bytes]:
-        """Yield all moments, or every n-th and the last one."""
-        last = len(self.moments) - 1
-        yield from (self.frame(i) for i in range(0, last, every))
-        yield self.frame(last)
+    def frames(self) -> Iterable[Bytes]:
+        """Yield all moments."""
+        return map(self.frame, range(len(self.moments)))
 
     def strip(self, indices: Sequence[int]) -> Bytes:
         """Draw moments side by side, the front camera above the view from above."""
@@ -113,12 +111,7 @@ class RoutePicture:
 
     def tile(self, index: int, name: str) -> Bytes:
         """Draw one camera's image, with its name."""
-        images = self.moments[index].images
-        if images is None:
-            height, width = self._image_size
-            tile = np.full((height, width, 3), NO_IMAGE, np.uint8)
-        else:
-            tile = images[CAMERA_NAMES.index(name)]
+        tile = self.moments[index].images[CAMERA_NAMES.index(name)]
         height = round(self.tile_width * tile.shape[0] / tile.shape[1])
         large = cv2.resize(
             tile, (self.tile_width, height), interpolation=cv2.INTER_LINEAR
@@ -127,24 +120,12 @@ class RoutePicture:
         write(pixels, [Text(name, 5, 3, 12, PAPER, INK)])
         return pixels
 
-    @cached_property
-    def _image_size(self) -> tuple[int, int]:
-        """Size of the recorded images, or that of a default rig."""
-        sizes = (m.images.shape[1:3] for m in self.moments if m.images is not None)
-        height, width = next(sizes, (96, 160))
-        return int(height), int(width)
-
     def _from_above(self, index: int, size: tuple[int, int]) -> Bytes:
         moment = self.moments[index]
         trail = self.trail[: index + 1]
         return self.birdseye.draw(
-            moment.scene, trail, moment.waypoints, self.infractions(index), size
+            moment.scene, trail, moment.plan, self.infractions(index), size
         )
-
-    def _captioned(self, picture: Bytes, index: int) -> Bytes:
-        caption = np.full((CAPTION, picture.shape[1], 3), PAPER, np.uint8)
-        write(caption, self.words(index, INK, 7))
-        return in_column([picture, caption])
 
     def words(self, index: int, colour: Colour, row: int) -> list[Text]:
         """Return title, time and speed at a height of the caption; infractions red."""
@@ -175,8 +156,7 @@ class RoutePicture:
 
 def _state(moment: Moment) -> str:
     scene = moment.scene
-    words = f"t = {scene.time_us / 1e6:.2f} s   {scene.ego.speed_mps:.1f} m/s"
-    return words if moment.score is None else f"{words}   score {moment.score:.1f}"
+    return f"t = {scene.time_us / 1e6:.2f} s   {scene.ego.speed_mps:.1f} m/s"
 
 
 def in_row(pictures: list[Bytes]) -> Bytes:
@@ -250,3 +230,39 @@ def _replace(
         raise EvaluationError(
             f"{path}: the picture cannot be written: {error.strerror or error}"
         ) from error
+
+
+FRONT = ("FRONT_LEFT", "FRONT", "FRONT_RIGHT")
+
+
+def overlay(one: RoutePicture, other: RoutePicture) -> npt.NDArray[np.uint8]:
+    """Draw the last moments of two drives: uint8 [H, W, 3].
+
+    On the left are the front cameras of both, the other's above; on the right is one
+    view from above, the other drive under the first in grey. The traffic shown is that
+    of ``one``, the drive in colour.
+    """
+    last, before = len(one.moments) - 1, len(other.moments) - 1
+    # front cameras of both drives
+    rows = [
+        in_row([drive.tile(index, name) for name in FRONT])
+        for drive, index in ((other, before), (one, last))
+    ]
+    cameras = in_column(rows)
+    height = cameras.shape[0]
+    # one view from above
+    moment, then = one.moments[last], other.moments[before]
+    view = one.birdseye.draw(
+        moment.scene,
+        one.trail,
+        moment.plan,
+        (*other.infractions(before), *one.infractions(last)),
+        (height, round(height * 0.82)),
+        OtherDrive(then.scene.ego, other.trail, then.plan),
+    )
+    picture = in_row([cameras, view])
+    # a caption line for each
+    caption = np.full((2 * CAPTION, picture.shape[1], 3), PAPER, np.uint8)
+    words = [*other.words(before, OTHER, 7), *one.words(last, EGO, 7 + CAPTION)]
+    write(caption, words)
+    return in_column([picture, caption])

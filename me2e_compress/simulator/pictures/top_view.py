@@ -20,11 +20,11 @@ from me2e_compress.simulator.scene import (
     Actor,
     ActorKind,
     Ego,
+    Event,
     Scene,
     SignalKind,
     SignalState,
 )
-from me2e_compress.simulator.traffic.events import Event
 
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
@@ -169,9 +169,7 @@ class BirdsEye:
 
 def _zoom(ego: Ego, other: Ego, side_m: float) -> float:
     """Return the factor by which more must be shown to include the other ego."""
-    east, north = other.x - ego.x, other.y - ego.y
-    cos, sin = np.cos(ego.heading), np.sin(ego.heading)
-    ahead, left = cos * east + sin * north, cos * north - sin * east
+    ahead, left = ego.seen(np.array(other.x), np.array(other.y))
     shares = (ahead / AHEAD_M, -ahead / BEHIND_M, abs(left) / side_m)
     return max(1.0, *(float(share) / MARGIN for share in shares))
 
@@ -234,9 +232,7 @@ def _signals(canvas: Canvas, scene: Scene) -> None:
 
 
 def _plan(canvas: Canvas, ego: Ego, plan: Floats, colour: Colour) -> None:
-    cos, sin = np.cos(ego.heading), np.sin(ego.heading)
-    away = plan @ np.array([(cos, sin), (-sin, cos)]) + (ego.x, ego.y)
-    points = np.concatenate([[(ego.x, ego.y)], away])
+    points = np.concatenate([[(ego.x, ego.y)], ego.placed(plan)])
     canvas.line(points, colour, 2)
     for point in points[1:]:
         canvas.dot(point, PAPER, 4.0)

@@ -6,7 +6,7 @@ import numpy as np
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Obstacle
 
-from me2e_compress.simulator.bicycle import MAX_STEERING_RAD, slip_of
+from me2e_compress.simulator.bicycle import MAX_STEERING_RAD, curvature_of, slip_of
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import (
     DIMENSIONS,
@@ -74,7 +74,7 @@ class EgoVehicle(Vehicle):  # type: ignore[misc]  # highway-env is untyped
         mean = (before + after) / 2
         # curvature, limited by grip
         slip = slip_of(self.steering_rad)
-        curvature = math.sin(slip) / (self.LENGTH / 2)
+        curvature = curvature_of(self.steering_rad, self.LENGTH)
         tightest = self.grip_mps2 / max(mean, 0.1) ** 2
         if abs(curvature) > tightest:
             curvature = math.copysign(tightest, curvature)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.objects import RoadObject
 
+from me2e_compress.simulator.bicycle import slip_of
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import DIMENSIONS, ActorKind
 from me2e_compress.simulator.traffic.network import (
@@ -189,7 +190,7 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
 
     def step(self, dt: float) -> None:
         """Advance by ``dt`` seconds; never backwards."""
-        slip = math.atan(math.tan(self.action["steering"]) / 2)
+        slip = slip_of(self.action["steering"])
         before = float(self.speed)
         after = max(0.0, before + self.action["acceleration"] * dt)
         travel = (before + after) / 2 * dt

@@ -40,8 +40,6 @@ class Leg:
     command: Command = Command.FOLLOW
     enter_m: float = 0.0
     leave_m: float | None = None
-    offset_m: float = 0.0
-    """Metres left of the lane's centre."""
 
 
 def build_path(network: Network, legs: Sequence[Leg], goal_m: float) -> RoutePath:
@@ -53,7 +51,7 @@ def build_path(network: Network, legs: Sequence[Leg], goal_m: float) -> RoutePat
         end = network.length(leg.lane) if leg.leave_m is None else leg.leave_m
         count = max(2, round((end - leg.enter_m) / FINE_M) + 1)
         stations = np.linspace(leg.enter_m, end, count)
-        poses = [network.pose(leg.lane, float(s), leg.offset_m) for s in stations]
+        poses = [network.pose(leg.lane, float(s)) for s in stations]
         piece = np.array([(p.x, p.y) for p in poses])
         begin = done
         if pieces and np.hypot(*(piece[0] - pieces[-1][-1])) > 0.5:

@@ -6,6 +6,7 @@ else.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -165,6 +166,15 @@ class Network:
     def length(self, index: LaneIndex) -> float:
         """Return the length of a lane in metres."""
         return float(self.lane(index).length)
+
+    def rest(
+        self, chain: Sequence[LaneIndex], s_m: float
+    ) -> tuple[list[LaneIndex], float]:
+        """Return a chain from an arc length on, and that in its first lane."""
+        lanes = list(chain)
+        while len(lanes) > 1 and s_m > self.length(lanes[0]):
+            s_m -= self.length(lanes.pop(0))
+        return lanes, s_m
 
     def centre(self, index: LaneIndex) -> Floats:
         """Return the [N, 2] centre line, at most `CHORD_M` apart, cached."""

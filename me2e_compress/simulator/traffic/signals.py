@@ -3,8 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from me2e_compress.simulator.scene import Signal, SignalKind, SignalState
-from me2e_compress.simulator.traffic.events import EventKind
+from me2e_compress.simulator.scene import EventKind, Signal, SignalKind, SignalState
 from me2e_compress.simulator.traffic.network import LANE_WIDTH_M, Pose
 
 STOPPED_MPS = 0.1
@@ -24,7 +23,6 @@ class Regulator:
         line: Centre of the stop line, heading of the traffic that must obey.
         line_s: Arc length (m) at which the ego's route crosses the line, if it does.
         state: Phase of a light.
-        remaining_s: Seconds until the phase changes; None if it depends on the ego.
         nearest_s: For a give-way sign: seconds until the next vehicle with priority
             reaches the conflict, infinity if there is none.
         conflict_s: For a give-way sign: arc length of the conflict on the route.
@@ -35,7 +33,6 @@ class Regulator:
     line: Pose
     line_s: float | None
     state: SignalState | None = None
-    remaining_s: float | None = None
     width_m: float = LANE_WIDTH_M
     nearest_s: Callable[[], float] = field(default=lambda: float("inf"), repr=False)
     conflict_s: float = float("inf")

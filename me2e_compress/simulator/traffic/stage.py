@@ -3,7 +3,6 @@
 import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from types import GeneratorType
 
 import numpy as np
 from highway_env.vehicle.objects import RoadObject
@@ -11,14 +10,19 @@ from highway_env.vehicle.objects import RoadObject
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import Floats, Point, RoutePath
 from me2e_compress.simulator.routes import Parameter, Route
-from me2e_compress.simulator.scene import ActorKind, SignalKind, SignalState
+from me2e_compress.simulator.scene import (
+    ActorKind,
+    Event,
+    EventKind,
+    SignalKind,
+    SignalState,
+)
 from me2e_compress.simulator.traffic.bodies import (
     EgoVehicle,
     StaticObject,
     Walker,
 )
 from me2e_compress.simulator.traffic.cars import Behaviour, Car
-from me2e_compress.simulator.traffic.events import Event, EventKind
 from me2e_compress.simulator.traffic.legs import Leg, build_path
 from me2e_compress.simulator.traffic.network import (
     LANE_WIDTH_M,
@@ -49,8 +53,6 @@ class Stage:
         self.parameters: dict[str, Parameter] = {}
         # set by layouts and scripts
         self.network = Network()
-        self.layout = ""
-        self.script_names: list[str] = []
         self.scripts: list[Script] = []
         self.bodies: list[Car | Walker] = []
         self.static_objects: list[StaticObject] = []
@@ -121,38 +123,35 @@ class Stage:
         """Add a script.
 
         It runs up to its first ``yield`` at once, so that its actors are there at frame
-        0. Its function's name becomes the script's name.
+        0.
         """
-        if isinstance(script, GeneratorType):
-            self.script_names.append(script.__name__)
         if next(script, self) is not self:
             self.scripts.append(script)
 
-    def drive(
-        self, legs: Sequence[Leg], speed_mps: float, goal_m: float = GOAL_M
-    ) -> None:
+    def drive(self, legs: Sequence[Leg], speed_mps: float) -> None:
         """Set the ego's route and put the ego at its beginning."""
-        self._path = build_path(self.network, legs, goal_m)
-        if self._path.length_m < goal_m:
+        self._path = build_path(self.network, legs, GOAL_M)
+        if self._path.length_m < GOAL_M:
             raise EvaluationError(
                 f"{self.route.scenario}: the route is {self._path.length_m:.0f} m "
-                f"long, its goal {goal_m:.0f} m away"
+                f"long, its goal {GOAL_M:.0f} m away"
             )
         (x, y), heading = self._path.points[0], self._path.headings[0]
         self._ego = EgoVehicle(Pose(float(x), float(y), float(heading)), speed_mps)
 
     def car(
         self,
-        lanes: Sequence[LaneIndex],
+        chain: Sequence[LaneIndex],
         s_m: float,
         speed_mps: float,
         target_mps: float | None = None,
         kind: ActorKind = ActorKind.CAR,
         behaviour: Behaviour | None = None,
     ) -> Car:
-        """Put a car on a chain of lanes."""
+        """Put a car on a chain of lanes, at an arc length from its beginning."""
+        lanes, s = self.network.rest(chain, s_m)
         car = Car(
-            self._id(), self.network, lanes, s_m, speed_mps, target_mps, kind, behaviour
+            self._id(), self.network, lanes, s, speed_mps, target_mps, kind, behaviour
         )
         self.bodies.append(car)
         return car
@@ -190,6 +189,11 @@ class Stage:
         regulator = Regulator(number, kind, line, line_s, state, width_m=width_m)
         self.regulators.append(regulator)
         return regulator
+
+    def add_crosswalk(self, corners: Sequence[Pose]) -> None:
+        """Paint a crosswalk between four corners."""
+        a, b, c, d = ((corner.x, corner.y) for corner in corners)
+        self.crosswalks.append((a, b, c, d))
 
     def route_pose(self, s_m: float, left_m: float = 0.0) -> Pose:
         """Return a pose beside the route."""

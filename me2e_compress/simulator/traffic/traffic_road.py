@@ -76,28 +76,6 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
                 break
         return None
 
-    def neighbour_vehicles(
-        self, vehicle: RoadObject, lane_index: LaneIndex | None = None
-    ) -> tuple[RoadObject | None, RoadObject | None]:
-        """Return the bodies before and behind in one lane: highway-env's query."""
-        index = lane_index or vehicle.lane_index
-        if not index:
-            return None, None
-        column = self.table.column[index]
-        row = self._row[id(vehicle)]
-        s, r = self._s[:, column], self._r[:, column]
-        # bodies inside the lane, then the nearest on either side
-        lane = self.network.get_lane(index)
-        inside = (np.abs(r) <= lane.width / 2 + 1) & (s >= 0) & (s <= lane.length)
-        inside[row] = False
-        front = np.where(inside & (s >= s[row]), s, np.inf)
-        rear = np.where(inside & (s < s[row]), s, -np.inf)
-        first, last = int(np.argmin(front)), int(np.argmax(rear))
-        return (
-            self._bodies[first] if math.isfinite(front[first]) else None,
-            self._bodies[last] if math.isfinite(rear[last]) else None,
-        )
-
     def act(self) -> None:
         """Let every car decide on the same positions."""
         self.refresh()

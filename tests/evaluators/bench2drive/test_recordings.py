@@ -71,10 +71,6 @@ def test_for_who_stood_the_steps_are_ticks() -> None:
     assert read_recording(recording(steps=1)).interval_s() == 0.05
 
 
-def test_steps_may_begin_late() -> None:
-    assert len(read_recording(recording(first=2)).frames(0.05)) == 60
-
-
 def test_degrees_for_radians_and_what_is_right() -> None:
     turn = drive(driven=read_recording(recording()).frames(0.05))
 

@@ -1,17 +1,12 @@
-import contextlib
 import math
-from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from me2e_compress.evaluators.bench2drive.records import (
     BrokenRecordError,
     number_of,
     read_record,
 )
-from me2e_compress.evaluators.bench2drive.scenario_types import TYPES
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Ending, Given
 from me2e_compress.metrics.infraction import InfractionKind
@@ -80,13 +75,6 @@ def test_a_crash_before_the_first_tick() -> None:
     assert read.duration_s is None
 
 
-def test_a_route_without_weather_of_the_table() -> None:
-    read = read_record(record(weather=None))
-
-    assert read.recording is not None
-    assert "_None_" in read.recording
-
-
 def test_speeds_beyond_all_bounds_stay_finite() -> None:
     huge = "9" * 400
     read = read_record(record(min_speed_infractions=[speed(12.5), f"{huge}% of it"]))
@@ -138,50 +126,6 @@ def test_a_broken_record_is_one_line(raw: object, message: str) -> None:
     with pytest.raises(BrokenRecordError, match=message) as caught:
         read_record(raw)
     assert "\n" not in str(caught.value)
-
-
-values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=6),
-    lambda inner: (
-        st.lists(inner, max_size=3)
-        | st.dictionaries(st.text(max_size=6), inner, max_size=3)
-    ),
-    max_leaves=5,
-)
-
-
-@given(st.data(), values)
-def test_whatever_stands_in_a_record(data: st.DataObject, value: Any) -> None:
-    raw: Any = record(min_speed_infractions=[speed(80.0)])
-    part = raw
-    while True:
-        keys = list(part) if isinstance(part, dict) else list(range(len(part)))
-        key = data.draw(st.sampled_from(keys))
-        nested = part[key]
-        if (
-            not isinstance(nested, dict | list)
-            or not nested
-            or data.draw(st.booleans())
-        ):
-            part[key] = value
-            break
-        part = nested
-
-    with contextlib.suppress(BrokenRecordError):
-        read_record(raw)
-
-
-def test_the_types_are_as_many_as_bench2drive_has() -> None:
-    counts = {ability: len(types) for ability, types in TYPES.items()}
-
-    assert counts == {
-        "Overtaking": 9,
-        "Merging": 16,
-        "Emergency_Brake": 12,
-        "Give_Way": 2,
-        "Traffic_Signs": 19,
-    }
-    assert len({each for types in TYPES.values() for each in types}) == 44
 
 
 def test_numbers_are_found_as_the_tools_find_them() -> None:

@@ -3,10 +3,11 @@ from dataclasses import replace
 import pytest
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.admission import Admission, DryRun, examine
 from me2e_compress.evaluators.highway.generate import (
-    ScenarioRoutes,
+    Admission,
+    DryRun,
     admitted_routes,
+    examine,
     generate,
     propose,
     seed_of,
@@ -96,7 +97,3 @@ def test_every_type_and_attempt_has_a_seed_of_its_own() -> None:
 
     assert len(seeds) == 4
     assert seed_of(1, "Accident", 0) not in seeds
-
-
-def test_a_harvest_counts_what_it_refused() -> None:
-    assert ScenarioRoutes("Accident", (route_of(),), ("no", "no")).tried == 3

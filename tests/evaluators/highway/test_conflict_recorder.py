@@ -18,8 +18,7 @@ from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import Contact, Infraction
 from me2e_compress.simulator.plane_geometry import Lane, LaneMarking, Roadmap
 from me2e_compress.simulator.routes import Route
-from me2e_compress.simulator.scene import Actor, ActorKind, Ego, Scene
-from me2e_compress.simulator.traffic.events import Event, EventKind
+from me2e_compress.simulator.scene import Actor, ActorKind, Ego, Event, EventKind, Scene
 from me2e_compress.simulator.world import World
 from tests.evaluators.highway.tiny_world import actor, ego_at, straight
 

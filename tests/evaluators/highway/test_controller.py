@@ -7,9 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.driving.contract import Trajectory
+from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
 from me2e_compress.evaluators.highway.blind import centre_plan
-from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
+from me2e_compress.evaluators.highway.controller import (
+    AnchoredPlan,
+    control_of,
+    curvature_by,
+)
 from me2e_compress.simulator.bicycle import (
     MAX_STEERING_RAD,
     advance,
@@ -41,14 +45,14 @@ def follow(
 ) -> tuple[TinyWorld, list[float]]:
     """Drive the route's centre line at one speed; all lateral offsets."""
     world = TinyWorld(path, ego_at(5.0, offset, speed=speed))
-    controller, offsets, s = Controller(), list[float](), 5.0
+    offsets, s = list[float](), 5.0
     plan = AnchoredPlan.of(np.zeros((6, 2)), world.ego, 0)
     for frame in range(round(seconds * 1e6 / DT_US)):
         if frame % every == 0:
             s, _ = path.project(world.ego.x, world.ego.y, s)
             waypoints = centre_plan(world.ego, path, s, speed)
             plan = AnchoredPlan.of(waypoints, world.ego, world.time_us)
-        world.step(controller.control(plan, world.ego, world.time_us))
+        world.step(plan.control(world.ego, world.time_us))
         offsets.append(path.project(world.ego.x, world.ego.y, s)[1])
     return world, offsets
 
@@ -125,7 +129,7 @@ def test_a_heap_of_waypoints_is_a_stop() -> None:
     ego = ego_at(speed=3.0)
     plan = AnchoredPlan.of(jitter, ego, 0)
     assert plan.travel_m[-1] < 0.3
-    control = Controller().control(plan, ego, 0)
+    control = plan.control(ego, 0)
     assert control.acceleration_mps2 < -3.0
     assert abs(control.steering_rad) < 0.05
 
@@ -157,7 +161,7 @@ def test_a_steady_acceleration_is_asked_for_exactly(rate: float) -> None:
     steady = type(ego)(
         *(ego.x, ego.y, 0.0, speed, rate, 0.0, 0.0, 0.0), length=5.0, width=2.0
     )
-    control = Controller().control(AnchoredPlan.of(waypoints, steady, 0), steady, 0)
+    control = AnchoredPlan.of(waypoints, steady, 0).control(steady, 0)
     assert control.acceleration_mps2 == pytest.approx(rate, abs=1e-6)
 
 
@@ -165,9 +169,9 @@ def test_an_old_plan_is_followed_from_where_it_has_got_to() -> None:
     """After 0.5 s on plan the same control is due as if it were planned anew."""
     waypoints = np.array([[4.0 * k, 0.0] for k in range(1, 7)])
     plan = AnchoredPlan.of(waypoints, ego_at(0.0), 0)
-    control = Controller().control(plan, ego_at(4.0), 500_000)
+    control = plan.control(ego_at(4.0), 500_000)
     assert control.acceleration_mps2 == pytest.approx(0.0, abs=1e-6)
-    late = Controller().control(plan, ego_at(2.0), 500_000)
+    late = plan.control(ego_at(2.0), 500_000)
     assert late.acceleration_mps2 > 2.0
 
 
@@ -184,7 +188,7 @@ def test_the_same_way_in_other_waypoints_is_driven_the_same(
         return Trajectory(bend, times)
 
     six, other = (
-        Controller().control(AnchoredPlan.of(plan, ego, 0), ego, 0)
+        AnchoredPlan.of(plan, ego, 0).control(ego, 0)
         for plan in (
             planned(0.5 * np.arange(1, 7)),
             planned(step_s * np.arange(1, count + 1)),
@@ -192,3 +196,30 @@ def test_the_same_way_in_other_waypoints_is_driven_the_same(
     )
     assert other.steering_rad == pytest.approx(six.steering_rad, abs=5e-3)
     assert other.acceleration_mps2 == pytest.approx(six.acceleration_mps2, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("throttle", "brake", "mps2"), [(0.5, 0.0, 2.0), (0.0, 1.0, -8.0), (1.0, 0.5, 0.0)]
+)
+def test_pedals_span_what_the_ego_can_do(
+    throttle: float, brake: float, mps2: float
+) -> None:
+    found = control_of(PedalsAndWheel(throttle, 0.0, brake), LENGTH_M)
+
+    assert found.acceleration_mps2 == pytest.approx(mps2)
+    assert found.steering_rad == 0.0
+
+
+@pytest.mark.parametrize("steer", [-0.4, 0.05, 0.3])
+def test_a_steer_makes_the_same_circle(steer: float) -> None:
+    found = control_of(PedalsAndWheel(0.0, steer, 0.0), LENGTH_M)
+
+    assert curvature_of(found.steering_rad, LENGTH_M) == pytest.approx(
+        -curvature_by(steer)
+    )
+
+
+def test_the_wheels_turn_no_further() -> None:
+    assert curvature_by(1.0) == pytest.approx(1 / 3.72, rel=0.01)
+    left = control_of(PedalsAndWheel(0.0, -1.0, 0.0), LENGTH_M)
+    assert left.steering_rad == MAX_STEERING_RAD

@@ -4,7 +4,7 @@ from typing import cast
 
 import pytest
 
-from me2e_compress.evaluators.highway.endings import EndingRules
+from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.simulator.world import EndReason, World
 

@@ -5,7 +5,7 @@ import pytest
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import BlindDriver
-from me2e_compress.evaluators.highway.engine_ray import RayEngine
+from me2e_compress.evaluators.highway.engine import RayEngine
 from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator
 from me2e_compress.evaluators.highway.worker import Job
 from tests.evaluators.highway.drivers import CROSSING, PARKED

@@ -10,13 +10,8 @@ from me2e_compress.evaluators.highway.episode_recorder import (
     EpisodeRecorder,
     junction_m,
 )
-from me2e_compress.simulator.scene import (
-    Actor,
-    ActorKind,
-    Command,
-    RoutePath,
-    Scene,
-)
+from me2e_compress.simulator.plane_geometry import Command, RoutePath
+from me2e_compress.simulator.scene import Actor, ActorKind, Scene
 from me2e_compress.simulator.world import World
 from tests.evaluators.highway.tiny_world import actor, ego_at
 

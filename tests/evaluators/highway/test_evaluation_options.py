@@ -7,7 +7,7 @@ import pytest
 from me2e_compress.driving.latency import FrameRate
 from me2e_compress.errors import EvaluationError, ProviderError
 from me2e_compress.evaluators import EVALUATORS
-from me2e_compress.evaluators.highway.evaluation_options import HighwayEvaluation
+from me2e_compress.evaluators.highway.evaluator import HighwayEvaluation
 from me2e_compress.simulator.routes import save_routes
 from tests.evaluators.highway.drivers import EXIT
 

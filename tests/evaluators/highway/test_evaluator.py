@@ -17,18 +17,17 @@ from me2e_compress.driving.realtime import LatencyModel
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
-from me2e_compress.evaluators.highway.durations import EXPERT_S, longest_first
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.evaluator import (
     DrivingProgress,
     HighwayEvaluator,
+    longest_first,
 )
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.marks import is_marked
 from me2e_compress.metrics.episode import Ending, Episode
 from me2e_compress.simulator.routes import Route, save_routes
-from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from tests.evaluators.highway.drivers import (
     CROSSING,
     EXIT,
@@ -330,7 +329,6 @@ def test_long_types_begin_in_whatever_order_they_come() -> None:
 
     assert [route.id for route in ordered] == ["green", "exit", "crossing", "parked"]
     assert longest_first(ROUTES[::-1]) == ordered
-    assert set(EXPERT_S) == set(SCENARIO_ABILITIES)
 
 
 def test_progress_runs_with_the_scores(tmp_path: Path) -> None:

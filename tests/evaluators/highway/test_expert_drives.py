@@ -3,17 +3,16 @@
 import numpy as np
 import pytest
 
-from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation
 from me2e_compress.driving.realtime import HeldControl
-from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.admission import dry_run
-from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
-from me2e_compress.evaluators.highway.expert import Expert, Memory, ceiling, decide
+from me2e_compress.evaluators.highway.controller import AnchoredPlan
+from me2e_compress.evaluators.highway.expert.expert_policy import Expert, Memory, decide
+from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
+from me2e_compress.evaluators.highway.generate import dry_run
+from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
-from me2e_compress.simulator.scene import Control
-from me2e_compress.simulator.world import INFRACTIONS
-from me2e_compress.simulator.world.world import World
+from me2e_compress.simulator.scene import INFRACTIONS, Control
+from me2e_compress.simulator.world import World
 
 SEED = 77_001
 
@@ -41,23 +40,16 @@ def test_it_solves_a_fresh_route_of(scenario: str) -> None:
 
 def test_the_planned_waypoints_are_where_the_ego_then_is() -> None:
     """The plan of a moment is driven: within 0.5 m after a second on a ring."""
-    world, controller, memory = World(route("EnterActorFlow")), Controller(), Memory()
+    world, memory = World(route("EnterActorFlow")), Memory()
     top, misses = ceiling(world.path), list[float]()
-    planned: list[tuple[float, float]] = []
+    planned = list[Floats]()
     while not world.done and world.time_us < 40_000_000:
         scene = world.scene()
         decision = decide(scene, world.privileged(), world.path, top, memory)
         memory = decision.memory
         plan = AnchoredPlan.of(decision.waypoints, scene.ego, scene.time_us)
-        cos, sin = np.cos(scene.ego.heading), np.sin(scene.ego.heading)
-        forward, left = decision.waypoints[1]
-        planned.append(
-            (
-                scene.ego.x + cos * forward - sin * left,
-                scene.ego.y + sin * forward + cos * left,
-            )
-        )
-        world.step(controller.control(plan, scene.ego, scene.time_us))
+        planned.append(scene.ego.placed(np.asarray(decision.waypoints, float))[1])
+        world.step(plan.control(scene.ego, scene.time_us))
         if len(planned) > 20:
             x, y = planned[-21]
             misses.append(float(np.hypot(scene.ego.x - x, scene.ego.y - y)))
@@ -67,7 +59,7 @@ def test_the_planned_waypoints_are_where_the_ego_then_is() -> None:
 
 def test_a_decision_that_takes_long_drives_worse() -> None:
     """Nobody drives a ring whose every control is 0.85 s old."""
-    held, controller = HeldControl(Control(0.0, 0.0)), Controller()
+    held = HeldControl(Control(0.0, 0.0))
     world, memory = World(route("EnterActorFlow")), Memory()
     top = ceiling(world.path)
     while not world.done and world.time_us < 40_000_000:
@@ -76,19 +68,8 @@ def test_a_decision_that_takes_long_drives_worse() -> None:
             decision = decide(scene, world.privileged(), world.path, top, memory)
             memory = decision.memory
             plan = AnchoredPlan.of(decision.waypoints, scene.ego, scene.time_us)
-            control = controller.control(plan, scene.ego, scene.time_us)
+            control = plan.control(scene.ego, scene.time_us)
             held.decide(control, 850_000)
         world.step(held.advance())
     wrong = [event.kind for event in world.events if event.kind in INFRACTIONS]
     assert wrong or not world.done
-
-
-def test_without_a_world_it_says_what_is_missing() -> None:
-    nothing = Observation(
-        *(0, None, np.zeros((6, 4, 4), np.float32)),
-        can_bus=np.zeros(CAN_BUS_SIZE, np.float32),
-        command=3,
-        speed_mps=0.0,
-    )
-    with pytest.raises(EvaluationError, match="expert needs a highway-env world"):
-        Expert().plan(nothing)

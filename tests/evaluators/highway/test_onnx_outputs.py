@@ -1,23 +1,18 @@
 """What a graph answers, read by an adapter: other waypoints, controls, both fused."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
 import pytest
 
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.collision_optimizer import CollisionOptimizer
 from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
-from me2e_compress.driving.host_stage import HostStage, HostWork
+from me2e_compress.driving.host_stage import CollisionOptimizer, HostStage, HostWork
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
-from me2e_compress.evaluators.highway.runner import drive
-from me2e_compress.metrics.episode import Ending
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.trajectory import Floats
@@ -71,34 +66,6 @@ def test_controls_drive_in_place_of_the_plan(tmp_path: Path) -> None:
     policy.reset(EXIT)
 
     assert policy.plan(observation()) == PedalsAndWheel(0.5, 0.25, 0.0)
-
-
-def test_both_are_fused(tmp_path: Path) -> None:
-    """At 3 m/s towards 4 m/s the throttle is the most, and the plan goes straight."""
-    policy = adapted(controlled(tmp_path), f"{VECTOR}\n[fusion]\nshare = 0.4").open()
-    policy.reset(EXIT)
-    ahead = np.array([[30.0, 0.0], [60.0, 0.0]], np.float32)
-
-    found = policy.plan(replace(observation(), target_points=ahead))
-
-    assert found == pytest.approx((0.6 * 0.75 + 0.4 * 0.5, 0.4 * 0.25, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("values", "reason"),
-    [
-        ("0.5, -1.5, 0.0", "steer is -1.5, it must be from -1 to 1"),
-        ("1.5, 0.0, 0.0", "throttle is 1.5, it must be from 0 to 1"),
-    ],
-)
-def test_a_control_out_of_its_range_ends_the_route(
-    tmp_path: Path, values: str, reason: str
-) -> None:
-    policy = adapted(controlled(tmp_path, values), VECTOR).open()
-
-    episode = drive(EXIT, policy, Conditions())
-
-    assert (episode.ending, episode.failure) == (Ending.POLICY_FAILED, reason)
 
 
 @pytest.mark.parametrize(

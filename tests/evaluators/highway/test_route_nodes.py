@@ -3,8 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from me2e_compress.evaluators.highway.route_nodes import APART_M, RouteNodes
-from me2e_compress.simulator.scene import Ego, RoutePath
+from me2e_compress.evaluators.highway.observe import APART_M, RouteNodes
+from me2e_compress.simulator.plane_geometry import RoutePath
+from me2e_compress.simulator.scene import Ego
 
 
 def path_of(commands: list[int]) -> RoutePath:

@@ -12,8 +12,7 @@ from me2e_compress.driving.latency import FixedLatency, parse_latency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.episode_recorder import junction_m
-from me2e_compress.evaluators.highway.expert import Expert
+from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.observe import can_bus_of, road_users
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.episode import Ending
@@ -202,14 +201,6 @@ def test_the_layout_of_the_can_bus() -> None:
     assert bus == pytest.approx(expected, abs=1e-4)
 
 
-def test_a_junction_begins_after_its_announcement() -> None:
-    found = junction_m(World(GREEN).path)
-
-    assert found is not None
-    assert 20.0 <= found < World(GREEN).path.goal_m
-    assert junction_m(World(PARKED).path) is None
-
-
 def test_a_step_must_divide_50_ms() -> None:
     with pytest.raises(EvaluationError, match="a step of 30 ms"):
         Conditions(dt_us=30_000)
@@ -269,16 +260,8 @@ def test_a_held_plan_stays_where_it_was_made() -> None:
     assert first.plan is not None
     assert later.plan is not None
 
-    def in_world(moment: Moment, point: npt.NDArray[np.floating]) -> list[float]:
-        ego = moment.scene.ego
-        cos, sin = np.cos(ego.heading), np.sin(ego.heading)
-        return [
-            ego.x + cos * point[0] - sin * point[1],
-            ego.y + sin * point[0] + cos * point[1],
-        ]
-
-    assert in_world(later, later.plan[3]) == pytest.approx(
-        in_world(first, first.plan[3])
+    np.testing.assert_allclose(
+        later.scene.ego.placed(later.plan), first.scene.ego.placed(first.plan)
     )
     assert later.plan[3, 0] < first.plan[3, 0] - 1.0
 

@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
-from me2e_compress.evaluators.highway.expert import Memory, ceiling, decide
+from me2e_compress.evaluators.highway.controller import AnchoredPlan
+from me2e_compress.evaluators.highway.expert.expert_policy import Memory, decide
+from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.simulator.bicycle import advance
 from me2e_compress.simulator.plane_geometry import (
     Command,
@@ -14,6 +15,11 @@ from me2e_compress.simulator.plane_geometry import (
     RoutePath,
     polyline_headings,
     resample,
+)
+from me2e_compress.simulator.privileged import (
+    Intent,
+    Phase,
+    Privileged,
 )
 from me2e_compress.simulator.scene import (
     DIMENSIONS,
@@ -25,11 +31,6 @@ from me2e_compress.simulator.scene import (
     Signal,
     SignalKind,
     SignalState,
-)
-from me2e_compress.simulator.world.privileged import (
-    Intent,
-    Phase,
-    Privileged,
 )
 
 DT_US = 50_000
@@ -111,7 +112,7 @@ class TinyWorld:
         return Scene(self.time_us, self.ego, self.actors, self.signals)
 
     def privileged(self) -> Privileged:
-        phases = (Phase(s.id, s.stop_line[0][0], s.state, None) for s in self.signals)
+        phases = (Phase(s.id, s.stop_line[0][0], s.state) for s in self.signals)
         return Privileged(self.intents, tuple(phases))
 
     def step(self, control: Control) -> None:
@@ -159,7 +160,7 @@ class TinyWorld:
 
 def drive(world: TinyWorld, seconds: float, every: int = 1) -> list[Scene]:
     """Let the expert drive through the controller; all scenes, the last included."""
-    top, memory, controller = ceiling(world.path), Memory(), Controller()
+    top, memory = ceiling(world.path), Memory()
     scenes, control = [world.scene()], Control(0.0, 0.0)
     for frame in range(round(seconds * 1e6 / DT_US)):
         if frame % every == 0:
@@ -167,7 +168,7 @@ def drive(world: TinyWorld, seconds: float, every: int = 1) -> list[Scene]:
             decision = decide(scene, world.privileged(), world.path, top, memory)
             memory = decision.memory
             plan = AnchoredPlan.of(decision.waypoints, scene.ego, scene.time_us)
-            control = controller.control(plan, scene.ego, scene.time_us)
+            control = plan.control(scene.ego, scene.time_us)
         world.step(control)
         scenes.append(world.scene())
         if world.touches:

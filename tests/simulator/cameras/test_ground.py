@@ -12,7 +12,8 @@ from me2e_compress.simulator.cameras import (
     PixelClass,
     paint_texture,
 )
-from me2e_compress.simulator.scene import Ego, Roadmap
+from me2e_compress.simulator.plane_geometry import Roadmap
+from me2e_compress.simulator.scene import Ego
 from tests.profiles import scaled
 from tests.simulator.cameras import town
 

@@ -63,13 +63,6 @@ def test_lidar2img_is_k_times_r_and_t(camera: int, point: tuple[float, ...]) -> 
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-2)
 
 
-def test_rotations_are_rotations() -> None:
-    rotations = CameraRig(96, 160).rotations
-    for rotation in rotations:
-        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(rotation) == pytest.approx(1.0)
-
-
 @given(st.floats(-np.pi, np.pi))
 def test_whatever_stands_around_the_car_is_in_an_image(azimuth: float) -> None:
     rig = CameraRig(96, 160)

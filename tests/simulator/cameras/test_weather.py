@@ -49,10 +49,6 @@ def see(texture: GroundTexture, rig: CameraRig) -> Eyes:
     return Eyes(texture, rig)
 
 
-def test_the_same_seed_and_time_give_the_same_bytes(see: Eyes) -> None:
-    np.testing.assert_array_equal(see(STORM), see(STORM))
-
-
 def test_an_image_does_not_depend_on_those_before(
     texture: GroundTexture, rig: CameraRig, see: Eyes
 ) -> None:

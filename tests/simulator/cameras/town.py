@@ -6,14 +6,12 @@ import numpy as np
 
 from me2e_compress.simulator.cameras import paint_texture
 from me2e_compress.simulator.cameras.texture import GroundTexture
+from me2e_compress.simulator.plane_geometry import Lane, LaneMarking, Roadmap
 from me2e_compress.simulator.scene import (
     DIMENSIONS,
     Actor,
     ActorKind,
     Ego,
-    Lane,
-    LaneMarking,
-    Roadmap,
     Scene,
     Signal,
     SignalKind,

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.simulator.cameras import CAMERA_NAMES, CameraRig, Cameras
+from me2e_compress.simulator.cameras import CAMERA_NAMES
 from me2e_compress.simulator.pictures import (
     Moment,
     RoutePicture,
@@ -17,8 +17,7 @@ from me2e_compress.simulator.pictures import (
     write_png,
 )
 from me2e_compress.simulator.pictures.top_view import EGO, OTHER, PLAN, TRAIL
-from me2e_compress.simulator.scene import ActorKind, SignalState
-from me2e_compress.simulator.traffic.events import Event, EventKind
+from me2e_compress.simulator.scene import ActorKind, Event, EventKind, SignalState
 from tests.simulator.cameras import town
 
 TEXTURE = town.paint()
@@ -30,10 +29,13 @@ def event(kind: EventKind, time_us: int) -> Event:
     return Event(time_us, kind, "", 2.0, 0.0, 8.0, 1, ActorKind.CAR)
 
 
-def moment(i: int, *events: Event, images: Image8 | None = None) -> Moment:
+BLACK = np.zeros((6, 96, 160, 3), np.uint8)
+
+
+def moment(i: int, *events: Event, images: Image8 = BLACK) -> Moment:
     scene = town.light(SignalState.RED, x=30.0)
     scene = replace(scene, time_us=i * 50_000, ego=town.ego(float(i), 0.0))
-    return Moment(scene, images, PLAN_AHEAD, events, score=100.0 - i)
+    return Moment(scene, images, PLAN_AHEAD, events)
 
 
 def picture(*moments: Moment, tile_width: int = 160) -> RoutePicture:
@@ -84,11 +86,10 @@ def test_the_plan_lies_ahead_of_the_ego() -> None:
     assert columns.mean() == pytest.approx(view.shape[1] / 2, abs=2)
 
 
-def test_no_plan_no_images_no_score_is_no_failure() -> None:
-    bare = replace(moment(0), plan=None, score=None)
+def test_a_moment_may_have_no_plan() -> None:
+    bare = replace(moment(0), plan=None)
     frame = picture(bare).frame(0)
     assert count(above(frame), PLAN) == 0
-    assert (frame[40, 20] == frame[140, 200]).all()
 
 
 def test_an_infraction_is_marked_from_its_moment_on() -> None:
@@ -112,25 +113,10 @@ def test_a_trigger_is_no_infraction() -> None:
     np.testing.assert_array_equal(with_it.frame(0), without.frame(0))
 
 
-def test_frames_keep_every_nth_and_the_last() -> None:
-    film = picture(*(moment(i) for i in range(8)))
-    frames = list(film.frames(3))
-    assert len(frames) == 4
-    np.testing.assert_array_equal(frames[1], film.frame(3))
-    np.testing.assert_array_equal(frames[-1], film.frame(7))
-
-
 def test_a_strip_sets_moments_side_by_side() -> None:
     film = picture(*(moment(i) for i in range(4)))
     strip = film.strip([0, 2, 3])
     assert strip.shape == (30 + 4 + 96 + 4 + 160, 3 * 160 + 2 * 4, 3)
-
-
-def test_real_images_make_the_same_picture_every_time() -> None:
-    cameras = Cameras(TEXTURE, CameraRig(64, 96))
-    images = cameras.render(town.busy())
-    first = picture(Moment(town.busy(), images)).frame(0)
-    np.testing.assert_array_equal(first, picture(Moment(town.busy(), images)).frame(0))
 
 
 def test_without_a_moment_there_is_nothing_to_draw() -> None:

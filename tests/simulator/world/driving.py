@@ -1,7 +1,7 @@
 """Small helpers of the world's tests."""
 
-from me2e_compress.evaluators.highway.admission import DryRun, dry_run
 from me2e_compress.evaluators.highway.blind import Blind
+from me2e_compress.evaluators.highway.generate import DryRun, dry_run
 from me2e_compress.simulator.routes import Parameter, Route
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from me2e_compress.simulator.scenarios.layouts.streets import two_way

@@ -2,7 +2,6 @@ import math
 
 import numpy as np
 import pytest
-from highway_env.road.road import Road
 from highway_env.utils import are_polygons_intersecting
 from highway_env.vehicle.behavior import IDMVehicle
 from hypothesis import assume, given
@@ -189,15 +188,3 @@ def test_overlap_agrees_with_highway_env(
     expected, _, _ = are_polygons_intersecting(a.polygon(), b.polygon(), still, still)
 
     assert overlap(a, b) == expected
-
-
-@given(st.lists(st.floats(5.0, 290.0), min_size=2, max_size=6, unique=True))
-def test_neighbours_are_those_of_highway_env(places: list[float]) -> None:
-    network, road = one_lane()
-    cars = [Car(k + 1, network, [("a", "b", 0)], s, 0.0) for k, s in enumerate(places)]
-    put(road, *cars)
-    stock = Road(network.graph, vehicles=cars, neighbour_vehicles_connected_lanes=True)
-    road.refresh()
-
-    for car in cars:
-        assert road.neighbour_vehicles(car) == stock.neighbour_vehicles(car)

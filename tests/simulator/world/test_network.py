@@ -64,6 +64,16 @@ def test_lanes_lie_to_the_right_of_the_first() -> None:
     assert network.length(("b", "c", 1)) == pytest.approx(33.5 * 0.9)
 
 
+def test_the_rest_of_a_chain_begins_in_the_lane_of_the_arc_length() -> None:
+    network = winding(Pose(0.0, 0.0, 0.0), 30.0, 0.9)
+    chain = [("a", "b", 0), ("b", "c", 0), ("c", "d", 0)]
+
+    assert network.rest(chain, 39.0) == (chain, 39.0)
+    lanes, s_m = network.rest(chain, 45.0)
+    assert (lanes, s_m) == (chain[1:], pytest.approx(5.0))
+    assert network.rest(chain[2:], 99.0) == (chain[2:], 99.0)
+
+
 @given(st.lists(st.tuples(places, places), min_size=1, max_size=8))
 def test_the_table_agrees_with_highway_env(points: list[tuple[float, float]]) -> None:
     network = winding(Pose(-20.0, 5.0, 0.4), 25.0, -1.2)

@@ -3,10 +3,7 @@ import pytest
 
 from me2e_compress.metrics.abilities import ABILITIES
 from me2e_compress.simulator.scenarios.builders import BUILDERS, stage_of
-from me2e_compress.simulator.scenarios.catalogue import (
-    DIFFERENCES,
-    SCENARIO_ABILITIES,
-)
+from me2e_compress.simulator.scenarios.catalogue import EXPERT_S, SCENARIO_ABILITIES
 from me2e_compress.simulator.traffic.traffic_road import overlap
 from me2e_compress.simulator.world import World
 from tests.simulator.world.driving import drive_blind, route_of
@@ -21,16 +18,8 @@ def test_there_are_the_44_types_of_bench2drive() -> None:
     ]
 
     assert len(TYPES) == 44
-    assert set(BUILDERS) == set(TYPES)
+    assert set(BUILDERS) == set(TYPES) == set(EXPERT_S)
     assert sizes == [9, 16, 12, 2, 19]
-
-
-def test_no_two_types_share_both_layout_and_script() -> None:
-    stages = [stage_of(route_of(name)) for name in TYPES]
-
-    pairs = {(stage.layout, tuple(stage.script_names)) for stage in stages}
-
-    assert len(pairs) == 44
 
 
 @pytest.mark.parametrize("name", TYPES)
@@ -72,8 +61,3 @@ def test_the_room_beside_a_route_is_what_the_map_shows(name: str) -> None:
             if room < 8.5:
                 far = world.roadmap.outside_m(float(outside[0]), float(outside[1]))
                 assert far > 0
-
-
-def test_what_stands_in_for_a_type_is_documented() -> None:
-    assert set(DIFFERENCES) <= set(TYPES)
-    assert all(words[0].islower() for words in DIFFERENCES.values())

@@ -2,8 +2,7 @@ import math
 
 import pytest
 
-from me2e_compress.simulator.scene import SignalKind, SignalState
-from me2e_compress.simulator.traffic.events import EventKind
+from me2e_compress.simulator.scene import EventKind, SignalKind, SignalState
 from me2e_compress.simulator.traffic.network import Pose
 from me2e_compress.simulator.traffic.signals import Regulator
 

@@ -10,10 +10,10 @@ from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.simulator.plane_geometry import resample
 from me2e_compress.simulator.scenarios.layouts.streets import two_way
-from me2e_compress.simulator.scene import ActorKind, Control
+from me2e_compress.simulator.scene import ActorKind, Control, EventKind
 from me2e_compress.simulator.traffic.cars import Behaviour
 from me2e_compress.simulator.traffic.stage import Script, Stage
-from me2e_compress.simulator.world import EndReason, EventKind, World
+from me2e_compress.simulator.world import EndReason, World
 from tests.simulator.world.driving import (
     coast,
     drive_blind,
@@ -49,21 +49,6 @@ def test_what_ran_before_in_the_process_does_not_matter() -> None:
     trace(route_of("T_Junction", 2), dt_us=20_000)
 
     assert trace(route_of("HazardAtSideLane", 3)) == alone
-
-
-def test_two_worlds_may_be_stepped_in_turn() -> None:
-    route, seen = route_of("EnterActorFlow", 4), list[object]()
-    one, other = World(route), World(route_of("EnterActorFlow", 5))
-    for _ in range(80):
-        one.step(Control(0.5, 0.0))
-        other.step(Control(-1.0, 0.0))
-        seen.append(one.scene())
-
-    assert seen == trace(route, 80)[:80]
-
-
-def test_another_seed_is_another_route() -> None:
-    assert trace(route_of(seed=1), 3) != trace(route_of(seed=2), 3)
 
 
 def test_a_given_parameter_changes_that_one_alone() -> None:
@@ -214,7 +199,7 @@ def test_a_script_may_add_actors_while_it_runs() -> None:
 def test_cars_that_leave_the_map_are_gone() -> None:
     def leaver(stage: Stage) -> None:
         street = two_way(stage)
-        stage.car(street.ahead(0), street.road.length_m - 6.0, 10.0)
+        stage.car(street.ahead(0), stage.network.length(street.ahead()[0]) - 6.0, 10.0)
 
     world = World(route_of(), builder=leaver)
     assert len(world.scene().actors) == 1

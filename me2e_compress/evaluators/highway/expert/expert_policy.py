@@ -24,10 +24,10 @@ from me2e_compress.evaluators.highway.expert.speed_limits import (
     slowed,
 )
 from me2e_compress.evaluators.highway.observe import scene_and_world
-from me2e_compress.evaluators.highway.reentry import in_ego_frame, slope_of
-from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.scene import RoutePath, Scene
-from me2e_compress.simulator.world.privileged import Privileged
+from me2e_compress.evaluators.highway.reentry import slope_of
+from me2e_compress.simulator.plane_geometry import Floats, RoutePath
+from me2e_compress.simulator.privileged import Privileged
+from me2e_compress.simulator.scene import Scene
 
 WAYPOINTS = np.searchsorted(TIMES_S, np.arange(0.5, 3.01, 0.5))
 """[6] columns of the candidates that become waypoints."""
@@ -57,7 +57,6 @@ class ExpertDecision:
     waypoints: Plan
     acceleration_mps2: float
     target_m: float
-    cost: float
     memory: Memory
 
 
@@ -100,10 +99,9 @@ def decide(
     target = float(future.target_m[best])
     columns = future.x[best, WAYPOINTS], future.y[best, WAYPOINTS]
     return ExpertDecision(
-        in_ego_frame(*columns, ego),
+        ego.seen(*columns),
         float(future.acceleration[best]),
         target,
-        float(cost[best]),
         Memory(s, target, stop.served),
     )
 

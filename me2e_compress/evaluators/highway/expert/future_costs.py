@@ -9,8 +9,8 @@ import numpy as np
 from me2e_compress.evaluators.highway.expert.forecast import TIMES_S, Flags, Forecast
 from me2e_compress.evaluators.highway.expert.futures import SampledFutures
 from me2e_compress.evaluators.highway.expert.lateral_targets import SLOW_MPS, Place
-from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.scene import Ego, RoutePath
+from me2e_compress.simulator.plane_geometry import Floats, RoutePath
+from me2e_compress.simulator.scene import Ego
 
 COLLISION, NEAR_MISS, CUT_OFF = 200.0, 8.0, 30.0
 FADE = np.exp(-TIMES_S / 3.0)

@@ -7,8 +7,8 @@ import numpy as np
 from me2e_compress.evaluators.highway.expert.forecast import TIMES_S, Flags
 from me2e_compress.evaluators.highway.expert.lateral_targets import Options, Place
 from me2e_compress.evaluators.highway.reentry import beyond, reentry
-from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.scene import Ego, RoutePath
+from me2e_compress.simulator.plane_geometry import Floats, RoutePath
+from me2e_compress.simulator.scene import Ego
 from me2e_compress.simulator.traffic.bodies import ACCELERATION_LAG_S
 
 ACCELERATIONS_MPS2 = (-7.5, -5.5, -4.0, -2.8, -1.8, -1.0, -0.4, 0.0, 0.6, 1.2, 2.0)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from me2e_compress.evaluators.highway.expert.forecast import Flags, Forecast
-from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.scene import Command, Ego, RoutePath
+from me2e_compress.simulator.plane_geometry import Command, Floats, RoutePath
+from me2e_compress.simulator.scene import Ego
 
 NUDGES_M = (0.5, -0.5, 1.0, -1.0)
 """Small shifts within the drivable width: past a door, away from a car that cuts the

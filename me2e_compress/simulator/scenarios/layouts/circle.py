@@ -53,7 +53,6 @@ def roundabout(stage: Stage) -> Regulator:
 
     Returns the ego's give-way sign.
     """
-    stage.layout = "roundabout"
     # where the entry arcs touch the ring
     half_lane = LANE_WIDTH_M / 2
     sideways = half_lane + ENTRY_M

@@ -1,10 +1,11 @@
 """Junctions of up to four arms, named as the ego sees them."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from me2e_compress.simulator.plane_geometry import Command, LaneMarking, Point
+from me2e_compress.simulator.plane_geometry import Command, LaneMarking
 from me2e_compress.simulator.scenarios.layouts.streets import (
     origin,
     start_speed,
@@ -38,7 +39,6 @@ class Crossing:
     """A finished junction.
 
     Attributes:
-        network: The network it belongs to.
         centre: Its middle, with the ego's heading as it approaches.
         half_m: Half its side.
         lanes: Lanes of each arm in each direction.
@@ -47,13 +47,17 @@ class Crossing:
         signals: The regulator of each arm that has one.
     """
 
-    network: Network
     centre: Pose
     half_m: float
     lanes: int
     move: str
     approach_m: float
     signals: dict[str, Regulator]
+
+    @property
+    def sign(self) -> Regulator | None:
+        """The regulator of the ego's arm, if it has one."""
+        return self.signals.get("back")
 
     def way(self, origin: str, to: str, lane: int = 0) -> list[LaneIndex]:
         """Return the chain of lanes from one arm to another."""
@@ -77,14 +81,17 @@ class Crossing:
 
 def junction(
     stage: Stage,
-    move: str,
+    moves: Sequence[str],
     sign: SignalKind | None = None,
     arms: Sequence[str] = ARMS,
     lanes: int = 1,
     limit_mps: float = 13.0,
 ) -> Crossing:
-    """Lay a junction without lights; ``sign`` stands on the ego's arm."""
-    stage.layout = "junction"
+    """Lay a junction without lights; ``sign`` stands on the ego's arm.
+
+    The ego's move is drawn if there are several ``moves``.
+    """
+    move = moves[0] if len(moves) == 1 else stage.choice("move", moves)
     crossing = _crossing(stage, move, arms, lanes, limit_mps)
     if sign is not None:
         line = _stop_line(crossing, "back")
@@ -94,11 +101,10 @@ def junction(
 
 
 def signal_junction(
-    stage: Stage, move: str, ego_light: SignalState = SignalState.GREEN
+    stage: Stage, moves: Sequence[str], ego_light: SignalState = SignalState.GREEN
 ) -> Crossing:
     """Lay a junction with lights; cross traffic has red where the ego has green."""
-    crossing = junction(stage, move)
-    stage.layout = "signal_junction"
+    crossing = junction(stage, moves)
     green = ego_light is SignalState.GREEN
     cross = SignalState.RED if green else SignalState.GREEN
     for arm in ARMS:
@@ -109,39 +115,13 @@ def signal_junction(
     return crossing
 
 
-def t_junction(stage: Stage, move: str) -> Crossing:
-    """Lay a side road that ends at a through road; the ego gives way and turns."""
-    crossing = junction(stage, move, SignalKind.GIVE_WAY, ("left", "back", "right"))
-    stage.layout = "t_junction"
-    return crossing
-
-
-def interurban_turnoff(stage: Stage) -> Crossing:
-    """Lay a fast two-way road with a side road on the left, which the ego takes."""
-    arms = ("ahead", "left", "back")
-    crossing = junction(stage, "left", arms=arms, limit_mps=16.0)
-    stage.layout = "interurban_turnoff"
-    return crossing
-
-
-def interurban_entry(stage: Stage) -> Crossing:
-    """Lay a side road that ends at a four-lane road; the ego turns left into it."""
-    arms, sign = ("left", "back", "right"), SignalKind.GIVE_WAY
-    crossing = junction(stage, "left", sign, arms, lanes=2, limit_mps=14.0)
-    stage.layout = "interurban_entry"
-    return crossing
-
-
-def crosswalk_on(stage: Stage, crossing: Crossing, arm: str) -> None:
-    """Paint a crosswalk across an arm."""
+def crosswalk_junction(stage: Stage, moves: Sequence[str]) -> Crossing:
+    """Lay a junction with a crosswalk on the arm that the ego turns into."""
+    crossing = junction(stage, moves)
     half = crossing.lanes * LANE_WIDTH_M
-    corners = [
-        crossing.arm(arm, out, left)
-        for out, left in ((0.5, half), (3.5, half), (3.5, -half), (0.5, -half))
-    ]
-    a, b, c, d = ((corner.x, corner.y) for corner in corners)
-    walk: tuple[Point, Point, Point, Point] = (a, b, c, d)
-    stage.crosswalks.append(walk)
+    places = ((0.5, half), (3.5, half), (3.5, -half), (0.5, -half))
+    stage.add_crosswalk([crossing.arm(crossing.move, *at) for at in places])
+    return crossing
 
 
 def _stop_line(crossing: Crossing, arm: str) -> Pose:
@@ -157,16 +137,13 @@ def _crossing(
     approach = stage.uniform("approach_m", 55.0, 70.0)
     half = HALF_M + (lanes - 1) * LANE_WIDTH_M
     centre = origin(stage).moved(approach + half)
-    crossing = Crossing(stage.network, centre, half, lanes, move, approach, {})
+    crossing = Crossing(centre, half, lanes, move, approach, {})
     section = Section(lanes=lanes, limit_mps=limit_mps)
-    section = replace(section, left=LaneMarking.SOLID)
     # arms, then a connection for each pair
     for arm in arms:
-        _arm(crossing, arm, section)
-    for start in arms:
-        for end in arms:
-            if start != end:
-                _connect(crossing, start, end, limit_mps)
+        _arm(stage.network, crossing, arm, section)
+    for start, end in itertools.permutations(arms, 2):
+        _connect(stage.network, crossing, start, end, limit_mps)
     # the ego's route
     incoming, inside, outgoing = crossing.way("back", move)
     begin = stage.network.length(incoming) - approach
@@ -175,16 +152,18 @@ def _crossing(
     return crossing
 
 
-def _arm(crossing: Crossing, name: str, section: Section) -> None:
-    network, half_lane = crossing.network, LANE_WIDTH_M / 2
+def _arm(network: Network, crossing: Crossing, name: str, section: Section) -> None:
+    half_lane = LANE_WIDTH_M / 2
     away = crossing.arm(name, 0.0, -half_lane)
     network.straight(f"{name}.out", f"{name}.end", away, ARM_M, section)
     towards = crossing.arm(name, ARM_M, half_lane).turned(math.pi)
     network.straight(f"{name}.far", f"{name}.in", towards, ARM_M, section)
 
 
-def _connect(crossing: Crossing, start: str, end: str, limit_mps: float) -> None:
-    network, lanes = crossing.network, crossing.lanes
+def _connect(
+    network: Network, crossing: Crossing, start: str, end: str, limit_mps: float
+) -> None:
+    lanes = crossing.lanes
     first = crossing.arm(start, 0.0, LANE_WIDTH_M / 2).turned(math.pi)
     here, there = f"{start}.in", f"{end}.out"
     # straight on, right, or left: radii that meet the lanes of the arms

@@ -4,17 +4,12 @@ import math
 from dataclasses import dataclass, replace
 
 from me2e_compress.simulator.plane_geometry import Command, LaneMarking
-from me2e_compress.simulator.scenarios.layouts.carriageway import (
-    Carriageway,
-    Straight,
-    carriageway,
-    straight_section,
-)
 from me2e_compress.simulator.scenarios.layouts.streets import (
     BEFORE_M,
-    BEYOND_M,
-    GOAL_M,
+    STRAIGHT,
+    TOTAL_M,
     Street,
+    lay_road,
     origin,
     start_speed,
 )
@@ -32,33 +27,32 @@ LIMIT_MPS = 14.0
 RAMP_RADIUS_M = 80.0
 RAMP_APART_M = 7.0
 """Sideways distance between the ramp's straight and the lane it becomes."""
-TOTAL_M = BEFORE_M + GOAL_M + BEYOND_M
 CHANGE_M = 25.0
 """Length of a lane change."""
 
 
 @dataclass(frozen=True)
 class Ramp:
-    """A two-lane main road and a ramp.
+    """A fast main road and a lane that leads onto it or off it.
 
     Attributes:
-        main: The main road; lane 1 is next to the ramp.
-        ramp: The chain of the ramp, the lane beside the main road included.
-        merge_s: Arc length on the ego's route at the middle of its change between ramp
-            and main road.
+        main: The main road, and its lane beside the ramp.
+        ramp: The chain of the ramp, the lane beside the main road included; empty
+            where a lane just ends.
+        merge_s: Arc length on the ego's route where it changes between ramp and main
+            road.
     """
 
-    main: Carriageway
+    main: Street
     ramp: list[LaneIndex]
     merge_s: float
 
 
 def on_ramp(stage: Stage, ego_on_ramp: bool) -> Ramp:
     """Lay a ramp that joins from the right and runs beside the main road."""
-    stage.layout = "on_ramp" if ego_on_ramp else "main_road_past_on_ramp"
-    start, section = origin(stage), straight_section(2, LIMIT_MPS)
+    start, section = origin(stage), Section(2, limit_mps=LIMIT_MPS)
     # main road
-    main = carriageway(stage.network, "m", start, [Straight(TOTAL_M)], section)
+    main = replace(lay_road(stage.network, "m", start, STRAIGHT, section), lane=1)
     single = replace(section, lanes=1)
     beside = replace(single, left=LaneMarking.DASHED)
     # ramp: straight, an S-bend, then the acceleration lane
@@ -74,7 +68,7 @@ def on_ramp(stage: Stage, ego_on_ramp: bool) -> Ramp:
     ramp: list[LaneIndex] = [(f"p{k}", f"p{k + 1}", 0) for k in range(4)]
     # the ego's route
     if not ego_on_ramp:
-        legs = [Leg(main.ahead(1)[0], enter_m=BEFORE_M)]
+        legs = [Leg(main.ahead()[0], enter_m=BEFORE_M)]
         stage.drive(legs, start_speed(stage))
         return Ramp(main, ramp, 0.0)
     begun = length + 2 * RAMP_RADIUS_M * math.sin(angle)
@@ -84,7 +78,7 @@ def on_ramp(stage: Stage, ego_on_ramp: bool) -> Ramp:
         Leg(ramp[1]),
         Leg(ramp[2]),
         Leg(ramp[3], leave_m=leave),
-        Leg(main.ahead(1)[0], Command.CHANGE_LEFT, begun + leave + CHANGE_M),
+        Leg(main.ahead()[0], Command.CHANGE_LEFT, begun + leave + CHANGE_M),
     ]
     stage.drive(legs, start_speed(stage))
     return Ramp(main, ramp, _beside(stage, start, begun + leave + CHANGE_M / 2))
@@ -92,10 +86,9 @@ def on_ramp(stage: Stage, ego_on_ramp: bool) -> Ramp:
 
 def off_ramp(stage: Stage) -> Ramp:
     """Lay an exit on the right; the ego starts in the left lane of the main road."""
-    stage.layout = "off_ramp"
-    start, section = origin(stage), straight_section(2, LIMIT_MPS)
+    start, section = origin(stage), Section(2, limit_mps=LIMIT_MPS)
     # main road
-    main = carriageway(stage.network, "m", start, [Straight(TOTAL_M)], section)
+    main = replace(lay_road(stage.network, "m", start, STRAIGHT, section), lane=1)
     single = replace(section, lanes=1)
     beside = replace(single, left=LaneMarking.DASHED)
     # ramp: a lane beside the main road, then an S-bend away from it
@@ -110,7 +103,7 @@ def off_ramp(stage: Stage) -> Ramp:
     net.straight("q3", "q4", pose, 150.0, single)
     ramp: list[LaneIndex] = [(f"q{k}", f"q{k + 1}", 0) for k in range(4)]
     # the ego changes lanes twice, into the ramp
-    left, right = main.ahead(0)[0], main.ahead(1)[0]
+    left, right = main.ahead(0)[0], main.ahead()[0]
     changed = BEFORE_M + first + CHANGE_M
     legs = [
         Leg(left, enter_m=BEFORE_M, leave_m=BEFORE_M + first),
@@ -122,10 +115,9 @@ def off_ramp(stage: Stage) -> Ramp:
     return Ramp(main, ramp, first + CHANGE_M / 2)
 
 
-def lane_drop(stage: Stage) -> Street:
+def lane_drop(stage: Stage) -> Ramp:
     """Lay a two-lane road whose right lane, the ego's, ends."""
-    stage.layout = "lane_drop"
-    start, section = origin(stage), straight_section(2, LIMIT_MPS)
+    start, section = origin(stage), Section(2, limit_mps=LIMIT_MPS)
     # the road, with barriers where its right lane ends
     ends = BEFORE_M + stage.uniform("ends_m", 85.0, 95.0)
     net = stage.network
@@ -140,15 +132,14 @@ def lane_drop(stage: Stage) -> Street:
         Leg(("d1", "d2", 0)),
     ]
     stage.drive(legs, start_speed(stage))
-    edges = (("d0", "d1"), ("d1", "d2"))
-    return Street(Carriageway(net, edges, (), (), 1, after), 1, BEFORE_M)
+    main = Street((("d0", "d1"), ("d1", "d2")))
+    return Ramp(main, [], ends - 30.0 - BEFORE_M)
 
 
 def four_lanes(stage: Stage) -> Street:
     """Lay four lanes one way, which the ego crosses from the left to the right."""
-    stage.layout = "four_lanes"
-    section: Section = straight_section(4, LIMIT_MPS)
-    road = carriageway(stage.network, "r", origin(stage), [Straight(TOTAL_M)], section)
+    section = Section(4, limit_mps=LIMIT_MPS)
+    road = lay_road(stage.network, "r", origin(stage), STRAIGHT, section)
     s, legs = BEFORE_M, list[Leg]()
     stay = stage.uniform("first_m", 32.0, 38.0)
     for lane in range(4):
@@ -158,7 +149,7 @@ def four_lanes(stage: Stage) -> Street:
         s += stay + CHANGE_M
         stay = 11.0
     stage.drive(legs, start_speed(stage))
-    return Street(road, 0, BEFORE_M)
+    return road
 
 
 def block_end(stage: Stage, pose: Pose) -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
+from me2e_compress.simulator.scenarios.layouts.streets import Street
 from me2e_compress.simulator.scenarios.scripts.synchronise import steps_out
 from me2e_compress.simulator.scene import ActorKind
 from me2e_compress.simulator.traffic.bodies import Walker
@@ -14,7 +15,7 @@ from me2e_compress.simulator.traffic.stage import Script, Stage
 HALF_LANE_M = LANE_WIDTH_M / 2
 
 
-def walker_behind_van(stage: Stage) -> Script:
+def walker_behind_van(stage: Stage, _: Street) -> Script:
     """Send a pedestrian out from behind a van that stands at the kerb."""
     s = stage.uniform("crossing_m", 60.0, 85.0)
     speed = stage.uniform("walk_mps", 1.5, 2.5)
@@ -25,7 +26,7 @@ def walker_behind_van(stage: Stage) -> Script:
     stage.fire("walker_behind_van", walker)
 
 
-def walker_between_cars(stage: Stage) -> Script:
+def walker_between_cars(stage: Stage, _: Street) -> Script:
     """Send a pedestrian out between two parked cars."""
     s = stage.uniform("crossing_m", 60.0, 85.0)
     speed = stage.uniform("walk_mps", 1.4, 2.2)
@@ -37,7 +38,7 @@ def walker_between_cars(stage: Stage) -> Script:
     stage.fire("walker_between_cars", walker)
 
 
-def walkers_on_zebra(stage: Stage) -> Script:
+def walkers_on_zebra(stage: Stage, _: Street) -> Script:
     """Send two to four people over the crosswalk from both sides."""
     s = float(stage.parameters["crosswalk_m"])
     count = stage.integer("walkers", 2, 4)
@@ -58,14 +59,14 @@ def pedestrians_on_exit(stage: Stage, crossing: Crossing) -> Script:
     """Send three pedestrians across the arm that the ego turns into."""
     speed = stage.uniform("walk_mps", 1.3, 2.0)
     row = _row(stage, crossing, ActorKind.PEDESTRIAN, speed, LANE_WIDTH_M + 1.5, 3, 1.3)
-    yield from _set_off(stage, row, 1, "pedestrians_on_exit")
+    yield from _set_off(stage, row, "pedestrians_on_exit")
 
 
 def cyclists_on_exit(stage: Stage, crossing: Crossing) -> Script:
     """Send three cyclists across the arm that the ego turns into."""
     speed = stage.uniform("ride_mps", 2.8, 4.0)
     row = _row(stage, crossing, ActorKind.BICYCLE, speed, LANE_WIDTH_M + 4.0, 3, 2.4)
-    yield from _set_off(stage, row, 1, "cyclists_on_exit")
+    yield from _set_off(stage, row, "cyclists_on_exit")
 
 
 def bicycle_stream(stage: Stage, crossing: Crossing) -> Script:
@@ -75,7 +76,7 @@ def bicycle_stream(stage: Stage, crossing: Crossing) -> Script:
     spacing = stage.uniform("spacing_m", 2.6, 3.6)
     start = LANE_WIDTH_M + 4.0
     row = _row(stage, crossing, ActorKind.BICYCLE, speed, start, count, spacing)
-    yield from _set_off(stage, row, 1, "bicycle_stream")
+    yield from _set_off(stage, row, "bicycle_stream")
 
 
 @dataclass(frozen=True)
@@ -117,10 +118,10 @@ def _row(
     return row
 
 
-def _set_off(stage: Stage, row: Row, timed: int, name: str) -> Script:
-    """Send a row off so that one of them meets the ego."""
-    who = row.people[timed]
-    yield from steps_out(stage, who, row.route_s, row.reach_m[timed])
+def _set_off(stage: Stage, row: Row, name: str) -> Script:
+    """Send a row off so that the second of them meets the ego."""
+    who = row.people[1]
+    yield from steps_out(stage, who, row.route_s, row.reach_m[1])
     for walker in row.people:
         walker.going = True
     stage.fire(name, who)

@@ -3,11 +3,10 @@
 from me2e_compress.simulator.scenarios.layouts.circle import ring_way
 from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
 from me2e_compress.simulator.scenarios.layouts.ramps import Ramp
-from me2e_compress.simulator.scenarios.layouts.streets import Street
+from me2e_compress.simulator.scenarios.layouts.streets import BEFORE_M, Street
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
     arrive_together,
     meeting,
-    on_chain,
     release,
 )
 from me2e_compress.simulator.scene import SignalKind
@@ -23,39 +22,38 @@ DENSE = Behaviour(headway_s=0.8, jam_gap_m=3.0)
 def oncoming_platoon(stage: Stage, crossing: Crossing) -> Script:
     """Drive oncoming traffic straight on while the ego wants to turn left."""
     cars = stage.integer("cars", 2, 4)
-    chain = crossing.way("ahead", "back")
-    yield from _platoon(stage, chain, cars, "oncoming_platoon")
+    yield from _platoon(stage, crossing.way("ahead", "back"), cars, "oncoming_platoon")
 
 
 def platoon_from_left(stage: Stage, crossing: Crossing) -> Script:
     """Drive cars from the left straight into the arm that the ego turns into."""
-    cars = stage.integer("cars", 2, 4)
-    chain = crossing.way("left", "right")
-    yield from _platoon(stage, chain, cars, "platoon_from_left", _sign(crossing))
+    cars, chain = stage.integer("cars", 2, 4), crossing.way("left", "right")
+    yield from _platoon(stage, chain, cars, "platoon_from_left", crossing.sign)
 
 
 def platoon_to_enter(stage: Stage, crossing: Crossing) -> Script:
     """Drive cars from the right into the road that the ego turns left into."""
-    cars = stage.integer("cars", 2, 4)
-    chain = crossing.way("right", "left")
-    yield from _platoon(stage, chain, cars, "platoon_to_enter", _sign(crossing))
+    cars, chain = stage.integer("cars", 2, 4), crossing.way("right", "left")
+    yield from _platoon(stage, chain, cars, "platoon_to_enter", crossing.sign)
 
 
 def priority_car(stage: Stage, crossing: Crossing) -> Script:
     """Drive one car, from a random side, that has the right of way."""
-    side = stage.choice("from", ("left", "right"))
-    other = "right" if side == "left" else "left"
-    chain = crossing.way(side, other)
-    if crossing.move == "right" and side == "right":
+    chain = _from_a_side(stage, crossing)
+    if crossing.move == "right":
         chain = crossing.way("left", "right")
-    yield from _platoon(stage, chain, 1, "priority_car", _sign(crossing))
+    yield from _platoon(stage, chain, 1, "priority_car", crossing.sign)
 
 
 def crossing_car(stage: Stage, crossing: Crossing) -> Script:
     """Drive a car from the side that must give way, and does not."""
+    yield from _platoon(stage, _from_a_side(stage, crossing), 1, "crossing_car")
+
+
+def _from_a_side(stage: Stage, crossing: Crossing) -> list[LaneIndex]:
+    """Return a chain straight through a junction, from its left or its right."""
     side = stage.choice("from", ("left", "right"))
-    chain = crossing.way(side, "right" if side == "left" else "left")
-    yield from _platoon(stage, chain, 1, "crossing_car")
+    return crossing.way(side, "right" if side == "left" else "left")
 
 
 def flows_from_both_sides(stage: Stage, crossing: Crossing) -> Script:
@@ -64,34 +62,25 @@ def flows_from_both_sides(stage: Stage, crossing: Crossing) -> Script:
     other = crossing.way("right", "left", crossing.lanes - 1)
     # cars from the right, which come a little later
     route_s, station = meeting(stage, other)
-    cars = 2 if crossing.move == "left" else 1
-    begin = max(station - route_s - late, 0.0)
-    for k in range(cars):
-        lanes, local = on_chain(stage.network, other, max(begin - 14.0 * k, 0.0))
-        stage.car(lanes, local, float(stage.ego.speed), behaviour=DENSE)
+    begin, speed = max(station - route_s - late, 0.0), float(stage.ego.speed)
+    for k in range(2 if crossing.move == "left" else 1):
+        stage.car(other, max(begin - 14.0 * k, 0.0), speed, behaviour=DENSE)
     # a platoon from the left, timed to meet it
     chain = crossing.way("left", "right", crossing.lanes - 1)
-    yield from _platoon(
-        stage,
-        chain,
-        stage.integer("cars", 2, 3),
-        "flows_from_both_sides",
-        _sign(crossing),
-    )
+    cars = stage.integer("cars", 2, 3)
+    yield from _platoon(stage, chain, cars, "flows_from_both_sides", crossing.sign)
 
 
 def near_and_far_flow(stage: Stage, crossing: Crossing) -> Script:
     """Drive fast traffic from the left to cross, slower from the right to join."""
-    far = crossing.way("right", "left", 0)
+    far = crossing.way("right", "left")
     route_s, station = meeting(stage, far)
     late = stage.uniform("late_m", 20.0, 30.0)
     for k in range(2):
         s = max(station - route_s - late - 15.0 * k, 0.0)
-        lanes, local = on_chain(stage.network, far, s)
-        stage.car(lanes, local, 9.0, 10.0, behaviour=DENSE)
-    chain = crossing.way("left", "right", 1)
-    cars = stage.integer("cars", 3, 5)
-    yield from _platoon(stage, chain, cars, "near_and_far_flow", _sign(crossing))
+        stage.car(far, s, 9.0, 10.0, behaviour=DENSE)
+    chain, cars = crossing.way("left", "right", 1), stage.integer("cars", 3, 5)
+    yield from _platoon(stage, chain, cars, "near_and_far_flow", crossing.sign)
 
 
 def ring_flow(stage: Stage, sign: Regulator) -> Script:
@@ -103,28 +92,24 @@ def ring_flow(stage: Stage, sign: Regulator) -> Script:
 
 def exit_lane_flow(stage: Stage, ramp: Ramp) -> Script:
     """Keep cars beside the ego, in the lane that it must cross to reach the exit."""
-    yield from _beside(
-        stage, ramp.main.ahead(1), 60.0, ramp.merge_s, "exit_lane_flow", 3
-    )
+    yield from _beside(stage, ramp.main.ahead(), ramp.merge_s, "exit_lane_flow", 3)
 
 
 def side_flows(stage: Stage, street: Street) -> Script:
     """Keep a car beside the ego at its first change, others in the lanes beyond."""
     for lane in (2, 3):
         ahead = stage.uniform(f"lane_{lane}_m", 8.0, 25.0) * (lane * 2 - 5)
-        chain, s = on_chain(
-            stage.network, street.ahead(lane), street.start_m + 20.0 + ahead
-        )
-        stage.car(chain, s, float(stage.ego.speed), behaviour=DENSE)
+        s = BEFORE_M + 20.0 + ahead
+        stage.car(street.ahead(lane), s, float(stage.ego.speed), behaviour=DENSE)
     change = float(stage.parameters["first_m"]) + 12.5
-    yield from _beside(stage, street.ahead(1), 60.0, change, "side_flows", 2)
+    yield from _beside(stage, street.ahead(1), change, "side_flows", 2)
 
 
 def bay_flow(stage: Stage, street: Street) -> Script:
     """Drive cars past the parking bay that the ego wants to leave."""
-    chain = street.ahead(0)
+    chain = street.ahead()
     route_s, _ = meeting(stage, chain)
-    begin = street.start_m - stage.uniform("behind_m", 3.0, 6.0)
+    begin = BEFORE_M - stage.uniform("behind_m", 3.0, 6.0)
     lead = stage.car(chain, begin, 3.0, behaviour=HEEDLESS)
     for k in range(stage.integer("followers", 1, 3)):
         stage.car(chain, begin - 11.0 * (k + 1), 3.0, 8.0, behaviour=DENSE)
@@ -156,9 +141,8 @@ def _platoon(
         s = station - ratio * route_s - gap * k
         if s < 0:
             break
-        lanes, local = on_chain(stage.network, chain, s)
         behaviour = DENSE if k else HEEDLESS
-        row.append(stage.car(lanes, local, speed, 9.0, behaviour=behaviour))
+        row.append(stage.car(chain, s, speed, 9.0, behaviour=behaviour))
     # a give-way sign judges by the nearest of them
     points = [meeting(stage, car.lanes) for car in row]
     if sign is not None and sign.kind is SignalKind.GIVE_WAY:
@@ -170,7 +154,6 @@ def _platoon(
 def _beside(
     stage: Stage,
     chain: list[LaneIndex],
-    start_m: float,
     change_s: float,
     name: str,
     cars: int,
@@ -180,7 +163,7 @@ def _beside(
     aside = stage.uniform("beside_m", -1.5, 1.5)
     # the first car adapts to the ego, the others follow
     row = [
-        stage.car(chain, start_m + aside - 13.0 * k, speed, behaviour=DENSE)
+        stage.car(chain, BEFORE_M + aside - 13.0 * k, speed, behaviour=DENSE)
         for k in range(cars)
     ]
     lead = row[0]
@@ -206,10 +189,6 @@ def _keep_beside(
     error = s - stage.ego_s - aside_m
     wanted = max(stage.ego.speed - 0.8 * error, slowest_mps)
     car.forced_mps2 = min(max((wanted - car.speed) / 0.3, -6.0), 5.0)
-
-
-def _sign(crossing: Crossing) -> Regulator | None:
-    return crossing.signals.get("back")
 
 
 def _nearest(row: list[Car], stations: list[float]) -> float:

@@ -2,10 +2,9 @@
 
 from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
 from me2e_compress.simulator.scenarios.layouts.ramps import Ramp
-from me2e_compress.simulator.scenarios.layouts.streets import Street
+from me2e_compress.simulator.scenarios.layouts.streets import BEFORE_M, Street
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
     hold,
-    on_chain,
     patience,
     release,
     stand,
@@ -29,9 +28,8 @@ def hard_brake(stage: Stage, street: Street) -> Script:
     gap = stage.uniform("gap_m", 13.0, 18.0)
     where = stage.uniform("brake_m", 35.0, 60.0)
     hardest = stage.uniform("brake_mps2", 5.0, 7.0)
-    lanes = street.ahead(street.lane)
     speed = float(stage.ego.speed)
-    car = stage.car(lanes, street.start_m + gap + 5.0, speed)
+    car = stage.car(street.ahead(), BEFORE_M + gap + 5.0, speed)
     # keep the distance until the place of braking
     while stage.ahead_m(where) > 0:
         error = stage.gap_m(car) - gap
@@ -54,12 +52,11 @@ def pull_out(stage: Stage, street: Street) -> Script:
     lead_s = stage.uniform("lead_s", 3.0, 3.6)
     for aside in (-13.0, -6.5, 14.0, 20.5):
         _park(stage, s + aside)
-    lanes, local = on_chain(stage.network, street.road.shoulder(), street.start_m + s)
-    car = stage.car(lanes, local, 0.0)
+    car = stage.car(street.shoulder(), BEFORE_M + s, 0.0)
     stand(car)
     while stage.arrival_s(s - 2.0) > lead_s:
         yield
-    yield from _cut_in(stage, car, street.ahead(street.lane), 1, "pull_out", 2.2)
+    yield from _cut_in(stage, car, street.ahead(), 1, "pull_out", 2.2)
 
 
 def queue_cut_in(stage: Stage, street: Street) -> Script:
@@ -71,8 +68,7 @@ def queue_cut_in(stage: Stage, street: Street) -> Script:
     # a standing queue with room ahead of the car that leaves it
     cutter: Car | None = None
     for aside in (-14.0, -7.0, 0.0, 11.0, 18.0):
-        lanes, local = on_chain(stage.network, chain, street.start_m + s + aside)
-        car = stage.car(lanes, local, 0.0)
+        car = stage.car(chain, BEFORE_M + s + aside, 0.0)
         stand(car)
         cutter = car if aside == 0.0 else cutter
     # leave when the ego is near in time
@@ -80,9 +76,7 @@ def queue_cut_in(stage: Stage, street: Street) -> Script:
         yield
     if cutter is not None:
         side = 1 if street.lane < lane else -1
-        yield from _cut_in(
-            stage, cutter, street.ahead(street.lane), side, "queue_cut_in", 2.2
-        )
+        yield from _cut_in(stage, cutter, street.ahead(), side, "queue_cut_in", 2.2)
 
 
 def ramp_cut_in(stage: Stage, ramp: Ramp) -> Script:
@@ -98,24 +92,22 @@ def ramp_cut_in(stage: Stage, ramp: Ramp) -> Script:
         car.forced_mps2 = min(max((wanted - car.speed) / 0.4, -6.0), 4.0)
         yield
     car.forced_mps2 = None
-    main = ramp.main.ahead(1)
-    yield from _cut_in(stage, car, main, 1, "ramp_cut_in", 2.0)
+    yield from _cut_in(stage, car, ramp.main.ahead(), 1, "ramp_cut_in", 2.0)
 
 
-def slow_queue(stage: Stage, lane: list[LaneIndex], merge_m: float) -> Script:
+def slow_queue(stage: Stage, ramp: Ramp) -> Script:
     """Fill the lane that the ego must enter with crawling cars.
 
     They speed up a while after the ego has come in among or behind them.
     """
     speed = stage.uniform("queue_mps", 1.6, 2.2)
     spacing = stage.uniform("queue_spacing_m", 8.5, 10.0)
-    first = merge_m + 30.0
+    first = BEFORE_M + ramp.merge_s + 30.0
     # a crawling row
     for k in range(10):
         s = first - spacing * k
         if s > 0:
-            lanes, local = on_chain(stage.network, lane, s)
-            stage.car(lanes, local, speed, speed)
+            stage.car(ramp.main.ahead(), s, speed, speed)
     queue = [body for body in stage.bodies if isinstance(body, Car)]
     # speed up a while after the ego has come close and slowed down
     while min(abs(stage.gap_m(car)) for car in queue) > 15.0:
@@ -168,7 +160,7 @@ def _cut_in(
     """Move into the ego's lane, crawl there, drive off."""
     stage.fire(name, car)
     # change lanes at a crawl
-    target, _ = on_chain(stage.network, lanes, _s_along(stage, lanes, car.pose))
+    target, _ = stage.network.rest(lanes, _s_along(stage, lanes, car.pose))
     car.change_lane(target, side)
     release(car, crawl)
     until = stage.time_s + CRAWL_S

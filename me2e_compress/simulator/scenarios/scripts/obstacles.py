@@ -1,10 +1,9 @@
 """Things in the way: accidents, road works, parked cars, doors, slow cyclists."""
 
-from me2e_compress.simulator.scenarios.layouts.streets import Street
+from me2e_compress.simulator.scenarios.layouts.streets import BEFORE_M, Street
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
     NEAR_M,
     met,
-    on_chain,
 )
 from me2e_compress.simulator.scene import ActorKind
 from me2e_compress.simulator.traffic.cars import Car
@@ -19,7 +18,7 @@ def free_side(stage: Stage) -> float:
     return 1.0 if left > LANE_WIDTH_M else -1.0
 
 
-def crashed_cars(stage: Stage) -> Script:
+def crashed_cars(stage: Stage, _: Street) -> Script:
     """Place two crashed cars askew in the lane, and a police van before them."""
     s = stage.uniform("obstacle_m", 62.0, 80.0)
     for k, name in enumerate(("first", "second")):
@@ -31,7 +30,7 @@ def crashed_cars(stage: Stage) -> Script:
     yield from met(stage, s, "crashed_cars")
 
 
-def construction(stage: Stage) -> Script:
+def construction(stage: Stage, _: Street) -> Script:
     """Close the lane for a few metres with cones and barriers."""
     s = stage.uniform("obstacle_m", 62.0, 80.0)
     length = stage.uniform("works_m", 8.0, 14.0)
@@ -46,7 +45,7 @@ def construction(stage: Stage) -> Script:
     yield from met(stage, s, "construction")
 
 
-def parked_car(stage: Stage) -> Script:
+def parked_car(stage: Stage, _: Street) -> Script:
     """Stop a car or van in the lane, its hazard lights on."""
     s = stage.uniform("obstacle_m", 62.0, 85.0)
     kind = ActorKind(stage.choice("obstacle", ("parked", "van", "truck")))
@@ -62,9 +61,8 @@ def slow_cyclists(stage: Stage, street: Street) -> Script:
     first = stage.uniform("cyclist_gap_m", 26.0, 34.0)
     last: Car | None = None
     for k in range(count):
-        s = street.start_m + first + 4.5 * k
-        lanes, local = on_chain(stage.network, street.ahead(street.lane), s)
-        rider = stage.car(lanes, local, speed, speed, ActorKind.BICYCLE)
+        s = BEFORE_M + first + 4.5 * k
+        rider = stage.car(street.ahead(), s, speed, speed, ActorKind.BICYCLE)
         rider.offset_m = -0.8
         right = rider.pose.moved(0.0, -0.8)
         rider.position[:] = (right.x, -right.y)
@@ -74,7 +72,7 @@ def slow_cyclists(stage: Stage, street: Street) -> Script:
     stage.fire("slow_cyclists", last)
 
 
-def opening_door(stage: Stage) -> Script:
+def opening_door(stage: Stage, _: Street) -> Script:
     """Open the door of one of a row of parked cars into the lane."""
     s = stage.uniform("door_m", 60.0, 80.0)
     side = -(LANE_WIDTH_M / 2 + 1.05)
@@ -90,7 +88,7 @@ def opening_door(stage: Stage) -> Script:
     stage.fire("opening_door", door)
 
 
-def spun_car(stage: Stage) -> Script:
+def spun_car(stage: Stage, _: Street) -> Script:
     """Lower the grip before a car that stands across the lane.
 
     Substitutes for Bench2Drive's ControlLoss, which adds noise to the controls: that
@@ -116,23 +114,21 @@ def neighbours(stage: Stage, street: Street) -> Script:
     """Drive a car ahead and one well behind in the lane beside the ego's."""
     chain = street.ahead(street.other_lane())
     for name, low, high in (("ahead", 35.0, 50.0), ("behind", -45.0, -30.0)):
-        s = street.start_m + stage.uniform(f"{name}_m", low, high)
+        s = BEFORE_M + stage.uniform(f"{name}_m", low, high)
         speed = stage.uniform(f"{name}_mps", 8.0, 10.0)
-        lanes, local = on_chain(stage.network, chain, s)
-        stage.car(lanes, local, speed)
+        stage.car(chain, s, speed)
     yield
 
 
 def oncoming_cars(stage: Stage, street: Street) -> Script:
     """Drive a few cars in the other direction, and then none."""
     count = stage.integer("oncoming", 1, 3)
-    chain = street.road.oncoming()
+    chain = street.oncoming()
     total = sum(stage.network.length(index) for index in chain)
     away = stage.uniform("oncoming_m", 80.0, 120.0)
     speed = stage.uniform("oncoming_mps", 8.0, 10.0)
     for k in range(count):
         gap = k * stage.uniform(f"oncoming_gap_{k}_m", 16.0, 24.0)
-        s = total - street.start_m - away - gap
-        lanes, local = on_chain(stage.network, chain, max(s, 0.0))
-        stage.car(lanes, local, speed)
+        s = total - BEFORE_M - away - gap
+        stage.car(chain, max(s, 0.0), speed)
     yield

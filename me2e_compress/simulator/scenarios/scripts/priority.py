@@ -1,17 +1,15 @@
 """Lights, signs, and vehicles that take or demand priority."""
 
 from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
-from me2e_compress.simulator.scenarios.layouts.streets import Street
+from me2e_compress.simulator.scenarios.layouts.streets import BEFORE_M, Street
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
     hold,
     met,
     nearest_station,
-    on_chain,
     patience,
 )
-from me2e_compress.simulator.scene import ActorKind, SignalState
+from me2e_compress.simulator.scene import ActorKind, Event, EventKind, SignalState
 from me2e_compress.simulator.traffic.cars import Behaviour
-from me2e_compress.simulator.traffic.events import Event, EventKind
 from me2e_compress.simulator.traffic.stage import Script, Stage
 
 YELLOW_S = 2.0
@@ -53,21 +51,20 @@ def stop_sign(stage: Stage, crossing: Crossing) -> Script:
 
 def invader(stage: Stage, street: Street) -> Script:
     """Drive an oncoming car partly in the ego's lane."""
-    chain = street.road.oncoming()
+    chain = street.oncoming()
     total = sum(stage.network.length(index) for index in chain)
     where = stage.uniform("meet_m", 55.0, 75.0)
     away = stage.uniform("away_m", 50.0, 60.0)
     kind = ActorKind(stage.choice("invader", ("car", "van")))
     # an oncoming car, offset into the ego's lane
-    s = total - (street.start_m + where + away)
-    lanes, local = on_chain(stage.network, chain, s)
-    car = stage.car(lanes, local, 7.0, kind=kind, behaviour=Behaviour(sees_ego=False))
+    s = total - (BEFORE_M + where + away)
+    car = stage.car(chain, s, 7.0, kind=kind, behaviour=Behaviour(sees_ego=False))
     _, lateral = stage.path.project(car.pose.x, car.pose.y)
     into = stage.uniform("invaded_m", 1.25, 1.45)
     car.offset_m = lateral - into
     # adapt its speed to meet the ego at the chosen place
     begin = stage.route_pose(where)
-    station = nearest_station(stage, lanes, begin.x, begin.y)
+    station = nearest_station(stage, car.lanes, begin.x, begin.y)
     while stage.arrival_s(where) > 4.0:
         due = stage.ahead_m(where) / max(stage.ego.speed, 2.0)
         wanted = min(max((station - car.station_m) / max(due, 0.2), 2.0), 13.0)
@@ -91,10 +88,10 @@ def emergency_behind(stage: Stage, street: Street) -> Script:
     route it must be ahead of the ego.
     """
     gap = stage.uniform("behind_m", 18.0, 26.0)
-    lanes = street.ahead(street.lane)
+    lanes = street.ahead()
     car = stage.car(
         lanes,
-        street.start_m - gap,
+        BEFORE_M - gap,
         float(stage.ego.speed) + 5.0,
         18.0,
         ActorKind.EMERGENCY,

@@ -18,16 +18,8 @@ COMMIT_M = 22.0
 NEAR_M = 30.0
 """A standing obstacle counts as met when the ego is this close."""
 TOUCH_M = 1.0
-
-
-def on_chain(
-    network: Network, chain: Sequence[LaneIndex], s_m: float
-) -> tuple[list[LaneIndex], float]:
-    """Return the rest of a chain from an arc length on, and that in its first lane."""
-    lanes = list(chain)
-    while len(lanes) > 1 and s_m > network.length(lanes[0]):
-        s_m -= network.length(lanes.pop(0))
-    return lanes, s_m
+TOP_MPS = 16.0
+"""The most that a synchronised car drives to be in time."""
 
 
 def chain_points(network: Network, chain: Sequence[LaneIndex]) -> tuple[Floats, Floats]:
@@ -75,7 +67,6 @@ def arrive_together(
     route_s: float,
     station_m: float,
     name: str,
-    top_mps: float = 16.0,
 ) -> Script:
     """Let a car reach its meeting point when the ego's centre does.
 
@@ -89,13 +80,13 @@ def arrive_together(
         and stage.ahead_m(route_s) - stage.ego.LENGTH / 2 > COMMIT_M
     ):
         due = stage.ahead_m(route_s) / max(stage.ego.speed, 2.0)
-        _hurry(car, station_m, due, 1.0, top_mps)
+        _hurry(car, station_m, due, 1.0)
         yield
     # commit to the time foreseen now
     stage.fire(name, car)
     due = stage.time_s + stage.ahead_m(route_s) / max(stage.ego.speed, 3.0)
     while due - stage.time_s > 0.25 and car.station_m < station_m:
-        _hurry(car, station_m, due - stage.time_s, 2.5, top_mps)
+        _hurry(car, station_m, due - stage.time_s, 2.5)
         yield
     # drive on by IDM
     car.forced_mps2 = None
@@ -103,11 +94,9 @@ def arrive_together(
     car.behaviour = replace(car.behaviour, sees_ego=True)
 
 
-def _hurry(
-    car: Car, station_m: float, due_s: float, slowest: float, top_mps: float
-) -> None:
+def _hurry(car: Car, station_m: float, due_s: float, slowest: float) -> None:
     wanted = (station_m - car.station_m) / max(due_s, 0.2)
-    wanted = min(max(wanted, slowest), top_mps)
+    wanted = min(max(wanted, slowest), TOP_MPS)
     car.forced_mps2 = min(max((wanted - car.speed) / 0.4, -6.0), 5.0)
 
 

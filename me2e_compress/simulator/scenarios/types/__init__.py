@@ -1,1 +1,0 @@
-"""The 44 types, a file for each of Bench2Drive's abilities."""

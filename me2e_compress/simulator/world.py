@@ -1,0 +1,231 @@
+"""One route, stepped frame by frame."""
+
+import math
+from enum import StrEnum
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.simulator.plane_geometry import Roadmap, RoutePath
+from me2e_compress.simulator.privileged import (
+    Privileged,
+    intent_of,
+    phase_of,
+)
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scenarios.builders import Builder, stage_of
+from me2e_compress.simulator.scene import Actor, Control, Event, EventKind, Scene
+from me2e_compress.simulator.traffic.bodies import StaticObject, Walker
+from me2e_compress.simulator.traffic.cars import Car
+from me2e_compress.simulator.traffic.traffic_road import TrafficRoad
+
+DT_US = 50_000
+"""20 Hz, as Bench2Drive."""
+DECISION_US = 100_000
+"""Actors decide at 10 Hz whatever the frame rate; they move at the frame rate."""
+TOLERANCE_M = 0.5
+"""The ego's centre may be this far outside every lane (OutsideRouteLanesTest)."""
+STANDING_MPS = 0.1
+"""Contact with an ego slower than this is no collision of the ego's, and the route
+goes on: CollisionTest in Bench2Drive's atomic_criteria.py."""
+
+
+class EndReason(StrEnum):
+    """Why the world ended by itself; a runner may stop earlier for other reasons."""
+
+    GOAL = "goal"
+    COLLISION = "collision"
+
+
+class World:
+    """A route of highway-env's roads and vehicles, driven by `Control`.
+
+    The same route gives the same bytes, whatever ran before in the process: every
+    random number comes from the route's seed and no class attribute is written.
+
+    Args:
+        route: What to stage.
+        dt_us: Frame length in microseconds. A finer one takes controls more often;
+            actors still decide every 0.1 s.
+        builder: Sets the stage instead of the registered scenario type: for new types.
+
+    Attributes:
+        path: The ego's route.
+        roadmap: All lanes, stop lines and crosswalks.
+        parameters: Every parameter of the scenario with its value.
+        outside_m: Metres between the ego's centre and the nearest lane, 0 inside.
+        outside_distance_m: Metres driven while that exceeded `TOLERANCE_M`.
+        reason: Why the world has ended; None before that.
+    """
+
+    def __init__(
+        self, route: Route, *, dt_us: int = DT_US, builder: Builder | None = None
+    ) -> None:
+        if not 0 < dt_us <= DECISION_US:
+            raise EvaluationError(
+                f"frame of {dt_us} us: it must be between 1 and {DECISION_US}"
+            )
+        self.route, self.dt_us = route, dt_us
+        # the scenario sets the stage
+        self._stage = stage = stage_of(route, builder)
+        self.path: RoutePath = stage.path
+        self.parameters = dict(stage.parameters)
+        self.roadmap: Roadmap = stage.network.roadmap(
+            tuple(signal.snapshot().stop_line for signal in stage.regulators),
+            tuple(stage.crosswalks),
+        )
+        # traffic, and the state of the checks
+        self._road = TrafficRoad(stage.network)
+        self._road.vehicles = [stage.ego]
+        self.outside_m, self.outside_distance_m = 0.0, 0.0
+        self.lateral_m, self._furthest_m = 0.0, 0.0
+        self._was_outside = False
+        self._met = set[tuple[int, int]]()
+        self._next_decision_us = 0
+        self.reason: EndReason | None = None
+        self._take_stage()
+        self._road.refresh()
+
+    @property
+    def time_us(self) -> int:
+        """Simulated time since the start."""
+        return self._stage.time_us
+
+    @property
+    def done(self) -> bool:
+        """Whether the world has ended by itself."""
+        return self.reason is not None
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """All events so far, in order."""
+        return tuple(self._stage.events)
+
+    @property
+    def ego_s(self) -> float:
+        """Arc length of the ego's projection on its route."""
+        return self._stage.ego_s
+
+    @property
+    def progress_m(self) -> float:
+        """The largest arc length reached, at most the goal's."""
+        return min(self._furthest_m, self.path.goal_m)
+
+    def scene(self) -> Scene:
+        """Return a frozen snapshot, right-handed."""
+        bodies = [*self._stage.bodies, *self._stage.static_objects]
+        return Scene(
+            self.time_us,
+            self._stage.ego.snapshot(),
+            tuple(_actor(body) for body in bodies),
+            tuple(signal.snapshot() for signal in self._stage.regulators),
+        )
+
+    def privileged(self) -> Privileged:
+        """Return what only a privileged policy may see: intents and signal phases."""
+        phases = (phase_of(regulator) for regulator in self._stage.regulators)
+        return Privileged(
+            tuple(intent_of(body) for body in self._stage.bodies),
+            tuple(phase for phase in phases if phase is not None),
+        )
+
+    def step(self, control: Control) -> None:
+        """Advance by one frame.
+
+        Raises:
+            EvaluationError: The control is not finite, or the world has ended.
+        """
+        wanted = (control.acceleration_mps2, control.steering_rad)
+        if not all(math.isfinite(value) for value in wanted):
+            raise EvaluationError(f"route {self.route.id}: {control} is not finite")
+        if self.done:
+            raise EvaluationError(f"route {self.route.id} has ended: {self.reason}")
+        stage = self._stage
+        stage.ego.wanted = control
+        # every 0.1 s: scripts act, then cars decide on the same positions
+        if stage.time_us >= self._next_decision_us:
+            self._next_decision_us += DECISION_US
+            stage.scripts = [s for s in stage.scripts if next(s, stage) is not stage]
+            self._take_stage()
+            self._road.act()
+        # every frame: bodies move, then the rules are checked
+        self._road.step(self.dt_us / 1e6)
+        stage.time_us += self.dt_us
+        self._follow_route()
+        self._check_lanes()
+        self._check_signals()
+        self._check_collisions()
+        if not self.done and self._furthest_m >= self.path.goal_m:
+            self._reach_goal()
+
+    def _take_stage(self) -> None:
+        """Take over the bodies that scripts added and removed; drop cars that left."""
+        stage = self._stage
+        stage.bodies = [
+            body for body in stage.bodies if not (isinstance(body, Car) and body.gone)
+        ]
+        self._road.vehicles = [stage.ego, *stage.bodies]
+        self._road.objects = list(stage.static_objects)
+        for body in stage.bodies:
+            body.road = self._road
+
+    def _follow_route(self) -> None:
+        stage, pose = self._stage, self._stage.ego.pose
+        stage.ego_s, self.lateral_m = self.path.project(pose.x, pose.y, stage.ego_s)
+        self._furthest_m = max(self._furthest_m, stage.ego_s)
+
+    def _check_lanes(self) -> None:
+        stage, pose = self._stage, self._stage.ego.pose
+        self.outside_m = self.roadmap.outside_m(pose.x, pose.y)
+        outside = self.outside_m > TOLERANCE_M
+        if outside:
+            self.outside_distance_m += stage.ego.speed * self.dt_us / 1e6
+            if not self._was_outside:
+                words = f"{self.outside_m:.2f} m outside every lane"
+                stage.events.append(stage.event(EventKind.OUTSIDE_LANES, words))
+        self._was_outside = outside
+
+    def _check_signals(self) -> None:
+        stage, half = self._stage, self._stage.ego.LENGTH / 2
+        for regulator in stage.regulators:
+            front, tail = stage.ego_s + half, stage.ego_s - half
+            kind = regulator.check(front, tail, stage.ego.speed)
+            if kind is not None:
+                stage.events.append(stage.event(kind, f"signal {regulator.id}"))
+
+    def _check_collisions(self) -> None:
+        for a, b in self._road.touching():
+            if (a.id, b.id) in self._met:
+                continue
+            self._met.add((a.id, b.id))
+            if a.id == 0 and a.speed < STANDING_MPS:
+                event = self._stage.event(EventKind.STRUCK, "the standing ego", b)
+            elif a.id == 0:
+                event = self._stage.event(EventKind.COLLISION, "the ego", b)
+                self.reason = EndReason.COLLISION
+            else:
+                words = f"actor {a.id}"
+                event = self._stage.event(EventKind.ACTOR_COLLISION, words, b)
+            self._stage.events.append(event)
+
+    def _reach_goal(self) -> None:
+        self.reason = EndReason.GOAL
+        for judge in self._stage.at_goal:
+            event = judge()
+            if event is not None:
+                self._stage.events.append(event)
+
+
+def _actor(body: Car | Walker | StaticObject) -> Actor:
+    x, y = body.position
+    return Actor(
+        body.id,
+        body.kind,
+        float(x),
+        -float(y),
+        -float(body.heading),
+        float(body.speed),
+        float(body.LENGTH),
+        float(body.WIDTH),
+        float(body.height),
+        bool(body.braking),
+        body.indicator,
+    )

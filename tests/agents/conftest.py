@@ -1,8 +1,0 @@
-import pytest
-
-from tests.agents.small_leaderboard import Leaderboard, installed
-
-
-@pytest.fixture
-def board(monkeypatch: pytest.MonkeyPatch) -> Leaderboard:
-    return installed(monkeypatch)
