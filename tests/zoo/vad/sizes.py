@@ -4,10 +4,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from me2e_compress.zoo.bev.sizes import BevGrid, Sampling
+from me2e_compress.zoo.drawing import rendered
 from me2e_compress.zoo.export import GRID_SAMPLE_OPSET, build, export, save, trace
 from me2e_compress.zoo.stacks import VAD_TINY, Stack
 from me2e_compress.zoo.vad.config import PUBLISHED, RANGE, VadConfig
-from me2e_compress.zoo.vad.initialise import initialise, rendered
+from me2e_compress.zoo.vad.initialise import initialise
 from me2e_compress.zoo.vad.stack import VadTiny
 
 
@@ -28,7 +29,8 @@ class VadSize:
     def build(self, sampling: Sampling = "operator") -> VadTiny:
         """Build and initialise it, seed 0, nuScenes heads."""
         model = VadTiny("nuscenes", sampling, self.config)
-        initialise(model.requires_grad_(False).eval(), rendered(self.stack, 0), 0)
+        images = rendered(self.stack, seed=0, stride=1)
+        initialise(model.requires_grad_(False).eval(), images, seed=0)
         return model
 
     def export(self, path: Path, *, opset: int = 17, fused: bool = False) -> Path:
