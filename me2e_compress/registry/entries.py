@@ -22,11 +22,8 @@ _OPTION = re.compile(r"^    (\w+): ((?:.|\n(?=      ))+)", re.MULTILINE)
 class Option:
     """One option of an entry.
 
-    Attributes:
-        name: of the field.
-        type: as it is written in Python.
-        default: as it is written in text; None where it must be given.
-        doc: what the docstring says of it; empty where it says nothing.
+    ``type`` is as it is written in Python, ``default`` as it is written in text, None
+    where it must be given; ``doc`` is what the docstring says of it.
     """
 
     name: str
@@ -39,13 +36,9 @@ class Option:
 class Entry:
     """One name of a registry.
 
-    Attributes:
-        name: what recipes and the command line call it.
-        source: the package that brings it, with its version; of a name that several
-            packages claim, all of them.
-        doc: first line of its docstring.
-        options: in the order of its fields.
-        error: why it cannot be used; empty if it can.
+    ``source`` is the package that brings it, with its version, or all packages that
+    claim the name; ``doc`` the first line of its docstring; ``error`` why it cannot be
+    used, empty if it can.
     """
 
     name: str
@@ -58,11 +51,6 @@ class Entry:
 def describe(registry: Registry[T]) -> tuple[Entry, ...]:
     """Describe every entry of a registry; what cannot be used says why."""
     return tuple(_entry(registry, name) for name in registry.names())
-
-
-def _first_line(cls: type) -> str:
-    """Return the first line of a docstring, empty without one."""
-    return (inspect.getdoc(cls) or "").partition("\n")[0]
 
 
 def options_of(cls: type) -> tuple[Option, ...]:
@@ -107,4 +95,5 @@ def _entry(registry: Registry[T], name: str) -> Entry:
         cls = registry.get(name)
     except Me2eError as error:
         return Entry(name, source, error=str(error))
-    return Entry(name, source, _first_line(cls), options_of(cls))
+    first_line = (inspect.getdoc(cls) or "").partition("\n")[0]
+    return Entry(name, source, first_line, options_of(cls))

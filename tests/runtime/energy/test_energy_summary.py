@@ -2,7 +2,7 @@
 
 import pytest
 
-from me2e_compress.runtime.energy.energy_summary import CountedBy, summarise
+from me2e_compress.runtime.energy.energy_result import CountedBy, summarise
 from me2e_compress.runtime.energy.estimate import Window
 from me2e_compress.runtime.energy.reader import DeviceState
 
