@@ -2,8 +2,9 @@
 
 from typing import TYPE_CHECKING, Any, cast
 
-from me2e_compress.zoo.stacks import TCP, UNIADS, Stack
+from me2e_compress.zoo.stacks import TCP, Stack
 from me2e_compress.zoo.synthetic_frames import frames
+from me2e_compress.zoo.uniad.config import CONFIGS
 
 if TYPE_CHECKING:
     from torch import nn
@@ -26,8 +27,7 @@ def construct(
 
         (heads,) = spec.heads
         model = Tcp(cast("ActionHeads", heads))
-    elif spec.name in UNIADS:
-        from me2e_compress.zoo.uniad.config import CONFIGS
+    elif spec.name in CONFIGS:
         from me2e_compress.zoo.uniad.stack import UniadTiny
 
         model = UniadTiny(CONFIGS[spec.name], sampling, trained=trained)
@@ -47,17 +47,17 @@ def draw(spec: Stack, sampling: "Sampling", seed: int) -> "nn.Module":
 
     model: Any = construct(spec, sampling, trained=False)  # one of three classes
     if spec.name == TCP.name:
-        from me2e_compress.zoo.tcp import initialise as tcp
+        from me2e_compress.zoo.tcp import stack as tcp
 
         tcp.initialise(model, rendered(spec, seed), seed)
-    elif spec.name in UNIADS:
+    elif spec.name in CONFIGS:
         from me2e_compress.zoo.uniad import initialise as uniad
 
         (frame,) = frames(spec, 1, seed)
         images, cameras = (torch.from_numpy(frame[n]) for n in ("img", "lidar2img"))
         uniad.initialise(model, images[0], cameras, seed)
     else:
-        from me2e_compress.zoo.vad import initialise as vad
+        from me2e_compress.zoo.vad import stack as vad
 
         vad.initialise(model, rendered(spec, seed), seed)
     drawn: nn.Module = model

@@ -1,6 +1,12 @@
-"""Draw weights from a seed, so that no two tensors are equal and none is constant.
+"""Draw weights from a seed so that the untrained network reacts to its input.
 
-An exporter merges equal tensors, and trained ones are never equal.
+A network drawn at random loses its input on the way: activations of different images
+share a large common part, averages over hundreds of keys cancel, and the plan hardly
+changes with a camera. So the statistics of backbone and neck are taken from rendered
+frames, residual branches that carry information are stronger than their shortcuts, and
+the weights of a linear layer sum to zero, which cancels the common part that a ReLU
+leaves. No two tensors are equal and none is constant, as in a trained model: an
+exporter merges equal ones.
 """
 
 import math

@@ -8,7 +8,6 @@ from me2e_compress.zoo.export import example
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.vad.stack import VadTiny
 from tests.zoo.truth import count_macs
-from tests.zoo.vad.sizes import SIZES, VadSize
 
 pytestmark = pytest.mark.xdist_group("vad")
 
@@ -30,13 +29,6 @@ def published() -> VadTiny:
     """The module at its published size; it holds no numbers."""
     with torch.device("meta"):
         return VadTiny()
-
-
-@pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
-def test_the_interface_has_the_sizes_of_the_configuration(size: VadSize) -> None:
-    inputs, config = size.stack.inputs, size.config
-    assert inputs["img"] == (1, 6, 3, *config.image_hw)
-    assert inputs["prev_bev"] == (config.grid.cells, 1, 256)
 
 
 def test_outputs_have_the_published_shapes(published: VadTiny) -> None:

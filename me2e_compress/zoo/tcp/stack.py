@@ -6,8 +6,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from me2e_compress.zoo.drawing import Gains, draw_weights, one_thread, take_statistics
 from me2e_compress.zoo.regions import region
-from me2e_compress.zoo.resnet import BLOCKS, BasicBlock, ResNet
+from me2e_compress.zoo.resnet import ResNet
 from me2e_compress.zoo.tcp.config import (
     ACTION_SIZE,
     DISTRIBUTIONS,
@@ -18,12 +19,20 @@ from me2e_compress.zoo.tcp.config import (
 
 PUBLISHED = TcpConfig()
 
+GAINS = Gains(
+    by_name=(
+        (r"weight_(ih|hh)|action_head|dist_", 1.0),
+        (r"output_traj", 1.0),
+    ),
+    last_norm=r"layer\d\.\d\.bn2\.weight$",
+)
+
 
 class ImageTrunk(ResNet):
     """ResNet-34 with its classifier: maps the strip to a vector and a feature map."""
 
     def __init__(self, config: TcpConfig) -> None:
-        super().__init__(BasicBlock, BLOCKS, config.stem)
+        super().__init__(config.stem, bottleneck=False)
         self.fc = nn.Linear(self.channels[-1], config.classes)
 
     def forward(self, img: Tensor) -> tuple[Tensor, Tensor]:
@@ -204,3 +213,10 @@ class Tcp(nn.Module):
             return out
         parameters = [self.get_submodule(n)(policy) for n in ("dist_mu", "dist_sigma")]
         return torch.cat(parameters, -1)
+
+
+def initialise(model: Tcp, images: Tensor, seed: int) -> None:
+    """Draw parameters, then statistics of images [N, 3, H, W], normalised, in place."""
+    draw_weights(model, GAINS, seed)
+    with one_thread():
+        take_statistics(model.perception, images)

@@ -62,8 +62,8 @@ class MotionFormer(nn.Module):
     def __init__(self, config: UniadConfig, sampling: Sampling) -> None:
         super().__init__()
         self.intention_interaction_layers = Wrapped(cross=False)
-        self.track_agent_interaction_layers = _repeat(Wrapped)
-        self.map_interaction_layers = _repeat(Wrapped)
+        self.track_agent_interaction_layers = _readers()
+        self.map_interaction_layers = _readers()
         self.bev_interaction_layers = nn.ModuleList(
             AttentionLayer(GoalAttention(config.grid, config.head_hw, sampling))
             for _ in range(LAYERS)
@@ -102,16 +102,16 @@ class MotionFormer(nn.Module):
             asked, track + track_pos, empty
         )
         aware = self.map_interaction_layers[layer](asked, lanes)
-        asked, places, ways = (x.flatten(0, 1).unsqueeze(0) for x in (query, pos, at))
-        goal = self.bev_interaction_layers[layer](asked, (places, bev, ways))
+        modes, places, ways = (x.flatten(0, 1).unsqueeze(0) for x in (query, pos, at))
+        goal = self.bev_interaction_layers[layer](modes, (places, bev, ways))
         own = track[0][:, None].expand_as(query) + pos
         parts = [social, aware, goal[0].view_as(query), own]
         out: Tensor = self.out_query_fuser(torch.cat(parts, -1))
         return out
 
 
-def _repeat(layer: type[Wrapped]) -> nn.ModuleList:
-    return nn.ModuleList(layer(cross=True) for _ in range(LAYERS))
+def _readers() -> nn.ModuleList:
+    return nn.ModuleList(Wrapped(cross=True) for _ in range(LAYERS))
 
 
 class Agents(NamedTuple):

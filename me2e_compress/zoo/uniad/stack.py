@@ -10,7 +10,7 @@ from me2e_compress.zoo.bev.neck import FeaturePyramid
 from me2e_compress.zoo.bev.sizes import EMBED, Sampling
 from me2e_compress.zoo.bev.transformer import Motions
 from me2e_compress.zoo.regions import region
-from me2e_compress.zoo.resnet import BLOCKS, Bottleneck, ResNet
+from me2e_compress.zoo.resnet import ResNet
 from me2e_compress.zoo.uniad.config import PUBLISHED, UniadConfig
 from me2e_compress.zoo.uniad.map import MapHead
 from me2e_compress.zoo.uniad.motion import Agents, MotionHead
@@ -33,7 +33,7 @@ class CameraTrunk(ResNet):
     """ResNet-50 up to the feature maps that the neck reads."""
 
     def __init__(self, stem: int, stages: tuple[int, ...]) -> None:
-        super().__init__(Bottleneck, BLOCKS, stem)
+        super().__init__(stem, bottleneck=True)
         self.chosen = stages
         self.read = [self.channels[stage] for stage in stages]
 

@@ -6,8 +6,7 @@ import torch
 
 from me2e_compress.zoo.stacks import TCP, Stack
 from me2e_compress.zoo.tcp.config import ActionHeads, TcpConfig
-from me2e_compress.zoo.tcp.initialise import initialise
-from me2e_compress.zoo.tcp.stack import Tcp
+from me2e_compress.zoo.tcp.stack import Tcp, initialise
 
 SMALL = TcpConfig(
     image_hw=(64, 96), stem=8, classes=20, measured=8, joint=24, hidden=16
