@@ -26,7 +26,7 @@ class Channel:
 
     def watts(self) -> float:
         """Return the present power; OSError or ValueError if a file has no number."""
-        volts, amperes = self.millivolts.readtext_in(), self.milliamperes.readtext_in()
+        volts, amperes = self.millivolts.read_text(), self.milliamperes.read_text()
         return int(volts) * int(amperes) / 1e6
 
 
