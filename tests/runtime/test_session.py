@@ -1,3 +1,4 @@
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ def ones(index: int, starts: bool) -> Frame:
 
 
 def sums(
-    counter: ir.Model, frames: list[Frame], state: dict[str, Array] | None = None
+    counter: ir.Model, frames: list[Frame], state: Mapping[str, Array] | None = None
 ) -> list[float]:
     replayed = replay(Session(counter), frames, state=state)
     return [float(values["y"].item(0)) for values in replayed]

@@ -60,8 +60,10 @@ DIGESTS = {
 """Number and SHA-256 of the tensors that driving reads, by the first of their names."""
 
 SCORERS = ("speed_branch", "value_branch_traj", "value_branch_ctrl")
-LAYERS = dict.fromkeys(SCORERS, (0, 2, 5))
-LAYERS |= dict.fromkeys(("feature_branch_traj", "feature_branch_ctrl"), (0,))
+LAYERS: dict[str, tuple[int, ...]] = {
+    **dict.fromkeys(SCORERS, (0, 2, 5)),
+    **dict.fromkeys(("feature_branch_traj", "feature_branch_ctrl"), (0,)),
+}
 TRAINING = {
     "tcp": [
         f"{branch}.{layer}.{kind}"

@@ -35,6 +35,10 @@ def in_metres(raw: Tensor, at: Tensor, grid: BevGrid) -> Tensor:
     return torch.cat([x, y, raw[..., 2:4], z, raw[..., 5:]], -1)
 
 
+Decoded = tuple[list[Tensor], list[Tensor], list[Tensor]]
+"""What a `Decoder` returns for its layers: queries, raw regressions, references."""
+
+
 class Decoder(nn.Module):
     """Self-attention and attention to the BEV in layers, and a branch for each.
 
@@ -66,7 +70,7 @@ class Decoder(nn.Module):
         reference: Tensor,
         branches: nn.ModuleList,
         ignore: Tensor | None = None,
-    ) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+    ) -> Decoded:
         """Decode queries [1, Q, 256] with references [1, Q, 2 or 3], 0..1.
 
         Columns 0 and 1 of a layer's branch, and 4 with heights, move the reference.
@@ -88,6 +92,19 @@ class Decoder(nn.Module):
             regressions.append(raw)
             references.append(reference)
         return queries, regressions, references
+
+
+def detections(
+    decoded: Decoded, branches: nn.ModuleList, grid: BevGrid
+) -> tuple[Tensor, Tensor]:
+    """Return the scores of all layers, [layers, 1, Q, classes], and boxes in metres."""
+    queries, regressions, references = decoded
+    scores = [branch(query) for branch, query in zip(branches, queries, strict=True)]
+    boxes = [
+        in_metres(raw, at, grid)
+        for raw, at in zip(regressions, references, strict=True)
+    ]
+    return torch.stack(scores), torch.stack(boxes)
 
 
 class Interaction(nn.Module):

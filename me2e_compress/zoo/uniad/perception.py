@@ -6,8 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from me2e_compress.zoo.bev.decoder import (
+    Decoded,
     Decoder,
-    in_metres,
+    detections,
     inverse_sigmoid,
     precise_sigmoid,
 )
@@ -56,7 +57,7 @@ class TrackTransformer(BevTransformer):
         motions: Motions,
         queries: Queries,
         branches: nn.ModuleList,
-    ) -> tuple[Tensor, tuple[list[Tensor], ...]]:
+    ) -> tuple[Tensor, Decoded]:
         """Encode levels [cameras, 256, h, w], then decode the track queries.
 
         ``cells`` are BEV queries and their positions, [1, cells, 256] each.
@@ -102,20 +103,7 @@ class TrackHead(nn.Module):
         )
         # Apply the branches
         with region("track"):
-            states, raw, at = decoded
-            scores = [
-                branch(state)
-                for branch, state in zip(self.cls_branches, states, strict=True)
-            ]
-            boxes = [
-                in_metres(each, place, self.grid)
-                for each, place in zip(raw, at, strict=True)
-            ]
-            return Found(
-                bev,
-                pos,
-                torch.stack(scores),
-                torch.stack(boxes),
-                states[-1][0],
-                inverse_sigmoid(at[-1][0]),
-            )
+            scores, boxes = detections(decoded, self.cls_branches, self.grid)
+            states, _, at = decoded
+            state, reference = states[-1][0], inverse_sigmoid(at[-1][0])
+            return Found(bev, pos, scores, boxes, state, reference)

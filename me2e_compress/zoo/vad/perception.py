@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.bev.decoder import Decoder, in_metres
+from me2e_compress.zoo.bev.decoder import Decoded, Decoder, detections
 from me2e_compress.zoo.bev.encoder import GridPosition
 from me2e_compress.zoo.bev.layers import classifier, mlp
 from me2e_compress.zoo.bev.sizes import BOX_CODE, EMBED, Sampling
@@ -52,7 +52,7 @@ class PerceptionTransformer(BevTransformer):
         points: Tensor,
         branches: tuple[nn.ModuleList, nn.ModuleList],
         motions: Motions,
-    ) -> tuple[Tensor, tuple[list[Tensor], ...], tuple[list[Tensor], ...]]:
+    ) -> tuple[Tensor, Decoded, Decoded]:
         """Encode features [cameras, 256, h, w] and decode agents and map points.
 
         ``cells`` are BEV queries and their positions, [1, cells, 256] each; ``agents``
@@ -116,28 +116,18 @@ class PerceptionHead(nn.Module):
             motions,
         )
         with region("det"):
-            agents = self._agents(*found)
+            agents = self._agents(found)
         with region("map"):
-            vectors = self._map(*mapped)
+            vectors = self._map(mapped)
         return bev, agents, vectors
 
-    def _agents(
-        self, queries: list[Tensor], raw: list[Tensor], at: list[Tensor]
-    ) -> AgentOutputs:
-        scores = [
-            branch(query)
-            for branch, query in zip(self.cls_branches, queries, strict=True)
-        ]
-        boxes = [
-            in_metres(r, a, self.config.grid) for r, a in zip(raw, at, strict=True)
-        ]
-        return AgentOutputs(
-            torch.stack(scores), torch.stack(boxes), queries[-1], at[-1][..., :2]
-        )
+    def _agents(self, decoded: Decoded) -> AgentOutputs:
+        scores, boxes = detections(decoded, self.cls_branches, self.config.grid)
+        queries, _, at = decoded
+        return AgentOutputs(scores, boxes, queries[-1], at[-1][..., :2])
 
-    def _map(
-        self, queries: list[Tensor], _raw: list[Tensor], at: list[Tensor]
-    ) -> MapOutputs:
+    def _map(self, decoded: Decoded) -> MapOutputs:
+        queries, _, at = decoded
         shape = 1, self.config.vectors, self.config.vector_points
         grouped = [q.view(*shape, EMBED) for q in queries]
         scores = [
