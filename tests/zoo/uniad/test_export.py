@@ -158,4 +158,6 @@ def test_a_plugin_says_what_standard_operators_say(
 def test_every_previous_value_is_fed_back(stack: Stack) -> None:
     said = json.loads(stack.metadata()["me2e.recurrent"])
     assert set(said) == {name for name in stack.inputs if name.startswith("prev_")}
+    named = {name: f"next_{name.removeprefix('prev_')}" for name in said}
+    assert said == named | {"prev_bev": "bev_embed"}
     assert set(said.values()) <= set(stack.outputs)
