@@ -30,12 +30,9 @@ def printable(text: str) -> str:
 
 @dataclass(frozen=True)
 class Cell:
-    """A number as it is shown.
+    """A number or words as shown, and its interval, if any, in smaller type.
 
-    Attributes:
-        text: The number, or words.
-        detail: Its interval, in smaller type; empty if it has none.
-        reason: Why there is no number; empty if there is one.
+    ``reason`` is why there is no number; empty if there is one.
     """
 
     text: str
@@ -171,8 +168,7 @@ def reason(error: BaseException) -> str:
 def not_measured(reasons: Mapping[str, str]) -> str:
     """Write why things have no number, for the note of their table; empty if all have.
 
-    Args:
-        reasons: by the name of the row.
+    ``reasons`` are by the name of the row.
     """
     rows = {why: list[str]() for why in reasons.values()}
     for name, why in reasons.items():
@@ -189,10 +185,7 @@ def megabytes(count: float) -> str:
 def giga(macs: int | None, unknown: int | None = 0, form: str = ".2f") -> str:
     """Write MACs in billions, as a lower bound where those of some nodes are unknown.
 
-    Args:
-        macs: those that are known; None if none are.
-        unknown: of how many nodes they are not known.
-        form: of the number.
+    ``macs`` is None if none are known.
     """
     if macs is None:
         return "-"

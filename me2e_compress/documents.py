@@ -65,27 +65,18 @@ def reading(
 
 
 def check_regular(path: Path) -> None:
-    """Refuse what may never end as it is read.
-
-    Raises:
-        OSError: it is not there.
-        MalformedError: it is a folder, a device or a pipe.
-    """
+    """Refuse a folder, a device or a pipe, which may never end as it is read."""
     if not stat.S_ISREG(path.stat().st_mode):
         what = "it is a folder, " if path.is_dir() else ""
         raise MalformedError(f"{what}not a regular file")
 
 
 def content(path: Path, most: int = LARGEST_BYTES) -> bytes:
-    """Read a text file.
-
-    Args:
-        path: the file.
-        most: bytes that it may have.
+    """Read a text file of at most so many bytes.
 
     Raises:
         OSError: it is not there, or may not be read.
-        MalformedError: it is a folder, a device or a pipe, or too large.
+        MalformedError: it is not a regular file, or too large.
     """
     check_regular(path)
     _check_size(path.stat().st_size, most)
@@ -93,15 +84,10 @@ def content(path: Path, most: int = LARGEST_BYTES) -> bytes:
 
 
 def from_json(text: bytes | str, *, finite: bool = True) -> Any:
-    """Read a JSON document.
+    """Read a JSON document; anything else is a MalformedError.
 
-    Args:
-        text: the document.
-        finite: whether to refuse NaN and infinities, which Python's own writer writes;
-            else the reader must look at its numbers.
-
-    Raises:
-        MalformedError: it is none.
+    So are NaN and infinities, which Python's own writer writes, unless ``finite`` is
+    False; the caller must then look at the numbers.
     """
     try:
         found = (_DECODER if finite else _ANY_NUMBER).decode(_decoded(text))
@@ -114,11 +100,7 @@ def from_json(text: bytes | str, *, finite: bool = True) -> Any:
 
 
 def from_toml(text: bytes | str) -> dict[str, Any]:
-    """Read a TOML document.
-
-    Raises:
-        MalformedError: it is none.
-    """
+    """Read a TOML document; anything else is a MalformedError."""
     try:
         _check_size(len(text), LARGEST_TOML_BYTES)
         decoded = _decoded(text)

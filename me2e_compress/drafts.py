@@ -12,14 +12,9 @@ _SETS: list[list[tuple[Path, Path]]] = []
 
 
 def put(draft: Path, path: Path) -> None:
-    """Put a draft in its place; of folders, the earlier one is removed.
+    """Put a draft in its place, which is in the same file system.
 
-    Args:
-        draft: in the file system of its place.
-        path: the place.
-
-    Raises:
-        OSError: it cannot be put there.
+    Of folders, the earlier one is removed.
     """
     if not draft.is_dir():
         _keep(path)

@@ -1,21 +1,5 @@
 """Everything this package raises on purpose.
 
-* Me2eError
-  x GraphError           a file is not a graph we can read, or lacks what we need
-  x FramesError          calibration frames are missing, wrong or not finite
-  x ModuleMapError       a module map is malformed or matches nothing
-  x RecipeError          a recipe or pipeline names an unknown pass or option
-  x PreconditionError    a pass was given a graph it cannot work on
-  x PassError            a pass broke (the cause is chained)
-  x VerificationError    the graph after a pass is not a valid successor
-  x EnergyError          a counter of energy, or a file of one, is not usable
-  x EvaluationError      a route, a policy or a results folder is not usable
-  x StudyError           a study is malformed, or names what it does not have
-  x TrainingError        a driver cannot be trained as asked
-  x MissingExtraError    an optional package is not installed
-  x BrokenPackageError   one is installed, and importing it fails
-  x MissingPackageError  one that none of our extras brings
-
 Every message says what was found, what there is, and names the culprit, on one line.
 """
 

@@ -25,22 +25,17 @@ _EXTRA_OF = {
 def missing_module(extras: str) -> str:
     """Return the first module of these extras that is not installed; empty for none.
 
-    Args:
-        extras: Names, parted by commas.
+    ``extras`` are names, separated by commas.
     """
     wanted = (module for extra in extras.split(",") for module in MODULES[extra])
     return next((module for module in wanted if util.find_spec(module) is None), "")
 
 
 def need_extra(extras: str, what: str) -> None:
-    """Go on if these extras are installed; nothing is imported to know it.
+    """Raise a MissingExtraError unless these extras are installed.
 
-    Args:
-        extras: Names, parted by commas.
-        what: What needs them, for the message.
-
-    Raises:
-        MissingExtraError: A module of them is not installed.
+    ``extras`` are names, separated by commas; ``what`` needs them, for the message.
+    Nothing is imported.
     """
     if module := missing_module(extras):
         raise MissingExtraError(f"{module}, which {what} needs,", extras)

@@ -12,10 +12,10 @@ from me2e_compress.modules import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.workflows import first_opening
 from tests import profiles
-from tests.zoo import truth
 
 if TYPE_CHECKING:
     from me2e_compress.zoo.vad.stack import VadTiny
+    from tests.zoo.truth import Truth
     from tests.zoo.vad.sizes import VadSize
 
 DRIVER = """
@@ -119,7 +119,9 @@ def vad_torch(vad_size: "VadSize") -> "VadTiny":
 
 
 @pytest.fixture(scope="session")
-def vad_truth(vad_size: "VadSize", vad_tiny: Path, vad_torch: "VadTiny") -> truth.Truth:
+def vad_truth(vad_size: "VadSize", vad_tiny: Path, vad_torch: "VadTiny") -> "Truth":
     """What its trace knew: the module of every node, and torch's own MACs."""
+    from tests.zoo.truth import truth_of
+
     plain = onnx.load(vad_tiny, load_external_data=False)
-    return truth.truth_of(vad_size.stack, vad_torch, plain=plain)
+    return truth_of(vad_size.stack, vad_torch, plain=plain)

@@ -21,7 +21,7 @@ from me2e_compress.display import (
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import ModuleMap, assign
 from me2e_compress.passes import PASSES, Context
-from me2e_compress.quantization.plan import QuantPlan, load_plan, save_plan
+from me2e_compress.quantization.plan import QuantPlan
 from me2e_compress.quantization.plan.decision import Decision
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frame
@@ -91,12 +91,6 @@ def test_a_plan_is_told_by_module_and_rule() -> None:
     assert [cell.text for cell in shown.rows[0]] == ["head", "int8", "layer", "400"]
 
 
-def test_a_plan_that_shows_itself_is_still_data(tmp_path: Path) -> None:
-    save_plan(plan(), tmp_path / "plan.json")
-
-    assert load_plan(tmp_path / "plan.json") == plan()
-
-
 @pytest.mark.parametrize(
     ("value", "form", "text"),
     [
@@ -144,12 +138,9 @@ def test_one_is_singular(count: float, text: str) -> None:
     assert counted(count, "thread") == text
 
 
-def test_who_says_something_is_named_once() -> None:
+def test_lines_say_who_and_why_once() -> None:
     assert prefixed("battery", "none here") == "battery: none here"
     assert prefixed("battery", "battery: none here") == "battery: none here"
-
-
-def test_an_error_that_says_nothing_is_told_by_its_kind() -> None:
     assert reason(EOFError()) == "EOFError"
     assert reason(ValueError("two\n lines")) == "two lines"
 

@@ -60,11 +60,6 @@ def describe(registry: Registry[T]) -> tuple[Entry, ...]:
     return tuple(_entry(registry, name) for name in registry.names())
 
 
-def _first_line(cls: type) -> str:
-    """Return the first line of a docstring, empty without one."""
-    return (inspect.getdoc(cls) or "").partition("\n")[0]
-
-
 def options_of(cls: type) -> tuple[Option, ...]:
     """Describe the options of a dataclass, in the order of its fields."""
     docs = _docs(cls)
@@ -107,4 +102,5 @@ def _entry(registry: Registry[T], name: str) -> Entry:
         cls = registry.get(name)
     except Me2eError as error:
         return Entry(name, source, error=str(error))
-    return Entry(name, source, _first_line(cls), options_of(cls))
+    first_line = (inspect.getdoc(cls) or "").partition("\n")[0]
+    return Entry(name, source, first_line, options_of(cls))

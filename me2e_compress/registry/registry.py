@@ -128,17 +128,12 @@ class Registry(Generic[T]):
     ) -> T:
         """Make an item from ``name``, ``name{option=value, ...}`` or ``name:value``.
 
-        What follows a colon is the value of the first option.
-
-        Args:
-            text: of the item.
-            cls: what to make of it, where that need not be registered; None finds the
-                class by the name.
-            more: options that the text is not to give.
+        What follows a colon is the value of the first option. ``cls`` need not be
+        registered; None finds the class by the name. The text must not give the
+        options in ``more``.
 
         Raises:
-            error: the text is not of that form or gives one of these options, or see
-                :meth:`build`.
+            error: the text is not of that form, or see :meth:`build`.
         """
         try:
             item = read_one(text)
@@ -149,11 +144,7 @@ class Registry(Generic[T]):
         return self._built(item, cls or self.get(item.name), more)
 
     def parse_all(self, text: str) -> tuple[T, ...]:
-        """Make the items that a text lists, parted by commas.
-
-        Raises:
-            error: the text is not of that form, or see :meth:`build`.
-        """
+        """Make the items that a text lists, parted by commas; see :meth:`parse`."""
         try:
             items = read_all(text)
         except TextError as error:
@@ -164,11 +155,8 @@ class Registry(Generic[T]):
         """Write an item so that :meth:`parse` makes an equal one.
 
         The single number of an item that has no other option stands behind a colon.
-        Fields that hold functions are left out: they have no text.
-
-        Args:
-            item: registered or not.
-            defaults: write options at their default too.
+        Options at their default are left out unless ``defaults``, and fields that hold
+        functions always: they have no text.
         """
         fields = [field for field in fields_of(type(item)) if field.name != "name"]
         values = {field.name: getattr(item, field.name) for field in fields}

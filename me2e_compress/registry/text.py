@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 _NAME = re.compile(r"[A-Za-z][\w.-]*", re.ASCII)
-_BEGINNING = re.compile(rf"\s*({_NAME.pattern})\s*(?=[:{{]|$)", re.ASCII)
+_BEGINNING = re.compile(rf"{_NAME.pattern}(?=[:{{]|\Z)", re.ASCII)
 _KEY = re.compile(r"\w+(?=\s*=)")
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
 _WORD = re.compile(r'[^\s\[\]{},="]+')
@@ -39,13 +39,7 @@ class TextError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class ParsedItem:
-    """A name and what a text says about it.
-
-    Attributes:
-        name: of the item.
-        options: those in braces, by name.
-        value: what stands behind a colon; None without one.
-    """
+    """A name, the options in braces behind it, and what stands behind a colon."""
 
     name: str
     options: Mapping[str, object] = dataclasses.field(default_factory=dict)
@@ -57,21 +51,14 @@ def name_in(text: str) -> str:
 
     A colon, a brace or the end of the text must follow it.
     """
-    found = _NAME.match(text.strip())
-    if found is None or text.strip()[found.end() : found.end() + 1] not in (
-        "",
-        ":",
-        "{",
-    ):
-        return ""
-    return found.group()
+    found = _BEGINNING.match(text.strip())
+    return "" if found is None else found.group()
 
 
 def read_one(text: str) -> ParsedItem:
     """Read one item; what follows its colon is taken as it stands.
 
-    Raises:
-        TextError: it is not one item.
+    Anything else is a TextError.
     """
     name, colon, value = text.strip().partition(":")
     if colon and value and name == name_in(text):
@@ -83,11 +70,7 @@ def read_one(text: str) -> ParsedItem:
 
 
 def read_all(text: str) -> tuple[ParsedItem, ...]:
-    """Read items parted by commas, at least one.
-
-    Raises:
-        TextError: it is not such a list.
-    """
+    """Read items parted by commas, at least one; anything else is a TextError."""
     reader = _Reader(text)
     items = [reader.item()]
     while reader.take(","):
@@ -99,10 +82,7 @@ def read_all(text: str) -> tuple[ParsedItem, ...]:
 def write_item(name: str, options: Mapping[str, object], *, short: bool = False) -> str:
     """Write an item so that it is read back.
 
-    Args:
-        name: of the item.
-        options: to be written, by name.
-        short: write a single number behind a colon instead of in braces.
+    ``short`` writes a single number behind a colon instead of in braces.
     """
     if not options:
         return name
@@ -119,8 +99,8 @@ def write_value(value: object) -> str:
     A dataclass is a mapping of its fields, those at their default left out, unless it
     has a text of its own.
     """
-    told = type(value).__str__ is not object.__str__
-    if dataclasses.is_dataclass(value) and not isinstance(value, type) and not told:
+    own = type(value).__str__ is not object.__str__
+    if dataclasses.is_dataclass(value) and not isinstance(value, type) and not own:
         return write_value(chosen_fields(value))
     if isinstance(value, tuple | list):
         return "[" + ", ".join(write_value(item) for item in value) + "]"

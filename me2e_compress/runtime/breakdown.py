@@ -148,30 +148,21 @@ def _divided(
     runs: Sequence[tuple[int, Sequence[NodeRun]]], places: Mapping[str, str]
 ) -> Breakdown:
     """Add up the node times of every inference by module and by operator."""
-    modules, operators = _Sums(len(runs)), _Sums(len(runs))
+    modules, operators = (
+        defaultdict[str, Any](lambda: np.zeros(len(runs), np.int64)) for _ in range(2)
+    )
     for index, (taken_us, nodes) in enumerate(runs):
         for node in nodes:
-            modules.add(places.get(node.name) or NOWHERE, index, node.taken_us)
-            operators.add(node.operator, index, node.taken_us)
+            modules[places.get(node.name) or NOWHERE][index] += node.taken_us
+            operators[node.operator][index] += node.taken_us
         # What the nodes do not account for is counted separately.
         rest = max(0, taken_us - sum(node.taken_us for node in nodes))
-        modules.add(BETWEEN, index, rest)
-        operators.add(BETWEEN, index, rest)
-    return Breakdown(modules.found(), operators.found())
+        modules[BETWEEN][index] += rest
+        operators[BETWEEN][index] += rest
+    return Breakdown(_by_cost(modules), _by_cost(operators))
 
 
-class _Sums:
-    """Sums of time by name, one for each inference."""
-
-    def __init__(self, runs: int) -> None:
-        self._sums = defaultdict[str, Any](lambda: np.zeros(runs, np.int64))
-
-    def add(self, name: str, run: int, taken_us: int) -> None:
-        self._sums[name][run] += taken_us
-
-    def found(self) -> Microseconds:
-        """Return the sums, the largest first and :data:`BETWEEN` last."""
-        order = sorted(
-            self._sums.items(), key=lambda item: (item[0] == BETWEEN, -item[1].sum())
-        )
-        return {name: tuple(map(int, sums.tolist())) for name, sums in order}
+def _by_cost(sums: Mapping[str, Any]) -> Microseconds:
+    """Return sums by name, the largest first and :data:`BETWEEN` last."""
+    order = sorted(sums.items(), key=lambda item: (item[0] == BETWEEN, -item[1].sum()))
+    return {name: tuple(each.tolist()) for name, each in order}

@@ -33,16 +33,16 @@ def sheltered() -> Iterator[None]:
     ``pickle`` or ``numpy``. A terminal sends Ctrl-C to all processes at once: only the
     parent should receive it, and it ends the others.
     """
-    with _STARTING, _told("PYTHONSAFEPATH", "1"):
+    with _STARTING, _with_environment("PYTHONSAFEPATH", "1"):
         if os.name == "posix":
-            with _told("PYTHONWARNINGS", _TRACKER_IS_SILENT):
+            with _with_environment("PYTHONWARNINGS", _TRACKER_IS_SILENT):
                 resource_tracker.ensure_running()  # else a lock starts it unsheltered
-        with _deaf_to_interrupts():
+        with _interrupts_blocked():
             yield
 
 
 @contextlib.contextmanager
-def _told(name: str, value: str) -> Iterator[None]:
+def _with_environment(name: str, value: str) -> Iterator[None]:
     """Set an environment variable for processes that start in this block."""
     before = os.environ.get(name)
     os.environ[name] = value
@@ -56,7 +56,7 @@ def _told(name: str, value: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
+def _interrupts_blocked() -> Iterator[None]:
     """Block Ctrl-C in this thread; processes that it starts inherit the mask."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -135,20 +135,20 @@ def run_script(
         subprocess.TimeoutExpired: it took longer than ``timeout_s`` and was killed.
     """
     command = [sys.executable, "-P", __file__, str(script), *words]
-    ear, mouth = os.pipe()  # nothing is ever said: it ends when this process does
+    read_end, write_end = os.pipe()  # nothing is written: it closes with this process
     try:
         return subprocess.run(
             command,
             check=False,
-            stdin=ear,
+            stdin=read_end,
             capture_output=True,
             text=True,
             errors="replace",
             timeout=timeout_s,
         )
     finally:
-        os.close(ear)
-        os.close(mouth)
+        os.close(read_end)
+        os.close(write_end)
 
 
 def main() -> None:

@@ -10,7 +10,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated
@@ -69,7 +69,7 @@ def read_imports(paths: Sequence[Path]) -> Imported:
     # A profile alone gives one latency, the sum of its layers.
     if found.layers_us:
         whole = sum(taken for (taken,) in found.layers_us.values())
-        return _with(found, samples_us=(whole,))
+        return replace(found, samples_us=(whole,))
     names = ", ".join(map(str, paths))
     raise EvaluationError(f"{names}: no latency in it: give the times of trtexec, too")
 
@@ -154,10 +154,4 @@ def _joined(one: Imported, other: Imported, path: Path) -> Imported:
         one.rails_w or other.rails_w,
         one.machine or other.machine,
         (*one.sources, *other.sources),
-    )
-
-
-def _with(found: Imported, samples_us: tuple[int, ...]) -> Imported:
-    return Imported(
-        samples_us, found.layers_us, found.rails_w, found.machine, found.sources
     )

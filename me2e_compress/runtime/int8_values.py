@@ -11,7 +11,8 @@ import math
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, is_standard, producer_of
+from me2e_compress.graph import array_of, producer_of
+from me2e_compress.graph.nodes import maker
 from me2e_compress.graph.shapes import open_shape
 from me2e_compress.operators import FusedCall
 
@@ -42,7 +43,7 @@ def read_int8(node: ir.Node, opset: int, names: set[str] | None) -> None:
     # Look through reshapes for the integers.
     channels = _channels(value)
     reshapes: list[ir.Node] = []
-    while (made := _maker(value, "Reshape")) and made.inputs[0] is not None:
+    while (made := maker(value, "Reshape")) and made.inputs[0] is not None:
         reshapes.append(made)
         value = made.inputs[0]
     stored = _stored(value, channels)
@@ -53,7 +54,8 @@ def read_int8(node: ir.Node, opset: int, names: set[str] | None) -> None:
     call = FusedCall(node, opset=opset, by="session", names=names)
     rows = stored.value
     for each in reversed(reshapes):
-        rows = call.add("Reshape", [rows, each.inputs[1]], dict(_options(each)))
+        options = {name: held.as_int() for name, held in each.attributes.items()}
+        rows = call.add("Reshape", [rows, each.inputs[1]], options)
     zero = stored.zero or call.constant(np.zeros(1, kind.numpy()), "zero")
     # Switch the call to the int8 kernel.
     before, count = node.inputs[0], len(node.inputs)
@@ -69,7 +71,7 @@ def _stored(value: ir.Value | None, channels: int | None) -> _Stored | None:
 
     ``channels`` is the length of a row's last axis; None if unknown.
     """
-    if node := _maker(value, "DequantizeLinear"):
+    if node := maker(value, "DequantizeLinear"):
         source, scale, *rest = node.inputs
         zero = rest[0] if rest else None
         if source is None or scale is None or source.shape is None:
@@ -85,19 +87,13 @@ def _stored(value: ir.Value | None, channels: int | None) -> _Stored | None:
         fits = _size(scale) == 1 or (last and _size(scale) == channels)
         return _Stored(source, scale, zero) if fits else None
     # The other form: integers cast to float, times a scale.
-    if node := _maker(value, "Mul"):
-        cast, scale = _maker(node.inputs[0], "Cast"), node.inputs[1]
+    if node := maker(value, "Mul"):
+        cast, scale = maker(node.inputs[0], "Cast"), node.inputs[1]
         if cast is None or cast.inputs[0] is None or scale is None:
             return None
         if channels is not None and scale.shape == (channels,):
             return _Stored(cast.inputs[0], scale, None)
     return None
-
-
-def _maker(value: ir.Value | None, op_type: str) -> ir.Node | None:
-    node = None if value is None else producer_of(value)
-    fits = node is not None and node.op_type == op_type and is_standard(node)
-    return node if fits else None
 
 
 def _size(value: ir.Value) -> int | None:
@@ -111,10 +107,6 @@ def _channels(value: ir.Value) -> int | None:
     dims = open_shape(value)
     heads, width = dims[2:] if dims is not None and len(dims) == 4 else (None, None)
     return None if heads is None or width is None else heads * width
-
-
-def _options(node: ir.Node) -> dict[str, int]:
-    return {name: each.as_int() for name, each in node.attributes.items()}
 
 
 def _remove_unread(node: ir.Node | None) -> None:

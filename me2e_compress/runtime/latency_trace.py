@@ -39,9 +39,9 @@ def shares(parts: Microseconds) -> tuple[TimeShare, ...]:
         TimeShare(
             name,
             sum(samples) / whole,
-            _told(samples, 50),
-            _told(samples, 90),
-            _told(samples, 99),
+            _known_percentile(samples, 50),
+            _known_percentile(samples, 90),
+            _known_percentile(samples, 99),
             max(samples),
         )
         for name, samples in parts.items()
@@ -60,15 +60,15 @@ def shares_table(title: str, what: str, parts: Microseconds) -> Table:
     ]
     columns = (what, "share", "p50 ms", "p90 ms", "p99 ms", "max ms")
     count = min(map(len, parts.values()), default=0)
-    return table(title, columns, rows, _untold(count))
+    return table(title, columns, rows, _missing_percentiles(count))
 
 
-def _told(samples: Sequence[int], percent: float) -> int | None:
+def _known_percentile(samples: Sequence[int], percent: float) -> int | None:
     """Return a percentile; None where there are too few samples for it."""
     return None if too_few(percent, len(samples)) else percentile(samples, percent)
 
 
-def _untold(count: int) -> str:
+def _missing_percentiles(count: int) -> str:
     """Say which percentiles need more samples."""
     why = {f"p{percent}": too_few(percent, count) for percent in PERCENTILES}
     return not_measured({name: each for name, each in why.items() if each})
@@ -107,11 +107,11 @@ class LatencyTrace(Displayed):
     def tables(self) -> tuple[Table, ...]:
         """Return the percentiles in milliseconds, and the times of modules."""
         rows = [
-            *((f"p{p}", _told(self.samples_us, p)) for p in PERCENTILES),
+            *((f"p{p}", _known_percentile(self.samples_us, p)) for p in PERCENTILES),
             ("max", self.max_us),
         ]
         shown = [(name, _ms(taken_us)) for name, taken_us in rows]
-        note = _untold(len(self.samples_us))
+        note = _missing_percentiles(len(self.samples_us))
         whole = table(self.headline, ("latency", "ms"), shown, note)
         # Times of modules are optional.
         if not self.modules_us:
@@ -142,7 +142,7 @@ class LatencyTrace(Displayed):
             "machine": self.machine,
             **frames,
             **busy,
-            **{f"p{p}_us": _told(self.samples_us, p) for p in PERCENTILES},
+            **{f"p{p}_us": _known_percentile(self.samples_us, p) for p in PERCENTILES},
             "max_us": self.max_us,
             "samples_us": list(self.samples_us),
             **modules,

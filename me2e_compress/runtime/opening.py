@@ -202,7 +202,7 @@ def _keep_int8(options: ort.SessionOptions) -> None:
     """Disable that step; setting the option twice would make onnxruntime warn."""
     try:
         options.get_session_config_entry(_INT8_STAYS)
-    except RuntimeError:  # nobody said so yet
+    except RuntimeError:  # it is not set yet
         options.add_session_config_entry(_INT8_STAYS, "1")
 
 

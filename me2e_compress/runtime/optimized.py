@@ -11,7 +11,7 @@ from me2e_compress.graph import producer_of
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 
-_JOINTS = "/_"
+_SEPARATORS = "/_"
 """Separators between a node's name and the suffix that onnxruntime adds:
 ``/MatMulAddFusion``, ``_nchwc``, ``_token_1``."""
 
@@ -55,7 +55,7 @@ def origins(source: ir.Model, found: ir.Model) -> dict[str, ir.Node]:
     names = {str(node.name): node for node in source.graph}
     makers = {str(value.name): node for node in source.graph for value in node.outputs}
     # Match by name or output first.
-    known = {node: _told(node, names, makers) for node in found.graph}
+    known = {node: _named_source(node, names, makers) for node in found.graph}
     # Take the origin of readers, then of inputs, for the rest.
     for node in reversed(found.graph):
         known[node] = known[node] or _first(
@@ -71,7 +71,7 @@ def origins(source: ir.Model, found: ir.Model) -> dict[str, ir.Node]:
     return {str(node.name): each for node, each in known.items() if each is not None}
 
 
-def _told(
+def _named_source(
     node: ir.Node, names: Mapping[str, ir.Node], makers: Mapping[str, ir.Node]
 ) -> ir.Node | None:
     """Return the source node that the node's name or an output refers to."""
@@ -86,7 +86,7 @@ def _stems(name: str) -> Iterator[str]:
     """Yield a name and its prefixes at separators, longest first."""
     yield name
     for end in range(len(name) - 1, 0, -1):
-        if name[end] in _JOINTS:
+        if name[end] in _SEPARATORS:
             yield name[:end]
 
 

@@ -22,13 +22,8 @@ def check_evaluator(
     stored: a route's name is valid in a file name, its numbers are finite and in their
     bounds, its frames are in order of time.
 
-    Args:
-        evaluator: the evaluator.
-        again: one of equal options that drives anew, i.e. with another folder for
-            results; None asks the same evaluator twice.
-
-    Returns:
-        The episodes.
+    ``again`` has equal options and drives anew, i.e. with another folder for results;
+    None asks the same evaluator twice. Returns the episodes.
 
     Raises:
         VerificationError: it broke a promise; the message says which.

@@ -18,10 +18,8 @@ def check_observer(observer: Observer, seed: int = 0) -> tuple[Bounds, Bounds]:
     same statistics give the same ranges; these are two finite float32 arrays [tensors],
     the low bound at most the high one, within what was seen; and the range of a tensor
     does not depend on the other tensors. The statistics are of five random tensors:
-    normal, one-sided, heavy-tailed, constant and zero.
-
-    Returns:
-        Low and high bounds of those five tensors.
+    normal, one-sided, heavy-tailed, constant and zero. Returns their low and high
+    bounds.
 
     Raises:
         VerificationError: it broke a promise; the message says which.

@@ -40,12 +40,9 @@ def check_operator(
     them, and compute the same there; and an attribute that the dialect does not have is
     refused.
 
-    Args:
-        operator: the operator; it need not be installed.
-        draw: makes a call in a dialect; None draws what the dialect's operands declare,
-            and any shape if they declare none.
-        seed: of the draws.
-        calls: how many are drawn for each dialect and opset.
+    The operator need not be installed. ``draw`` makes a call in a dialect; None draws
+    what the dialect's operands declare, and any shape if they declare none. So many
+    ``calls`` are drawn for each dialect and opset.
 
     Raises:
         VerificationError: it broke a promise; the message says which.

@@ -1,7 +1,6 @@
 """Check what the manager and the documents promise of passes."""
 
 import dataclasses
-import re
 
 import onnx_ir as ir
 
@@ -14,8 +13,7 @@ from me2e_compress.manager.verification_inputs import VerificationInputs
 from me2e_compress.modules import map_of
 from me2e_compress.passes import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize
-
-_KEBAB = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+from me2e_compress.testing.form import check_class
 
 
 def check_pass(
@@ -30,14 +28,9 @@ def check_pass(
     one names the pass and, as its origins, nodes that were there. If the pass is exact,
     a second run changes nothing and the outputs are the same.
 
-    Args:
-        current: the pass.
-        model: a graph to try it on; static input shapes let exact passes be run.
-        context: module map, frames, seed; None detects the map, and takes a graph of no
-            known stack as one module.
-
-    Returns:
-        The pass's own result.
+    ``model`` is a graph to try it on; static input shapes let exact passes be run.
+    ``context`` None detects the module map, and takes a graph of no known stack as one
+    module. Returns the pass's own result.
 
     Raises:
         VerificationError: it broke a promise; the message says which.
@@ -64,12 +57,8 @@ def _prepare(model: ir.Model, context: Context) -> ir.Model:
 
 
 def _check_form(current: Pass) -> None:
+    check_class(current)
     cls = type(current)
-    # of its own: an undecorated class inherits that of the base, and has no options
-    if "__dataclass_params__" not in vars(cls):
-        raise VerificationError(f"{cls.__name__} is not a frozen dataclass")
-    if _KEBAB.fullmatch(current.name) is None:
-        raise VerificationError(f"{current.name!r} is not a name-like-this")
     text = cls.__doc__ or ""
     if "Given:" not in text or "Result:" not in text:
         raise VerificationError(f"{cls.__name__}'s docstring lacks Given: and Result:")

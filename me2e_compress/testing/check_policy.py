@@ -33,10 +33,8 @@ def check_policy(driver: Driver) -> Answers:
     route that ships, each answer is a finite plan, float [6, 2] or a `Trajectory`, or
     controls in their range; the world is not stepped; and the policy gives the same
     answers after a reset, as does one that is opened anew. For a Python policy,
-    ``driver`` is ``driver_named("package.module:factory")``.
-
-    Returns:
-        The answers, plans with the times of their waypoints.
+    ``driver`` is ``driver_named("package.module:factory")``. Returns the answers, plans
+    with the times of their waypoints.
 
     Raises:
         VerificationError: it broke a promise; the message says which.

@@ -11,19 +11,8 @@ _KEBAB = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 T = TypeVar("T", bound=NamedItem)
 
 
-def check_form(item: T, registry: Registry[T]) -> None:
-    """Check that an item is a frozen dataclass that text can represent.
-
-    It must have a name-like-this and a docstring that describes every option, and its
-    text must build an equal item.
-
-    Args:
-        item: a pass, rule, observer, driver, ...; it need not be installed.
-        registry: of its kind, e.g. ``calibration.observers.OBSERVERS``.
-
-    Raises:
-        VerificationError: it is not; the message says why.
-    """
+def check_class(item: NamedItem) -> None:
+    """Check that an item is of a frozen dataclass with a name-like-this."""
     cls = type(item)
     # of its own: an undecorated class inherits that of its base
     parameters = vars(cls).get("__dataclass_params__")
@@ -31,6 +20,21 @@ def check_form(item: T, registry: Registry[T]) -> None:
         raise VerificationError(f"{cls.__name__} is not a frozen dataclass")
     if _KEBAB.fullmatch(item.name) is None:
         raise VerificationError(f"{item.name!r} is not a name-like-this")
+
+
+def check_form(item: T, registry: Registry[T]) -> None:
+    """Check that an item is a frozen dataclass that text can represent.
+
+    It must have a name-like-this and a docstring that describes every option, and its
+    text must build an equal item. ``item`` is a pass, rule, observer, driver, ..., and
+    need not be installed; ``registry`` is that of its kind, e.g.
+    ``calibration.observers.OBSERVERS``.
+
+    Raises:
+        VerificationError: it is not; the message says why.
+    """
+    check_class(item)
+    cls = type(item)
     if cls.__doc__ is None or cls.__doc__.startswith(f"{cls.__name__}("):
         raise VerificationError(f"{cls.__name__} has no docstring")
     for option in options_of(cls):

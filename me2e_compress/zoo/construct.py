@@ -1,8 +1,10 @@
-"""Build the torch module of a stack, without weights."""
+"""Build the torch module of a stack, without weights or with those of a seed."""
 
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
-from me2e_compress.zoo.stacks import TCP, UNIADS, Stack
+from me2e_compress.zoo.stacks import TCP, Stack
+from me2e_compress.zoo.synthetic_frames import frames
+from me2e_compress.zoo.uniad.config import CONFIGS
 
 if TYPE_CHECKING:
     from torch import nn
@@ -12,22 +14,51 @@ if TYPE_CHECKING:
     from me2e_compress.zoo.vad.config import HeadsName
 
 
-def construct(spec: Stack, sampling: "Sampling" = "operator") -> "nn.Module":
-    """Build a module that the original's weights fit; its own are meaningless."""
+def construct(
+    spec: Stack, sampling: "Sampling" = "operator", *, trained: bool = True
+) -> "nn.Module":
+    """Build a module whose weights are meaningless; those of the original fit it.
+
+    ``trained`` False leaves out what only the original's weights need.
+    """
     model: nn.Module
     if spec.name == TCP.name:
         from me2e_compress.zoo.tcp.stack import Tcp
 
         (heads,) = spec.heads
         model = Tcp(cast("ActionHeads", heads))
-    elif spec.name in UNIADS:
-        from me2e_compress.zoo.uniad.config import CONFIGS
+    elif spec.name in CONFIGS:
         from me2e_compress.zoo.uniad.stack import UniadTiny
 
-        model = UniadTiny(CONFIGS[spec.name], sampling, trained=True)
+        model = UniadTiny(CONFIGS[spec.name], sampling, trained=trained)
     else:
         from me2e_compress.zoo.vad.stack import VadTiny
 
         (heads,) = spec.heads
         model = VadTiny(cast("HeadsName", heads), sampling)
     return model.requires_grad_(False).eval()
+
+
+def draw(spec: Stack, sampling: "Sampling", seed: int) -> "nn.Module":
+    """Build a module with weights of a seed; the same seed gives the same bytes."""
+    import torch
+
+    from me2e_compress.zoo.drawing import rendered
+
+    model: Any = construct(spec, sampling, trained=False)  # one of three classes
+    if spec.name == TCP.name:
+        from me2e_compress.zoo.tcp import stack as tcp
+
+        tcp.initialise(model, rendered(spec, seed), seed)
+    elif spec.name in CONFIGS:
+        from me2e_compress.zoo.uniad import initialise as uniad
+
+        (frame,) = frames(spec, 1, seed)
+        images, cameras = (torch.from_numpy(frame[n]) for n in ("img", "lidar2img"))
+        uniad.initialise(model, images[0], cameras, seed)
+    else:
+        from me2e_compress.zoo.vad import stack as vad
+
+        vad.initialise(model, rendered(spec, seed), seed)
+    drawn: nn.Module = model
+    return drawn

@@ -1,6 +1,12 @@
-"""Draw weights from a seed, so that no two tensors are equal and none is constant.
+"""Draw weights from a seed so that the untrained network reacts to its input.
 
-An exporter merges equal tensors, and trained ones are never equal.
+A network drawn at random loses its input on the way: activations of different images
+share a large common part, averages over hundreds of keys cancel, and the plan hardly
+changes with a camera. So the statistics of backbone and neck are taken from rendered
+frames, residual branches that carry information are stronger than their shortcuts, and
+the weights of a linear layer sum to zero, which cancels the common part that a ReLU
+leaves. No two tensors are equal and none is constant, as in a trained model: an
+exporter merges equal ones.
 """
 
 import math
@@ -13,6 +19,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from me2e_compress.zoo.bev.neck import FeaturePyramid
+from me2e_compress.zoo.stacks import Stack
+from me2e_compress.zoo.synthetic_frames import frames
+
 BIAS_STD = 0.1
 EMBEDDING_STD = 0.3
 DEFAULT_GAIN = math.sqrt(2)
@@ -20,6 +30,10 @@ RESIDUAL_SCALE = 0.35
 """Scale of the last normalisation of a residual block, so 16 blocks stay stable."""
 
 ATTENTION_HEADS = 8
+
+CALIBRATION_FRAMES = 4
+CALIBRATION_STRIDE = 2
+"""Every second pixel is enough for the statistics of a channel."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +122,40 @@ def take_statistics(backbone: nn.Module, images: Tensor) -> Tensor:
         norm.eval()
         norm.momentum = 0.1
     return features
+
+
+def normalise_neck(neck: FeaturePyramid, stages: Sequence[Tensor]) -> list[Tensor]:
+    """Scale the convolutions of a neck to outputs of unit size; return its levels."""
+    maps = [
+        _normalised(conv, stage)
+        for conv, stage in zip(neck.lateral_convs, stages, strict=True)
+    ]
+    levels = [
+        _normalised(conv, x) for conv, x in zip(neck.fpn_convs, maps, strict=False)
+    ]
+    for conv in neck.fpn_convs[len(maps) :]:
+        levels.append(_normalised(conv, levels[-1]))
+    return levels
+
+
+def _normalised(module: nn.Module, x: Tensor) -> Tensor:
+    """Normalise a convolution's output per channel, keeping its bias; return it."""
+    convolution = module.get_submodule("conv")
+    weight, bias = (convolution.get_parameter(name) for name in ("weight", "bias"))
+    out = convolution(x)
+    scale = out.std((0, 2, 3)).reciprocal()
+    kept = bias.clone()
+    weight.mul_(scale[:, None, None, None])
+    bias.copy_((kept - out.mean((0, 2, 3))) * scale + kept)
+    y: Tensor = convolution(x)
+    return y
+
+
+def rendered(spec: Stack, seed: int, stride: int = CALIBRATION_STRIDE) -> Tensor:
+    """Return images of several scenes, [N, 3, H, W], with every ``stride``-th pixel."""
+    made = frames(spec, CALIBRATION_FRAMES, seed, scene_length=1)
+    images = [torch.from_numpy(frame["img"])[..., ::stride, ::stride] for frame in made]
+    return torch.cat([each.reshape(-1, *each.shape[-3:]) for each in images])
 
 
 @contextmanager

@@ -7,23 +7,21 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import onnx
 
 from me2e_compress.errors import GraphError, MissingExtraError
 from me2e_compress.marks import PRODUCER
-from me2e_compress.zoo.construct import construct
+from me2e_compress.zoo.construct import construct, draw
 from me2e_compress.zoo.model_files import write
-from me2e_compress.zoo.stacks import TCP, UNIADS, Stack, find
+from me2e_compress.zoo.stacks import TCP, Stack, find
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from me2e_compress.zoo.bev.sizes import Sampling
     from me2e_compress.zoo.published_weights import PublishedWeights
-    from me2e_compress.zoo.tcp.config import ActionHeads
-    from me2e_compress.zoo.vad.config import HeadsName
 
 GRID_SAMPLE_OPSET = 16
 """The first opset with GridSample; below, sampling is written with Gather."""
@@ -120,35 +118,13 @@ def build(
         )
     if importlib.util.find_spec("torch") is None:
         raise MissingExtraError("torch", "zoo")
-    # TCP samples nothing: neither opset nor fusion matters
-    if spec.name == TCP.name:
-        if fused:
-            raise GraphError(f"{stack} has no deformable attention: no plugin fits it")
-        # Published weights fill an empty module
-        if weights is not None:
-            return _filled(spec, weights)
-        from me2e_compress.zoo.tcp.initialise import build_tcp
-
-        (chosen,) = spec.heads
-        return build_tcp(seed=seed, heads=cast("ActionHeads", chosen))
+    if fused and spec.name == TCP.name:
+        raise GraphError(f"{stack} has no deformable attention: no plugin fits it")
     # The opset decides how features are sampled
     native: Sampling = "operator" if opset >= GRID_SAMPLE_OPSET else "gather"
     sampling = "fused" if fused else native
-    if weights is not None:
-        return _filled(spec, weights, sampling)
-    if spec.name in UNIADS:
-        from me2e_compress.zoo.uniad.initialise import build_uniad
-
-        return build_uniad(spec, seed=seed, sampling=sampling)
-    from me2e_compress.zoo.vad.initialise import build as build_vad
-
-    (chosen,) = spec.heads
-    return build_vad(seed=seed, heads=cast("HeadsName", chosen), sampling=sampling)
-
-
-def _filled(
-    spec: Stack, weights: "PublishedWeights", sampling: "Sampling" = "operator"
-) -> "nn.Module":
+    if weights is None:
+        return draw(spec, sampling, seed)
     model = construct(spec, sampling)
     weights.fill(model)
     return model

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from me2e_compress.errors import GraphError
 from me2e_compress.zoo.construct import construct
-from me2e_compress.zoo.name_match import Mismatch, NameMatch
-from me2e_compress.zoo.published_names import PUBLISHED
+from me2e_compress.zoo.published_names import PUBLISHED, Mismatch, NameMatch
 from me2e_compress.zoo.stacks import Stack, find
 from me2e_compress.zoo.state_dict import StateDict, read_state_dict
 from me2e_compress.zoo.weights_record import WeightsRecord

@@ -1,96 +1,77 @@
 """Residual networks, under the parameter names that published weights use."""
 
-from collections.abc import Sequence
-
 from torch import Tensor, nn
 
 BLOCKS = (3, 4, 6, 3)
 """Blocks of the four stages of ResNet-34 and ResNet-50 (He et al. 2016, table 1)."""
 
 STEM = 64
+EXPANSION = 4
+"""Channels of a bottleneck's output, relative to those inside."""
 
 
-class BasicBlock(nn.Module):
-    """3x3 (strided) and 3x3 convolutions, and the shortcut."""
+class Block(nn.Module):
+    """Convolutions, each normalised, and the shortcut.
 
-    expansion = 1
+    Two of 3x3, or of a bottleneck 1x1, 3x3 and 1x1; the first of 3x3 is strided.
+    """
 
-    def __init__(self, channels: int, width: int, stride: int) -> None:
+    def __init__(
+        self, channels: int, width: int, stride: int, *, bottleneck: bool
+    ) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(channels, width, 3, stride, 1, bias=False)
-        self.bn1 = nn.BatchNorm2d(width)
-        self.conv2 = nn.Conv2d(width, width, 3, 1, 1, bias=False)
-        self.bn2 = nn.BatchNorm2d(width)
+        kernels = (1, 3, 1) if bottleneck else (3, 3)
+        outs = (width, width, EXPANSION * width) if bottleneck else (width, width)
+        strided = kernels.index(3)
+        size = channels
+        for at, (kernel, out) in enumerate(zip(kernels, outs, strict=True)):
+            step = stride if at == strided else 1
+            conv = nn.Conv2d(size, out, kernel, step, kernel // 2, bias=False)
+            self.add_module(f"conv{at + 1}", conv)
+            self.add_module(f"bn{at + 1}", nn.BatchNorm2d(out))
+            size = out
+        self.count = len(kernels)
         self.relu = nn.ReLU()
-        self.downsample = _shortcut(channels, width, stride)
+        self.downsample: nn.Module | None = None
+        if stride != 1 or channels != size:
+            self.downsample = nn.Sequential(
+                nn.Conv2d(channels, size, 1, stride, bias=False), nn.BatchNorm2d(size)
+            )
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map [N, C, H, W] to [N, width, H / stride, W / stride]."""
+        """Map [N, C, H, W] to [N, out, H / stride, W / stride]."""
         shortcut = x if self.downsample is None else self.downsample(x)
-        x = self.relu(self.bn1(self.conv1(x)))
-        x = self.bn2(self.conv2(x)) + shortcut
+        for number in range(1, self.count):
+            x = self.relu(self._normalised(number, x))
+        x = self._normalised(self.count, x) + shortcut
         out: Tensor = self.relu(x)
         return out
 
-
-class Bottleneck(nn.Module):
-    """1x1, 3x3 (strided) and 1x1 convolutions, and the shortcut."""
-
-    expansion = 4
-
-    def __init__(self, channels: int, width: int, stride: int) -> None:
-        super().__init__()
-        out = width * self.expansion
-        self.conv1 = nn.Conv2d(channels, width, 1, bias=False)
-        self.bn1 = nn.BatchNorm2d(width)
-        self.conv2 = nn.Conv2d(width, width, 3, stride, 1, bias=False)
-        self.bn2 = nn.BatchNorm2d(width)
-        self.conv3 = nn.Conv2d(width, out, 1, bias=False)
-        self.bn3 = nn.BatchNorm2d(out)
-        self.relu = nn.ReLU()
-        self.downsample = _shortcut(channels, out, stride)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map [N, C, H, W] to [N, 4 * width, H / stride, W / stride]."""
-        shortcut = x if self.downsample is None else self.downsample(x)
-        x = self.relu(self.bn1(self.conv1(x)))
-        x = self.relu(self.bn2(self.conv2(x)))
-        x = self.bn3(self.conv3(x)) + shortcut
-        out: Tensor = self.relu(x)
-        return out
-
-
-def _shortcut(channels: int, out: int, stride: int) -> nn.Module | None:
-    if stride == 1 and channels == out:
-        return None
-    return nn.Sequential(
-        nn.Conv2d(channels, out, 1, stride, bias=False), nn.BatchNorm2d(out)
-    )
+    def _normalised(self, number: int, x: Tensor) -> Tensor:
+        conv = self.get_submodule(f"conv{number}")
+        normalised: Tensor = self.get_submodule(f"bn{number}")(conv(x))
+        return normalised
 
 
 class ResNet(nn.Module):
     """Maps images to the feature maps of all stages; each stage doubles ``width``."""
 
-    def __init__(
-        self,
-        block: type[BasicBlock | Bottleneck],
-        blocks: Sequence[int],
-        width: int = STEM,
-    ) -> None:
+    def __init__(self, width: int = STEM, *, bottleneck: bool) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(3, width, 7, 2, 3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
         self.relu = nn.ReLU()
         self.maxpool = nn.MaxPool2d(3, 2, 1)
-        self.channels = tuple(
-            block.expansion * width * 2**stage for stage in range(len(blocks))
-        )
+        expansion = EXPANSION if bottleneck else 1
+        widths = tuple(width * 2**stage for stage in range(len(BLOCKS)))
+        self.channels = tuple(expansion * each for each in widths)
         channels = width
-        for number, count in enumerate(blocks, start=1):
+        for number, count in enumerate(BLOCKS, start=1):
             stage = nn.Sequential()
             for index in range(count):
                 stride = 2 if index == 0 and number > 1 else 1
-                stage.append(block(channels, width * 2 ** (number - 1), stride))
+                inner = widths[number - 1]
+                stage.append(Block(channels, inner, stride, bottleneck=bottleneck))
                 channels = self.channels[number - 1]
             self.add_module(f"layer{number}", stage)
 
@@ -108,7 +89,7 @@ class ResNet50(ResNet):
     """Maps images to the C5 feature map."""
 
     def __init__(self, width: int = STEM) -> None:
-        super().__init__(Bottleneck, BLOCKS, width)
+        super().__init__(width, bottleneck=True)
 
     def forward(self, images: Tensor) -> Tensor:
         """Map [N, 3, H, W] to [N, 32 * width, H / 32, W / 32]."""

@@ -7,6 +7,7 @@ from typing import Self
 
 import pydantic
 
+from me2e_compress.documents import reading
 from me2e_compress.errors import GraphError
 from me2e_compress.zoo.model_files import write
 from me2e_compress.zoo.stacks import STACKS
@@ -64,17 +65,11 @@ class ModelCard(pydantic.BaseModel):
         Raises:
             GraphError: the file is missing or not a card.
         """
-        try:
+        with reading(path, GraphError, "not a model card"):
             return cls.model_validate_json(path.read_bytes(), strict=True)
-        except OSError as error:
-            raise GraphError(f"{path}: cannot be read: {error.strerror}") from error
-        except pydantic.ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            where = ".".join(map(str, first["loc"])) or "the file"
-            raise GraphError(f"{path}: {where}: {first['msg']}") from error
 
 
-def card(name: str, folder: Path | None = None) -> ModelCard:
+def card(name: str) -> ModelCard:
     """Return the card of a shipped model.
 
     Raises:
@@ -82,61 +77,58 @@ def card(name: str, folder: Path | None = None) -> ModelCard:
     """
     if name not in SHIPPED:
         raise GraphError(f"no model {name!r} ships; there is {', '.join(SHIPPED)}")
-    return ModelCard.load((folder or WEIGHTS) / f"{name}.json")
+    return ModelCard.load(WEIGHTS / f"{name}.json")
 
 
-def shipped(name: str, folder: Path | None = None) -> Path:
+def shipped(name: str) -> Path:
     """Return the file of a shipped model after checking its digest, once per process.
-
-    ``folder`` holds models and cards; None means those of the package.
 
     Raises:
         GraphError: unknown model, or its file or card is missing or altered.
     """
-    return _checked(name, folder or WEIGHTS)
+    return _checked(WEIGHTS / f"{name}.onnx", card(name).sha256)
 
 
-def checkpoint(name: str, folder: Path | None = None) -> Path:
+def checkpoint(name: str) -> Path:
     """Return the weights of a shipped model from which training can continue.
 
     It is a file of `driver.checkpoint.Start`. The repository and the source
-    distribution hold it; the wheel does not. ``folder`` is as in `shipped`.
+    distribution hold it; the wheel does not.
 
     Raises:
         GraphError: unknown model, or its checkpoint or card is missing or altered.
     """
-    folder = folder or WEIGHTS
-    expected = card(name, folder).checkpoint_sha256
+    expected = card(name).checkpoint_sha256
     if expected is None:
         raise GraphError(f"{name}: its card names no checkpoint")
-    path = folder / f"{name}.pt"
+    path = WEIGHTS / f"{name}.pt"
     if not path.exists():
         raise GraphError(
             f"{path}: the wheel leaves the checkpoint out; take"
             f" me2e_compress/zoo/weights/{name}.pt of the source distribution"
         )
-    return _same(path, expected)
+    return _checked(path, expected)
 
 
-def sample_frames(model: Path, folder: Path | None = None) -> Path | None:
+def sample_frames(model: Path) -> Path | None:
     """Return the recorded frames of a shipped model, if a file is a copy of one.
 
     Two frames of a drive suffice to verify exact passes, but not to calibrate.
     """
-    name = _copied(model, folder := folder or WEIGHTS)
-    frames = folder / f"{name}-frames"
+    name = _copied(model)
+    frames = WEIGHTS / f"{name}-frames"
     return frames if name is not None and frames.is_dir() else None
 
 
 def is_copy(path: Path) -> bool:
     """Return whether a file is a copy of a model that ships."""
-    return path.is_file() and _copied(path, WEIGHTS) is not None
+    return path.is_file() and _copied(path) is not None
 
 
-def _copied(model: Path, folder: Path) -> str | None:
+def _copied(model: Path) -> str | None:
     """Return the name of the shipped model that a file is a copy of."""
     for name in SHIPPED:
-        known = card(name, folder)
+        known = card(name)
         if model.stat().st_size != known.bytes:
             continue
         if hashlib.sha256(model.read_bytes()).hexdigest() == known.sha256:
@@ -145,11 +137,7 @@ def _copied(model: Path, folder: Path) -> str | None:
 
 
 @functools.cache
-def _checked(name: str, folder: Path) -> Path:
-    return _same(folder / f"{name}.onnx", card(name, folder).sha256)
-
-
-def _same(path: Path, expected: str) -> Path:
+def _checked(path: Path, expected: str) -> Path:
     try:
         found = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
@@ -163,14 +151,14 @@ def _same(path: Path, expected: str) -> Path:
     return path
 
 
-def copy(name: str, target: Path, folder: Path | None = None) -> Path:
+def copy(name: str, target: Path) -> Path:
     """Write a copy of a shipped model atomically and return its path.
 
     Raises:
         GraphError: as `shipped`, or ``target`` is the shipped file or cannot be
             written.
     """
-    source = shipped(name, folder)
+    source = shipped(name)
     if target.exists() and target.samefile(source):
         raise GraphError(f"{target} is the shipped model: choose another output")
     return write(target, source.read_bytes())

@@ -6,6 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from me2e_compress.errors import GraphError
+from me2e_compress.zoo.bev.sizes import CAMERAS, EMBED
+from me2e_compress.zoo.uniad.config import CONFIGS, MEMORY, UniadConfig
+from me2e_compress.zoo.vad.config import VadConfig
 
 Shape = tuple[int, ...]
 
@@ -114,31 +117,37 @@ class Stack:
         }
 
 
-VAD_TINY = Stack(
-    name="vad-tiny",
-    inputs={
-        "img": (1, 6, 3, 384, 640),
-        "lidar2img": (1, 6, 4, 4),
-        "can_bus": (18,),
-        "prev_bev": (10000, 1, 256),
-    },
-    outputs=(
-        "bev_embed",
-        "all_cls_scores",
-        "all_bbox_preds",
-        "all_traj_preds",
-        "all_traj_cls_scores",
-        "map_all_cls_scores",
-        "map_all_bbox_preds",
-        "map_all_pts_preds",
-        "ego_fut_preds",
-    ),
-    recurrent={"prev_bev": "bev_embed"},
-    plan="ego_fut_preds",
-    plan_deltas=True,
-    heads={"nuscenes": 2, "bench2drive": 3},
-    image=IMAGENET,
-)
+def vad_stack(config: VadConfig, scale: float) -> Stack:
+    """Return VAD-tiny's interface at the sizes of a configuration."""
+    return Stack(
+        name="vad-tiny",
+        inputs={
+            "img": (1, CAMERAS, 3, *config.image_hw),
+            "lidar2img": (1, CAMERAS, 4, 4),
+            "can_bus": (18,),
+            "prev_bev": (config.grid.cells, 1, EMBED),
+        },
+        outputs=(
+            "bev_embed",
+            "all_cls_scores",
+            "all_bbox_preds",
+            "all_traj_preds",
+            "all_traj_cls_scores",
+            "map_all_cls_scores",
+            "map_all_bbox_preds",
+            "map_all_pts_preds",
+            "ego_fut_preds",
+        ),
+        recurrent={"prev_bev": "bev_embed"},
+        plan="ego_fut_preds",
+        plan_deltas=True,
+        heads={"nuscenes": 2, "bench2drive": 3},
+        image=IMAGENET,
+        scale=scale,
+    )
+
+
+VAD_TINY = vad_stack(VadConfig(), scale=0.4)
 """hustvl/VAD, VAD_tiny_e2e.py: image statistics of ImageNet; commands right, left and
 straight. Bench2DriveZoo: six road options, of which the fourth follows the lane."""
 
@@ -198,65 +207,48 @@ TCP = Stack(
 """OpenDriveLab/TCP, whose control head gives Beta distributions, and Bench2DriveZoo,
 branch tcp/admlp, where it scores 39 actions. Outputs are named as there."""
 
-UNIAD_SLOTS = 249
-"""Slots for tracks: with the 901 new queries of a frame 1150, DL4AGX's maximum."""
-
-UNIAD_REMEMBERED: dict[str, Shape] = {
-    "l2g_r_mat": (1, 3, 3),
-    "l2g_t": (1, 3),
-    "timestamp": (1,),
-    "track_query": (UNIAD_SLOTS, 512),
-    "track_ref_pts": (UNIAD_SLOTS, 3),
-    "track_obj_idxes": (UNIAD_SLOTS,),
-    "track_disappear_time": (UNIAD_SLOTS,),
-    "track_save_period": (UNIAD_SLOTS,),
-    "track_velocity": (UNIAD_SLOTS, 2),
-    "track_mem_bank": (UNIAD_SLOTS, 4, 256),
-    "track_mem_held": (UNIAD_SLOTS, 4),
-    "max_obj_id": (1,),
-}
-"""UniAD's recurrent state, besides its bird's eye view."""
-
 UNIAD_COUNTS = ("obj_idxes", "disappear_time", "save_period", "max_obj_id")
+UNIAD_OUTPUTS = (
+    "all_cls_scores",
+    "all_bbox_preds",
+    "track_boxes",
+    "track_scores",
+    "track_labels",
+    "lane_query",
+    "lane_scores",
+    "lane_boxes",
+    "lane_masks",
+    "traj_preds",
+    "traj_scores",
+    "occupancy",
+    "sdc_traj",
+)
+"""Those that are not fed back."""
 
 
-def _uniad(
-    name: str, image_hw: tuple[int, int], cells: int, scale: float, straight_on: int
+def uniad_stack(
+    name: str, config: UniadConfig, scale: float, straight_on: int
 ) -> Stack:
+    """Return UniAD-tiny's interface at the sizes of a configuration."""
     # Every recurrent input prev_X is fed by next_X
-    remembered = {f"prev_{key}": shape for key, shape in UNIAD_REMEMBERED.items()}
+    state = _uniad_state(config.tracks)
+    remembered = {f"prev_{key}": shape for key, shape in state.items()}
     counts = [key for key in remembered if key.endswith(UNIAD_COUNTS)]
-    recurrent = {f"prev_{key}": f"next_{key}" for key in UNIAD_REMEMBERED}
+    recurrent = {f"prev_{key}": f"next_{key}" for key in state}
     return Stack(
         name=name,
         inputs={
-            "img": (1, 6, 3, *image_hw),
-            "lidar2img": (1, 6, 4, 4),
+            "img": (1, CAMERAS, 3, *config.image_hw),
+            "lidar2img": (1, CAMERAS, 4, 4),
             "can_bus": (18,),
             "command": (1,),
             "l2g_r_mat": (1, 3, 3),
             "l2g_t": (1, 3),
             "timestamp": (1,),
-            "prev_bev": (cells, 1, 256),
+            "prev_bev": (config.grid.cells, 1, EMBED),
             **remembered,
         },
-        outputs=(
-            "bev_embed",
-            *recurrent.values(),
-            "all_cls_scores",
-            "all_bbox_preds",
-            "track_boxes",
-            "track_scores",
-            "track_labels",
-            "lane_query",
-            "lane_scores",
-            "lane_boxes",
-            "lane_masks",
-            "traj_preds",
-            "traj_scores",
-            "occupancy",
-            "sdc_traj",
-        ),
+        outputs=("bev_embed", *recurrent.values(), *UNIAD_OUTPUTS),
         recurrent={"prev_bev": "bev_embed", **recurrent},
         plan="sdc_traj",
         plan_deltas=False,
@@ -268,13 +260,29 @@ def _uniad(
     )
 
 
-UNIAD_TINY = _uniad("uniad-tiny", (928, 1600), 10_000, 1.0, 3)
+def _uniad_state(slots: int) -> dict[str, Shape]:
+    """Return the shapes of the recurrent state, besides the bird's eye view."""
+    return {
+        "l2g_r_mat": (1, 3, 3),
+        "l2g_t": (1, 3),
+        "timestamp": (1,),
+        "track_query": (slots, 2 * EMBED),
+        "track_ref_pts": (slots, 3),
+        "track_obj_idxes": (slots,),
+        "track_disappear_time": (slots,),
+        "track_save_period": (slots,),
+        "track_velocity": (slots, 2),
+        "track_mem_bank": (slots, MEMORY, EMBED),
+        "track_mem_held": (slots, MEMORY),
+        "max_obj_id": (1,),
+    }
+
+
+UNIAD_TINY = uniad_stack("uniad-tiny", CONFIGS["uniad-tiny"], 1.0, 3)
 """Bench2DriveZoo, tiny_e2e_b2d.py."""
 
-UNIAD_TRT = _uniad("uniad-trt", (256, 416), 2_500, 0.25, 2)
+UNIAD_TRT = uniad_stack("uniad-trt", CONFIGS["uniad-trt"], 0.25, 2)
 """NVIDIA/DL4AGX, uniad-trt: the tiny model of its TensorRT export, for nuScenes."""
-
-UNIADS = (UNIAD_TINY.name, UNIAD_TRT.name)
 
 STACKS: dict[str, Stack] = {
     stack.name: stack for stack in (VAD_TINY, UNIAD_TINY, UNIAD_TRT, TCP, HIGHWAY)

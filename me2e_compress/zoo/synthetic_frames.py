@@ -2,28 +2,41 @@
 
 import math
 from collections.abc import Iterator
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from me2e_compress.errors import FramesError
 from me2e_compress.zoo.stacks import Stack
-from me2e_compress.zoo.synthetic_cameras import LIDAR_HEIGHT_M, render, rig
-from me2e_compress.zoo.synthetic_strip import route_state, strip
+from me2e_compress.zoo.synthetic_cameras import LIDAR_HEIGHT_M, SCALE, render, rig
 from me2e_compress.zoo.synthetic_world import (
     FRAME_S,
-    LANE_M,
-    LANES,
-    TILE,
-    Cuboid,
     EgoPose,
     SyntheticWorld,
+    draw_world,
 )
+from me2e_compress.zoo.tcp.config import COMMANDS, SPEED_UNIT_MPS
 
 Frame = dict[str, NDArray[np.float32 | np.int64]]
 
 SENSOR_NOISE = 2.0
 """Standard deviation of pixel noise, in 1 / 255."""
+
+STRIP_HW = (256, 900)
+
+FRONT, FRONT_LEFT, FRONT_RIGHT = 0, 1, 2
+"""Indices of cameras among the six."""
+
+CUTS = ((FRONT_LEFT, 0, 1400), (FRONT, 200, 1400), (FRONT_RIGHT, 200, 1600))
+"""Camera, first and last column of 1600, from left to right (Bench2DriveZoo, branch
+tcp/admlp, team_code/tcp_b2d_agent.py): 4000 columns, before they are made 900."""
+
+TARGET_S = 4.0
+"""How far ahead of the vehicle its target point is."""
+
+FOLLOW_LANE = 3
+"""Index among left, right, straight, follow, change left and change right."""
 
 
 def frames(
@@ -112,92 +125,37 @@ def _can_bus(world: SyntheticWorld, step: int) -> NDArray[np.float32]:
     return out
 
 
-Range = tuple[float, float]
-
-TINT = 22.0
-"""Standard deviation of a colour around its grey, in 1 / 255."""
-
-
-def draw_world(rng: np.random.Generator) -> SyntheticWorld:
-    """Draw a road with 8 to 12 vehicles, parked cars, buildings, people and cones."""
-    bend = float(rng.uniform(-0.008, 0.008))
-    speed_mps = float(rng.uniform(3, 10))
-    # Objects by kind
-    boxes = [
-        *(_vehicle(rng, bend, speed_mps) for _ in range(int(rng.integers(8, 13)))),
-        *(_parked(rng, bend) for _ in range(int(rng.integers(4, 8)))),
-        *(_building(rng, bend) for _ in range(int(rng.integers(10, 15)))),
-        *(_small(rng, bend) for _ in range(int(rng.integers(5, 9)))),
-    ]
-    # Ground texture of two scales
-    coarse = rng.normal(0, 7, (TILE // 8, TILE // 8)).repeat(8, 0).repeat(8, 1)
-    tile = (coarse + rng.normal(0, 6, (TILE, TILE))).astype(np.float32)
-    return SyntheticWorld(
-        bend=bend,
-        crossing_m=float(rng.uniform(8, 40)),
-        tile=tile,
-        boxes=tuple(boxes),
-        speed_mps=speed_mps,
-        accel_mps2=float(rng.uniform(-0.7, 0.7)),
-        lane_m=0.0,
+def strip(seen: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Join three of six images: [6, 360, 640, 3] to [256, 900, 3] grey levels."""
+    parts = [seen[i, :, round(a * SCALE) : round(b * SCALE)] for i, a, b in CUTS]
+    wide = np.concatenate(parts, axis=1).astype(np.float32)
+    rows = interpolation(wide.shape[0], STRIP_HW[0])
+    columns = interpolation(wide.shape[1], STRIP_HW[1])
+    shrunk: NDArray[np.float32] = np.einsum(
+        "hr,rwc,vw->hvc", rows, wide, columns, optimize=True
     )
+    return shrunk
 
 
-def _place(bend: float, along: float, aside: float) -> tuple[float, float, float]:
-    """Return world x, y and yaw at a station and an offset of the road."""
-    return along, bend * along**2 / 2 + aside, math.atan(bend * along)
+@cache
+def interpolation(before: int, after: int) -> NDArray[np.float32]:
+    """Return weights [after, before] of linear interpolation between pixel centres."""
+    at = (np.arange(after) + 0.5) * before / after - 0.5
+    at = np.clip(at, 0, before - 1)
+    away = np.abs(at[:, None] - np.arange(before))
+    weights: NDArray[np.float32] = np.maximum(1 - away, 0).astype(np.float32)
+    return weights
 
 
-def _colour(rng: np.random.Generator, bounds: Range) -> tuple[float, float, float]:
-    red, green, blue = np.clip(rng.uniform(*bounds) + rng.normal(0, TINT, 3), 0, 255)
-    return float(red), float(green), float(blue)
-
-
-def _vehicle(rng: np.random.Generator, bend: float, ego_mps: float) -> Cuboid:
-    """Draw a moving vehicle; in the ego's lane it is about as fast as the ego."""
-    # Keep a gap around the ego vehicle in its lane
-    lane = int(rng.integers(0, LANES)) - LANES // 2
-    ahead = lane != 0 or rng.random() < 0.7
-    along = float(rng.uniform(9, 60) if ahead else rng.uniform(-50, -9))
-    if lane != 0:
-        along = float(rng.uniform(-45, 60))
-    x, y, yaw = _place(bend, along, lane * LANE_M)
-    # A fifth of the vehicles are trucks
-    truck = rng.random() < 0.2
-    return Cuboid(
-        x=x,
-        y=y,
-        yaw=yaw + (math.pi if lane == 1 else 0.0),
-        length=float(rng.uniform(6.5, 9.5) if truck else rng.uniform(3.8, 4.9)),
-        width=2.3 if truck else float(rng.uniform(1.7, 1.95)),
-        height=float(rng.uniform(2.6, 3.4) if truck else rng.uniform(1.4, 1.8)),
-        colour=_colour(rng, (30, 235)),
-        speed_mps=ego_mps if lane == 0 else float(rng.uniform(4, 11)),
-        window_m=None if truck else 1.6,
-    )
-
-
-def _parked(rng: np.random.Generator, bend: float) -> Cuboid:
-    side = 1 if rng.random() < 0.5 else -1
-    x, y, yaw = _place(bend, float(rng.uniform(-35, 55)), side * 6.4)
-    return Cuboid(x, y, yaw, 4.4, 1.8, 1.5, _colour(rng, (30, 235)), window_m=1.5)
-
-
-def _building(rng: np.random.Generator, bend: float) -> Cuboid:
-    side = 1 if rng.random() < 0.5 else -1
-    depth = float(rng.uniform(7, 14))
-    offset = side * (float(rng.uniform(11, 20)) + depth / 2)
-    x, y, yaw = _place(bend, float(rng.uniform(-55, 80)), offset)
-    length, height = float(rng.uniform(9, 24)), float(rng.uniform(5, 17))
-    return Cuboid(
-        x, y, yaw, length, depth, height, _colour(rng, (90, 210)), window_m=2.8
-    )
-
-
-def _small(rng: np.random.Generator, bend: float) -> Cuboid:
-    side = 1 if rng.random() < 0.5 else -1
-    x, y, yaw = _place(bend, float(rng.uniform(-20, 40)), side * rng.uniform(6, 8.5))
-    if rng.random() < 0.4:
-        return Cuboid(x, y, yaw, 0.4, 0.4, 0.8, (236.0, 108.0, 32.0))
-    pace = float(rng.uniform(0.6, 1.6))
-    return Cuboid(x, y, yaw, 0.5, 0.5, 1.75, _colour(rng, (30, 220)), speed_mps=pace)
+def route_state(
+    world: SyntheticWorld, step: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return state [1, 9] and target point [1, 2], as `Tcp.forward` takes them."""
+    now = world.ego(step * FRAME_S)
+    there = world.ego(step * FRAME_S + TARGET_S)
+    right, ahead = now.to_lidar(there.x, there.y)
+    target = np.array([[ahead, right]], np.float32)
+    speed = world.speed_mps + world.accel_mps2 * step * FRAME_S
+    command = np.eye(COMMANDS, dtype=np.float32)[FOLLOW_LANE : FOLLOW_LANE + 1]
+    first = np.array([[speed / SPEED_UNIT_MPS]], np.float32)
+    return np.concatenate([first, target, command], 1), target

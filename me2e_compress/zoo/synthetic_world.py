@@ -154,3 +154,94 @@ class SyntheticWorld:
         column = (x / TILE_CELL_M).astype(np.int32) % TILE
         row = (y / TILE_CELL_M).astype(np.int32) % TILE
         return colour + self.tile[row, column][..., None]
+
+
+Range = tuple[float, float]
+
+TINT = 22.0
+"""Standard deviation of a colour around its grey, in 1 / 255."""
+
+
+def draw_world(rng: np.random.Generator) -> SyntheticWorld:
+    """Draw a road with 8 to 12 vehicles, parked cars, buildings, people and cones."""
+    bend = float(rng.uniform(-0.008, 0.008))
+    speed_mps = float(rng.uniform(3, 10))
+    # Objects by kind
+    boxes = [
+        *(_vehicle(rng, bend, speed_mps) for _ in range(int(rng.integers(8, 13)))),
+        *(_parked(rng, bend) for _ in range(int(rng.integers(4, 8)))),
+        *(_building(rng, bend) for _ in range(int(rng.integers(10, 15)))),
+        *(_small(rng, bend) for _ in range(int(rng.integers(5, 9)))),
+    ]
+    # Ground texture of two scales
+    coarse = rng.normal(0, 7, (TILE // 8, TILE // 8)).repeat(8, 0).repeat(8, 1)
+    tile = (coarse + rng.normal(0, 6, (TILE, TILE))).astype(np.float32)
+    return SyntheticWorld(
+        bend=bend,
+        crossing_m=float(rng.uniform(8, 40)),
+        tile=tile,
+        boxes=tuple(boxes),
+        speed_mps=speed_mps,
+        accel_mps2=float(rng.uniform(-0.7, 0.7)),
+        lane_m=0.0,
+    )
+
+
+def _place(bend: float, along: float, aside: float) -> tuple[float, float, float]:
+    """Return world x, y and yaw at a station and an offset of the road."""
+    return along, bend * along**2 / 2 + aside, math.atan(bend * along)
+
+
+def _colour(rng: np.random.Generator, bounds: Range) -> tuple[float, float, float]:
+    red, green, blue = np.clip(rng.uniform(*bounds) + rng.normal(0, TINT, 3), 0, 255)
+    return float(red), float(green), float(blue)
+
+
+def _vehicle(rng: np.random.Generator, bend: float, ego_mps: float) -> Cuboid:
+    """Draw a moving vehicle; in the ego's lane it is about as fast as the ego."""
+    # Keep a gap around the ego vehicle in its lane
+    lane = int(rng.integers(0, LANES)) - LANES // 2
+    ahead = lane != 0 or rng.random() < 0.7
+    along = float(rng.uniform(9, 60) if ahead else rng.uniform(-50, -9))
+    if lane != 0:
+        along = float(rng.uniform(-45, 60))
+    x, y, yaw = _place(bend, along, lane * LANE_M)
+    # A fifth of the vehicles are trucks
+    truck = rng.random() < 0.2
+    return Cuboid(
+        x=x,
+        y=y,
+        yaw=yaw + (math.pi if lane == 1 else 0.0),
+        length=float(rng.uniform(6.5, 9.5) if truck else rng.uniform(3.8, 4.9)),
+        width=2.3 if truck else float(rng.uniform(1.7, 1.95)),
+        height=float(rng.uniform(2.6, 3.4) if truck else rng.uniform(1.4, 1.8)),
+        colour=_colour(rng, (30, 235)),
+        speed_mps=ego_mps if lane == 0 else float(rng.uniform(4, 11)),
+        window_m=None if truck else 1.6,
+    )
+
+
+def _parked(rng: np.random.Generator, bend: float) -> Cuboid:
+    side = 1 if rng.random() < 0.5 else -1
+    x, y, yaw = _place(bend, float(rng.uniform(-35, 55)), side * 6.4)
+    return Cuboid(x, y, yaw, 4.4, 1.8, 1.5, _colour(rng, (30, 235)), window_m=1.5)
+
+
+def _building(rng: np.random.Generator, bend: float) -> Cuboid:
+    side = 1 if rng.random() < 0.5 else -1
+    depth = float(rng.uniform(7, 14))
+    offset = side * (float(rng.uniform(11, 20)) + depth / 2)
+    x, y, yaw = _place(bend, float(rng.uniform(-55, 80)), offset)
+    length, height = float(rng.uniform(9, 24)), float(rng.uniform(5, 17))
+    return Cuboid(
+        x, y, yaw, length, depth, height, _colour(rng, (90, 210)), window_m=2.8
+    )
+
+
+def _small(rng: np.random.Generator, bend: float) -> Cuboid:
+    side = 1 if rng.random() < 0.5 else -1
+    x, y, yaw = _place(bend, float(rng.uniform(-20, 40)), side * rng.uniform(6, 8.5))
+    if rng.random() < 0.4:
+        return Cuboid(x, y, yaw, 0.4, 0.4, 0.8, (236.0, 108.0, 32.0))
+    pace = float(rng.uniform(0.6, 1.6))
+    return Cuboid(x, y, yaw, 0.5, 0.5, 1.75, _colour(rng, (30, 220)), speed_mps=pace)

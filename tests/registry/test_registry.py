@@ -228,6 +228,7 @@ def test_defaults_are_written_where_they_are_asked_for() -> None:
         (r'square{label="\x"}', "is not a JSON string"),
         ("square{}, point", "from ', point' on: a comma or the end is expected"),
         ("3", "no shape '3'; there are square"),
+        ("square 3", "no shape 'square 3'; there are square"),
         ("", "no shape ''; there are square"),
     ],
 )

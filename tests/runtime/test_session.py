@@ -1,3 +1,4 @@
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import constant_values
-from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.runnable import unsupported
 from me2e_compress.runtime.session import Session, replay, run_once
 from me2e_compress.targets.weights import evaluate_constants
@@ -37,22 +38,29 @@ def ones(index: int, starts: bool) -> Frame:
     return Frame(index, starts, {"x": np.ones((1, 2), np.float32)})
 
 
+def sums(
+    counter: ir.Model, frames: list[Frame], state: Mapping[str, Array] | None = None
+) -> list[float]:
+    replayed = replay(Session(counter), frames, state=state)
+    return [float(values["y"].item(0)) for values in replayed]
+
+
 def test_state_is_fed_forward_and_reset_where_a_scene_starts(counter: ir.Model) -> None:
     frames = [ones(0, True), ones(1, False), ones(2, False), ones(3, True)]
+    assert sums(counter, frames) == [1, 2, 3, 1]
 
-    sums = [values["y"][0, 0] for values in replay(Session(counter), frames)]
 
-    assert sums == [1, 2, 3, 1]
+def test_a_replay_can_go_on_in_the_middle_of_a_scene(counter: ir.Model) -> None:
+    frames = [ones(3, False), ones(4, False), ones(5, True)]
+    state = {"memory": np.full((1, 2), 5, np.float32)}
+    assert sums(counter, frames, state) == [6, 7, 1]
 
 
 def test_a_scene_may_open_with_a_state_of_its_own(counter: ir.Model) -> None:
     start = {**ones(0, True).arrays, "memory": np.full((1, 2), 10, np.float32)}
     later = {**ones(1, False).arrays, "memory": np.full((1, 2), 99, np.float32)}
 
-    frames = [Frame(0, True, start), Frame(1, False, later)]
-    sums = [values["y"][0, 0] for values in replay(Session(counter), frames)]
-
-    assert sums == [11, 12]
+    assert sums(counter, [Frame(0, True, start), Frame(1, False, later)]) == [11, 12]
 
 
 def test_metadata_decides_what_is_fed_back(counter: ir.Model) -> None:
@@ -160,15 +168,6 @@ def test_what_no_input_changes_is_constant_and_can_be_computed() -> None:
     np.testing.assert_array_equal(
         evaluate_constants(model, ["turned"])["turned"], [[1, 3, 5], [2, 4, 6]]
     )
-
-
-def test_a_replay_can_go_on_in_the_middle_of_a_scene(counter: ir.Model) -> None:
-    state = {"memory": np.full((1, 2), 5, np.float32)}
-
-    frames = [ones(3, False), ones(4, False), ones(5, True)]
-    sums = [v["y"][0, 0] for v in replay(Session(counter), frames, state=state)]
-
-    assert sums == [6, 7, 1]
 
 
 def test_the_graph_as_onnxruntime_rewrites_it_computes_the_same(

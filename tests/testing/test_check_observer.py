@@ -1,3 +1,5 @@
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -37,94 +39,53 @@ def test_an_observer_that_is_not_installed_holds_too() -> None:
     assert highs[1] > 1
 
 
-@dataclass(frozen=True)
-class Plain(Observer):
-    """Three root mean squares to each side; those below err in one way."""
+def nothing_for_zeros(lows: Bounds, highs: Bounds) -> tuple[Bounds, Bounds]:
+    return lows, np.where(highs == 0, np.float32(np.nan), highs)
 
-    name: ClassVar[str] = "plain"
+
+def in_float64(lows: Bounds, highs: Bounds) -> tuple[Bounds, Bounds]:
+    wide: Any = highs.astype(np.float64)
+    return lows, wide
+
+
+CALLS = itertools.count(1)
+ALTERED: dict[str, Callable[[Bounds, Bounds], tuple[Bounds, Bounds]]] = {
+    "drifts": lambda lows, highs: (lows, highs * np.float32(1 - 1e-3 * next(CALLS))),
+    "beyond": lambda lows, highs: (lows, highs + 1),
+    "twisted": lambda lows, highs: (highs, lows),
+    "in float64": in_float64,
+    "short": lambda lows, highs: (lows[1:], highs[1:]),
+    "not finite": nothing_for_zeros,
+}
+
+
+@dataclass(frozen=True)
+class Wrong(Observer):
+    """Three root mean squares to each side, altered in one way.
+
+    Attributes:
+        way: in which it errs.
+    """
+
+    name: ClassVar[str] = "wrong"
+    way: str
 
     def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        return RootMeanSquare(3.0).ranges(seen)
+        if self.way == "of the first":
+            return within(seen, np.sqrt(seen.mean_squares[:, :1].mean(axis=0)))
+        if self.way == "counts":
+            seen.counted()
+        lows, highs = RootMeanSquare(3.0).ranges(seen)
+        return ALTERED[self.way](lows, highs) if self.way in ALTERED else (lows, highs)
 
 
 @dataclass(frozen=True)
-class Drifting(Plain):
-    """Another range each time."""
+class Wasteful(Wrong):
+    """Says that it counts.
 
-    calls: ClassVar[list[int]] = []
-
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        self.calls.append(1)
-        lows, highs = super().ranges(seen)
-        return lows, highs * np.float32(1 - 1e-3 * len(self.calls))
-
-
-@dataclass(frozen=True)
-class Beyond(Plain):
-    """Not cut off."""
-
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        lows, highs = super().ranges(seen)
-        return lows, highs + 1
-
-
-@dataclass(frozen=True)
-class Shared(Plain):
-    """Tensors judged by the first."""
-
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        return within(seen, np.sqrt(seen.mean_squares[:, :1].mean(axis=0)))
-
-
-@dataclass(frozen=True)
-class Twisted(Plain):
-    """Low is high."""
-
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        lows, highs = super().ranges(seen)
-        return highs, lows
-
-
-@dataclass(frozen=True)
-class Doubles(Plain):
-    """In float64."""
-
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        lows, highs = super().ranges(seen)
-        wide: Any = highs.astype(np.float64)
-        return lows, wide
-
-
-@dataclass(frozen=True)
-class Short(Plain):
-    """A tensor too few."""
-
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        lows, highs = super().ranges(seen)
-        return lows[1:], highs[1:]
-
-
-@dataclass(frozen=True)
-class Endless(Plain):
-    """Infinite for a tensor of zeros."""
-
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        lows, highs = super().ranges(seen)
-        return lows, np.where(highs == 0, np.float32(np.nan), highs)
-
-
-@dataclass(frozen=True)
-class Secretive(Plain):
-    """Counts without saying so."""
-
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        seen.counted()
-        return super().ranges(seen)
-
-
-@dataclass(frozen=True)
-class Wasteful(Plain):
-    """Says that it counts."""
+    Attributes:
+        way: none.
+    """
 
     counts: ClassVar[bool] = True
 
@@ -132,15 +93,15 @@ class Wasteful(Plain):
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
-        (Drifting(), "gives two ranges for one tensor"),
-        (Beyond(), "reaches beyond what was seen"),
-        (Shared(), "depends on the other tensors"),
-        (Twisted(), "the low bound .* is above the high one"),
-        (Doubles(), r"a bound is float64 \[5\], it must be float32 \[5\]"),
-        (Short(), r"a bound is float32 \[4\], it must be float32 \[5\]"),
-        (Endless(), "a bound is not finite"),
-        (Secretive(), "reads histograms, and counts is False"),
-        (Wasteful(), "reads no histograms, and counts is True"),
+        (Wrong("drifts"), "gives two ranges for one tensor"),
+        (Wrong("beyond"), "reaches beyond what was seen"),
+        (Wrong("of the first"), "depends on the other tensors"),
+        (Wrong("twisted"), "the low bound .* is above the high one"),
+        (Wrong("in float64"), r"a bound is float64 \[5\], it must be float32 \[5\]"),
+        (Wrong("short"), r"a bound is float32 \[4\], it must be float32 \[5\]"),
+        (Wrong("not finite"), "a bound is not finite"),
+        (Wrong("counts"), "reads histograms, and counts is False"),
+        (Wasteful(""), "reads no histograms, and counts is True"),
     ],
 )
 def test_a_wrong_observer_is_caught(bad: Observer, message: str) -> None:

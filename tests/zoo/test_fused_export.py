@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from torch import nn
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError, RecipeError
+from me2e_compress.errors import RecipeError
 from me2e_compress.operators import expand, find, fused_nodes, import_domains
 from me2e_compress.operators.deformable_attention import DeformableAttention
-from me2e_compress.workflows.export import ExportOptions, export_stack, in_dialect
+from me2e_compress.workflows.export import ExportOptions, in_dialect
 from me2e_compress.zoo.bev.attention import DecoderAttention
 from me2e_compress.zoo.export import trace
 from me2e_compress.zoo.stacks import VAD_TINY
@@ -71,12 +71,6 @@ def test_a_library_without_the_operator_is_an_error() -> None:
 def test_a_dialect_of_standard_operators_is_an_error() -> None:
     with pytest.raises(RecipeError, match="needs --operators plugin"):
         ExportOptions(dialect="tensorrt")
-
-
-def test_the_driver_that_ships_is_one_file(tmp_path: Path) -> None:
-    options = ExportOptions(operators="plugin")
-    with pytest.raises(GraphError, match="--operators cannot be chosen"):
-        export_stack("highway", tmp_path / "h.onnx", options)
 
 
 @pytest.fixture(scope="module", params=[13, 17])

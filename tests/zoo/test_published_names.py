@@ -3,81 +3,41 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.zoo.construct import construct
-from me2e_compress.zoo.name_match import AVERAGE, NameMatch
-from me2e_compress.zoo.published_names import PUBLISHED
+from me2e_compress.zoo.published_names import AVERAGE, PUBLISHED, NameMatch
 from me2e_compress.zoo.stacks import STACKS
 from me2e_compress.zoo.state_dict import PREFIXES
 from me2e_compress.zoo.tcp.stack import Tcp
 from tests.zoo.published_files import state
-from tests.zoo.published_layouts import Shapes, tcp, vad_tiny
+from tests.zoo.published_layouts import DIGESTS, TRAINING, digests, published
 from tests.zoo.tcp.small import SMALL
-from tests.zoo.uniad_layout import ANCHORS, uniad_tiny
 
-LAYOUTS = {
-    ("vad-tiny", "nuscenes"): vad_tiny(),
-    ("vad-tiny", "bench2drive"): vad_tiny(classes=9, map_classes=6, modes=6),
-    ("uniad-tiny", None): uniad_tiny() | ANCHORS,
-    ("tcp", "bench2drive"): tcp(),
-    ("tcp", "beta"): tcp("beta"),
-}
-
-
-def own_shapes(stack: str, heads: str | None) -> Shapes:
-    with torch.device("meta"):
-        model = construct(STACKS[stack].with_heads(heads))
-    return {
-        name: tuple(each.shape)
-        for name, each in model.state_dict().items()
-        if not PUBLISHED[stack].is_computed(name)
-    }
+LAYOUTS = pytest.mark.parametrize(("stack", "heads"), DIGESTS)
 
 
 def test_originals_are_of_stacks_that_are_drawn() -> None:
     drawn = {name for name, stack in STACKS.items() if not stack.trained}
-    assert drawn >= PUBLISHED.keys() == {stack for stack, _ in LAYOUTS}
+    assert drawn >= PUBLISHED.keys() == {stack for stack, _ in DIGESTS}
 
 
-@pytest.mark.parametrize(("stack", "heads"), LAYOUTS)
+@LAYOUTS
 def test_names_and_shapes_are_the_original_s(stack: str, heads: str | None) -> None:
     names = PUBLISHED[stack]
-    renamed = {names.published(n): s for n, s in own_shapes(stack, heads).items()}
-    layout = LAYOUTS[stack, heads]
+    held = published(stack, heads)
 
-    assert renamed == {n: s for n, s in layout.items() if not names.is_unread(n)}
-
-
-@pytest.mark.parametrize(("stack", "heads"), LAYOUTS)
-def test_no_two_names_become_one(stack: str, heads: str | None) -> None:
-    own = own_shapes(stack, heads)
-    published = {PUBLISHED[stack].published(name) for name in own}
-    averages = {AVERAGE + name.replace(".", "_") for name in published}
-
-    assert len(own) == len(published) == len(averages)
+    read = {n: s for n, s in held.items() if not names.is_unread(n)}
+    assert digests(read) == DIGESTS[stack, heads]
+    assert held.keys() - read.keys() == set(TRAINING.get(stack, ()))
 
 
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=map(str, LAYOUTS))
-def test_no_name_begins_as_a_wrapper_s_prefix(layout: Shapes) -> None:
-    assert [name for name in layout if name.startswith(PREFIXES)] == []
+@LAYOUTS
+def test_no_name_becomes_another_s_or_begins_as_a_wrapper(
+    stack: str, heads: str | None
+) -> None:
+    names = published(stack, heads)
+    averages = {AVERAGE + name.replace(".", "_") for name in names}
 
-
-def test_no_parameter_is_taken_for_a_computed_table() -> None:
-    for name, stack in STACKS.items():
-        if name in PUBLISHED:
-            with torch.device("meta"):
-                model = construct(stack.with_heads(None))
-            learned = dict(model.named_parameters())
-            assert not any(map(PUBLISHED[name].is_computed, learned))
-
-
-def test_lane_layers_are_told_apart() -> None:
-    """They alone are called otherwise; three of the four tensors are of one shape."""
-    named = PUBLISHED["vad-tiny"].published
-    layer = "pts_bbox_head.lane_encoder.layer_seq.lmlp_2"
-
-    assert named(f"{layer}.linear.bias") == f"{layer}.mlp.0.bias"
-    assert named(f"{layer}.norm.weight") == f"{layer}.mlp.1.weight"
-    assert named(f"{layer}.norm.bias") == f"{layer}.mlp.1.bias"
+    assert len(names) == len(averages)
+    assert [name for name in names if name.startswith(PREFIXES)] == []
 
 
 SMALL_TCP = Tcp(config=SMALL)

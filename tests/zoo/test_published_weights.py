@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import onnx
@@ -14,8 +14,7 @@ from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.workflows.export import ExportOptions, ExportResult, export_stack
 from me2e_compress.zoo import export as exporting
 from me2e_compress.zoo.export import build, trace
-from me2e_compress.zoo.name_match import NameMatch
-from me2e_compress.zoo.published_names import PUBLISHED
+from me2e_compress.zoo.published_names import PUBLISHED, NameMatch
 from me2e_compress.zoo.published_weights import (
     PublishedWeights,
     mismatch,
@@ -37,21 +36,20 @@ from tests.zoo.published_files import (
     saved,
     thin,
 )
-from tests.zoo.published_layouts import tcp, vad_tiny
+from tests.zoo.published_layouts import published
 from tests.zoo.tcp.small import SMALL, small_spec
-from tests.zoo.uniad_layout import ANCHORS, uniad_tiny
 
 
 @pytest.fixture
 def tensors() -> Tensors:
-    return thin(tcp())
+    return thin(published("tcp"))
 
 
 @pytest.fixture
 def trained() -> Tcp:
     """A small original: its statistics are no fresh model's."""
     torch.manual_seed(5)
-    model = Tcp(training_branches=True, config=SMALL).requires_grad_(False).eval()
+    model = Tcp(config=SMALL).requires_grad_(False).eval()
     for name, each in model.state_dict().items():
         if each.is_floating_point():
             drawn = 0.2 * torch.randn(each.shape)
@@ -88,22 +86,6 @@ def test_the_graph_answers_as_the_original(tmp_path: Path, trained: Tcp) -> None
     np.testing.assert_array_equal(held[name], trained.state_dict()[name])
 
 
-@pytest.mark.parametrize(
-    ("stack", "heads", "layout"),
-    [
-        ("vad-tiny", None, vad_tiny()),
-        ("vad-tiny", "bench2drive", vad_tiny(classes=9, map_classes=6, modes=6)),
-        ("uniad-tiny", None, uniad_tiny() | ANCHORS),
-        ("tcp", "beta", tcp("beta")),
-    ],
-)
-def test_published_files_fit_at_full_size(
-    tmp_path: Path, stack: str, heads: str | None, layout: dict[str, tuple[int, ...]]
-) -> None:
-    path = saved(tmp_path / "a.pth", mmcv(thin(layout)))
-    assert not mismatch(stack, path, heads=heads)
-
-
 def test_a_checkpoint_of_vad_is_told_how_its_images_are_normalised(
     tmp_path: Path,
 ) -> None:
@@ -130,7 +112,7 @@ def test_a_file_without_a_record_is_random_if_export_made_it(
     assert bool(named_weights(metadata)) == bool(line)
 
 
-def test_the_record_names_file_digest_and_count(
+def test_the_record_names_the_file_and_what_only_training_reads(
     tmp_path: Path, tensors: Tensors
 ) -> None:
     path = saved(tmp_path / "tcp.pth", mmcv(tensors))
@@ -144,24 +126,15 @@ def test_the_record_names_file_digest_and_count(
         "iteration": 211_080,
         "averaged": False,
     }
-    assert record.lines()[0] == (
-        f"weights: tcp.pth, epoch 60, iteration 211080, sha256 {record.sha256}"
-    )
-
-
-def test_what_only_training_reads_is_left_out_and_said(
-    tmp_path: Path, tensors: Tensors
-) -> None:
-    record = published_weights("tcp", saved(tmp_path / "a.pth", tensors)).record
-
-    assert record.lines()[1] == (
+    assert record.lines() == (
+        f"weights: tcp.pth, epoch 60, iteration 211080, sha256 {record.sha256}",
         "left out, 22 tensors that driving does not read: speed_branch,"
         " value_branch_traj, value_branch_ctrl, feature_branch_traj,"
-        " feature_branch_ctrl"
+        " feature_branch_ctrl",
     )
 
 
-@pytest.mark.parametrize("type_", [torch.float16, torch.bfloat16, torch.float64])
+@pytest.mark.parametrize("type_", [torch.bfloat16, torch.float64])
 def test_other_precisions_become_float32_and_are_said(
     tmp_path: Path, tensors: Tensors, type_: torch.dtype
 ) -> None:
@@ -170,22 +143,11 @@ def test_other_precisions_become_float32_and_are_said(
 
     floats = {each.dtype for n, each in found.tensors.items() if "tracked" not in n}
     assert floats == {torch.float32}
-    count = sum("tracked" not in name for name in found.tensors)
     kind = str(type_).removeprefix("torch.")
-    said = f"{count} tensors of {kind} converted to float32"
-    assert said in found.record.lines()
-
-
-def test_the_record_of_converted_weights_is_plain_json(
-    tmp_path: Path, tensors: Tensors
-) -> None:
-    half = {name: each.half() for name, each in tensors.items()}
-    record = published_weights("tcp", saved(tmp_path / "a.pth", half)).record
-
-    found = ExportResult("tcp", tmp_path / "a.pth", 17, record).to_json()
-    assert json.loads(json.dumps(found, default=str))["weights"]["converted"] == {
-        "float16": 230
-    }
+    assert f"230 tensors of {kind} converted to float32" in found.record.lines()
+    result = ExportResult("tcp", tmp_path / "a.pth", 17, found.record).to_json()
+    written = json.loads(json.dumps(result, default=str))
+    assert written["weights"]["converted"] == {kind: 230}
 
 
 def test_counters_may_be_missing(tmp_path: Path, tensors: Tensors) -> None:
@@ -195,25 +157,20 @@ def test_counters_may_be_missing(tmp_path: Path, tensors: Tensors) -> None:
     assert found["perception.bn1.num_batches_tracked"] == 0
 
 
-def test_moving_averages_are_left_out_and_said(tmp_path: Path, trained: Tcp) -> None:
+@pytest.mark.parametrize("ema", [False, True])
+def test_moving_averages_are_taken_where_asked_else_said(
+    tmp_path: Path, trained: Tcp, ema: bool
+) -> None:
     state = trained.state_dict()
     names = [name for name, _ in trained.named_parameters()]
-    found = read(saved(tmp_path / "a.pth", mmcv(averaged(state, names))))
+    found = read(saved(tmp_path / "a.pth", mmcv(averaged(state, names))), ema=ema)
 
-    assert torch.equal(found.tensors["output_traj.bias"], state["output_traj.bias"])
-    said = f"left out: {len(names)} moving averages; --ema takes them"
-    assert said in found.record.lines()
-
-
-def test_moving_averages_are_taken_where_asked(tmp_path: Path, trained: Tcp) -> None:
-    state = trained.state_dict()
-    names = [name for name, _ in trained.named_parameters()]
-    found = read(saved(tmp_path / "a.pth", mmcv(averaged(state, names))), ema=True)
-
-    assert torch.equal(found.tensors["output_traj.bias"], state["output_traj.bias"] + 1)
-    statistics = "perception.bn1.running_mean"
+    bias, statistics = "output_traj.bias", "perception.bn1.running_mean"
+    assert torch.equal(found.tensors[bias], state[bias] + int(ema))
     assert torch.equal(found.tensors[statistics], state[statistics])
-    assert found.record.averaged
+    assert found.record.averaged is ema
+    said = f"left out: {len(names)} moving averages; --ema takes them"
+    assert (said in found.record.lines()) is not ema
 
 
 def test_averages_that_are_not_there_are_missing(
@@ -224,52 +181,37 @@ def test_averages_that_are_not_there_are_missing(
         published_weights("tcp", path, ema=True)
 
 
-def without(tensors: Tensors) -> Tensors:
-    return {name: each for name, each in tensors.items() if name != "merge.2.bias"}
-
-
-def of_another_model(tensors: Tensors) -> Tensors:
-    return thin(vad_tiny())
-
-
-def of_another_shape(tensors: Tensors) -> Tensors:
-    return {**tensors, "merge.2.bias": torch.zeros(255)}
-
-
-def of_integers(tensors: Tensors) -> Tensors:
-    return {**tensors, "merge.2.bias": torch.zeros(256, dtype=torch.int64)}
-
-
-def not_finite(tensors: Tensors) -> Tensors:
-    return {**tensors, "merge.2.bias": torch.full((256,), float("nan"))}
-
-
-def too_large(tensors: Tensors) -> Tensors:
-    """Finite in float64 alone."""
-    return {**tensors, "merge.2.bias": torch.full((256,), 1e300, dtype=torch.float64)}
-
-
-def with_more(tensors: Tensors) -> Tensors:
-    return {**tensors, "brake_head.bias": torch.zeros(1)}
+BIAS = "merge.2.bias"
 
 
 @pytest.mark.parametrize(
-    ("alter", "words"),
+    ("altered", "words"),
     [
-        (without, "names missing (merge.2.bias)"),
-        (of_another_shape, "1 of another shape (merge.2.bias is [255] in it, [256] h"),
-        (of_integers, "1 not floating-point (merge.2.bias is int64)"),
-        (not_finite, "1 not finite (merge.2.bias)"),
-        (too_large, "1 not finite (merge.2.bias)"),
-        (with_more, "1 unexpected (brake_head.bias)"),
-        (of_another_model, "names missing (perception.conv1.weight, perception.bn1.w"),
+        ({BIAS: None}, "names missing (merge.2.bias)"),
+        ({BIAS: torch.zeros(255)}, "merge.2.bias is [255] in it, [256] here"),
+        (
+            {BIAS: torch.zeros(256, dtype=torch.int64)},
+            "1 not floating-point (merge.2.bias is int64)",
+        ),
+        ({BIAS: torch.full((256,), float("nan"))}, "1 not finite (merge.2.bias)"),
+        # finite in float64 alone
+        (
+            {BIAS: torch.full((256,), 1e300, dtype=torch.float64)},
+            "1 not finite (merge.2.bias)",
+        ),
+        ({"brake_head.bias": torch.zeros(1)}, "1 unexpected (brake_head.bias)"),
     ],
+    ids=["missing", "shape", "type", "nan", "overflow", "unexpected"],
 )
 def test_what_does_not_fit_is_named_in_one_line(
-    tmp_path: Path, tensors: Tensors, alter: object, words: str
+    tmp_path: Path,
+    tensors: Tensors,
+    altered: dict[str, torch.Tensor | None],
+    words: str,
 ) -> None:
-    assert callable(alter)
-    path = saved(tmp_path / "a.pth", alter(tensors))
+    held = {**tensors, **altered}
+    path = tmp_path / "a.pth"
+    saved(path, {name: each for name, each in held.items() if each is not None})
     with pytest.raises(GraphError) as error:
         published_weights("tcp", path)
     line = str(error.value)
@@ -280,19 +222,22 @@ def test_what_does_not_fit_is_named_in_one_line(
 
 
 def test_the_heads_that_would_fit_are_said(tmp_path: Path) -> None:
-    path = saved(tmp_path / "a.pth", thin(vad_tiny(classes=9, map_classes=6, modes=6)))
+    path = saved(tmp_path / "a.pth", thin(published("vad-tiny", "bench2drive")))
     with pytest.raises(GraphError, match=r"; it fits --heads bench2drive$"):
         published_weights("vad-tiny", path)
 
 
 def test_every_name_that_does_not_fit_can_be_asked_for(tmp_path: Path) -> None:
-    found = mismatch("tcp", saved(tmp_path / "a.pth", thin(vad_tiny())))
+    found = mismatch("tcp", saved(tmp_path / "a.pth", thin(published("vad-tiny"))))
     assert len(found.missing) > 100
-    assert set(found.unexpected) == set(vad_tiny())
+    assert set(found.unexpected) == set(published("vad-tiny"))
+    assert "(perception.conv1.weight, perception.bn1.weight, " in found.line()
 
 
 def test_anchors_of_uniad_are_asked_for(tmp_path: Path) -> None:
-    path = saved(tmp_path / "a.pth", thin(uniad_tiny()))
+    held = published("uniad-tiny")
+    del held["motion_head.kmeans_anchors"]
+    path = saved(tmp_path / "a.pth", thin(held))
     assert mismatch("uniad-tiny", path).missing == ["motion_head.kmeans_anchors"]
 
 
@@ -304,7 +249,8 @@ def test_a_stack_without_an_original(tmp_path: Path) -> None:
 def test_nothing_is_written_of_what_does_not_fit(
     tmp_path: Path, tensors: Tensors
 ) -> None:
-    path = saved(tmp_path / "a.pth", without(tensors))
+    del tensors[BIAS]
+    path = saved(tmp_path / "a.pth", tensors)
     with pytest.raises(GraphError, match="names missing"):
         export_stack("tcp", tmp_path / "out.onnx", ExportOptions(weights=path))
     assert not (tmp_path / "out.onnx").exists()
@@ -316,14 +262,18 @@ def test_a_checkpoint_is_not_overwritten(tmp_path: Path, tensors: Tensors) -> No
         export_stack("tcp", path, ExportOptions(weights=path, force=True))
 
 
-def test_a_seed_has_nothing_to_draw() -> None:
-    with pytest.raises(RecipeError, match="--seed draws weights, --weights brings"):
-        ExportOptions(seed=0, weights=Path("a.pth"))
-
-
-def test_averages_of_no_checkpoint() -> None:
-    with pytest.raises(RecipeError, match="--ema needs --weights"):
-        ExportOptions(ema=True)
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"seed": 0, "weights": Path("a.pth")}, "--seed draws weights, --weights bri"),
+        ({"ema": True}, "--ema needs --weights"),
+    ],
+)
+def test_options_that_contradict_the_weights(
+    options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(RecipeError, match=words):
+        ExportOptions(**options)
 
 
 @pytest.mark.parametrize("operators", ["standard", "plugin"])
@@ -333,8 +283,7 @@ def test_an_export_is_of_the_checkpoint_and_names_it(
     operators: Literal["standard", "plugin"],
 ) -> None:
     """As far as the trace, which takes minutes at full size."""
-    layout = {name: each for name, each in vad_tiny().items() if "tracked" not in name}
-    path = saved(tmp_path / "a.pth", mmcv(thin(layout)))
+    path = saved(tmp_path / "a.pth", mmcv(thin(published("vad-tiny"))))
     traced: list[torch.nn.Module] = []
 
     def trace(spec: Stack, model: torch.nn.Module, opset: int) -> onnx.ModelProto:

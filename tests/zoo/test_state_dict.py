@@ -37,19 +37,15 @@ def test_wrappers_in_wrappers(tmp_path: Path) -> None:
     assert same(read_state_dict(path).tensors)
 
 
-def test_what_mmcv_counts(tmp_path: Path) -> None:
-    found = read_state_dict(saved(tmp_path / "a.pth", mmcv(TENSORS)))
-    assert (found.epoch, found.iteration) == (60, 211_080)
-
-
-def test_what_lightning_counts(tmp_path: Path) -> None:
-    found = read_state_dict(saved(tmp_path / "a.ckpt", lightning(TENSORS)))
-    assert (found.epoch, found.iteration) == (31, 9_000)
-
-
-def test_nothing_is_counted_where_nothing_is_stated(tmp_path: Path) -> None:
-    found = read_state_dict(saved(tmp_path / "a.pth", TENSORS))
-    assert (found.epoch, found.iteration) == (None, None)
+@pytest.mark.parametrize(
+    ("wrap", "counts"),
+    [(mmcv, (60, 211_080)), (lightning, (31, 9_000)), (dict, (None, None))],
+)
+def test_epoch_and_iteration_are_those_that_the_file_states(
+    tmp_path: Path, wrap: Callable[[Tensors], object], counts: tuple[int | None, ...]
+) -> None:
+    found = read_state_dict(saved(tmp_path / "a.pth", wrap(TENSORS)))
+    assert (found.epoch, found.iteration) == counts
 
 
 def test_safetensors(tmp_path: Path) -> None:
@@ -121,14 +117,12 @@ def test_what_holds_no_tensors_by_name(
     assert message in str(error.value)
 
 
-def test_what_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(GraphError, match=r"a\.pth: No such file"):
-        read_state_dict(tmp_path / "a.pth")
-
-
-def test_a_folder(tmp_path: Path) -> None:
-    with pytest.raises(GraphError, match="it is a folder"):
-        read_state_dict(tmp_path)
+@pytest.mark.parametrize(
+    ("name", "words"), [("a.pth", r"a\.pth: No such file"), ("", "it is a folder")]
+)
+def test_what_is_no_file(tmp_path: Path, name: str, words: str) -> None:
+    with pytest.raises(GraphError, match=words):
+        read_state_dict(tmp_path / name)
 
 
 @settings(max_examples=60, deadline=None)

@@ -8,20 +8,21 @@ code, so node *i* of the marked file is node *i* of the plain one.
 
 import copy
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import onnx
+import torch
+from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import flop_registry
 
 from me2e_compress.errors import GraphError
 from me2e_compress.zoo.export import build, example, trace
 from me2e_compress.zoo.regions import listening
 from me2e_compress.zoo.stacks import Stack, find
-
-if TYPE_CHECKING:
-    from torch import nn
 
 MARK = "region@"
 """Begins the scope that a region pushes, and @ ends the name of the module in it: no
@@ -29,6 +30,13 @@ attribute has an @, and the exporter appends a number when it enters a scope aga
 
 NOT_COMPUTE = frozenset({"Constant", "Identity"})
 """Nodes that hold or rename values; the exporter shares and places them freely."""
+
+aten = torch.ops.aten
+
+COUNTED = (aten.convolution, aten.mm, aten.addmm, aten.bmm, aten.baddbmm)
+"""What becomes Conv, Gemm and MatMul."""
+
+FLOPS_PER_MAC = 2
 
 
 @dataclass(frozen=True)
@@ -61,7 +69,7 @@ def record(
 
 def truth_of(
     spec: Stack,
-    model: "nn.Module",
+    model: nn.Module,
     opset: int = 17,
     *,
     plain: onnx.ModelProto | None = None,
@@ -106,8 +114,6 @@ def _align(plain: onnx.ModelProto, marked: onnx.ModelProto) -> dict[str, str]:
 @contextmanager
 def _push_scope(module: str) -> Iterator[None]:
     """Make the module a scope of what is traced."""
-    import torch
-
     state = torch._C._get_tracing_state()
     if state is None:
         yield
@@ -120,16 +126,36 @@ def _push_scope(module: str) -> Iterator[None]:
         state.pop_scope()
 
 
-def count_macs(spec: Stack, model: "nn.Module") -> dict[str, int]:
+class MacCounter(TorchDispatchMode):
+    """Tell a function the multiply-accumulates of every product that runs inside."""
+
+    def __init__(self, add: Callable[[int], None]) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self._add = add
+
+    def __torch_dispatch__(
+        self,
+        func: torch._ops.OpOverload,
+        types: Sequence[type],
+        args: tuple[Any, ...] = (),
+        kwargs: Mapping[str, Any] | None = None,
+    ) -> Any:
+        """Run the operator and count it."""
+        options = dict(kwargs or {})
+        out = func(*args, **options)
+        packet = func._overloadpacket
+        if packet in COUNTED:
+            flops = flop_registry[packet](*args, **options, out_val=out)
+            self._add(int(flops) // FLOPS_PER_MAC)
+        return out
+
+
+def count_macs(spec: Stack, model: nn.Module) -> dict[str, int]:
     """Return the multiply-accumulates of one forward pass by module.
 
     Raises:
         GraphError: Something multiplied outside of every region.
     """
-    import torch
-
-    from tests.zoo.counter import MacCounter
-
     stack: list[str] = []
     macs: Counter[str] = Counter()
 

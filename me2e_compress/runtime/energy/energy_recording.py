@@ -6,8 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.errors import EnergyError
-from me2e_compress.runtime.energy.energy_result import EnergyResult
-from me2e_compress.runtime.energy.energy_summary import CountedBy, summarise
+from me2e_compress.runtime.energy.energy_result import (
+    CountedBy,
+    EnergyResult,
+    summarise,
+)
 from me2e_compress.runtime.energy.estimate import FEWEST_WINDOWS, Window
 from me2e_compress.runtime.energy.schedule import EnergySchedule
 

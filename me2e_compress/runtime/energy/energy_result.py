@@ -1,16 +1,19 @@
 """The measured energy of a model on one machine, or the reason why there is none."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeAlias
 
+import numpy as np
 from pydantic import Field, TypeAdapter
 
 from me2e_compress import documents
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import EnergyError
 from me2e_compress.runtime.atomic import write_document
+from me2e_compress.runtime.energy.estimate import Window, estimate
+from me2e_compress.runtime.energy.reader import DeviceState
 
 Finite: TypeAlias = Annotated[float, Field(allow_inf_nan=False)]
 NotNegative: TypeAlias = Annotated[float, Field(allow_inf_nan=False, ge=0)]
@@ -166,3 +169,68 @@ class EnergyResult(Displayed):
         with documents.reading(path, EnergyError, "not an energy file"):
             record = documents.from_json(documents.content(path))
             return TypeAdapter(cls).validate_python(record)
+
+
+@dataclass(frozen=True)
+class CountedBy:
+    """Description of the counter, copied into the result."""
+
+    counter: str
+    device: str
+    scope: str
+    step_s: float
+
+
+def summarise(
+    windows: Sequence[Window],
+    by: CountedBy,
+    idle_w: float | None,
+    *,
+    states: Sequence[DeviceState] = (),
+    power_j_per_frame: float | None = None,
+    warnings: tuple[str, ...] = (),
+) -> EnergyResult:
+    """Return the energy result of one model.
+
+    ``idle_w`` is None where the idle device was not measured; ``states`` are those
+    before and after each window.
+    """
+    found = estimate(windows, by.step_s, idle_w)
+    # Pauses between frames are not part of a frame's time.
+    frames = sum(each.frames for each in windows)
+    frame_s = sum(each.taken_s - each.paused_s for each in windows) / frames
+    # Not every device reports temperatures or clocks.
+    warmth = [e.temperature_c for e in states if e.temperature_c is not None]
+    throttled = dict.fromkeys(reason for each in states for reason in each.throttled)
+    return EnergyResult(
+        joules=sum(each.joules for each in windows),
+        frames=frames,
+        j_per_frame=found.j_per_frame,
+        net_j_per_frame=None
+        if idle_w is None
+        else found.j_per_frame - idle_w * frame_s,
+        low=found.low,
+        high=found.high,
+        windows=len(windows),
+        window_s=float(np.mean([each.taken_s for each in windows])),
+        counter=by.counter,
+        counter_step_s=by.step_s,
+        idle_w=idle_w,
+        temperature=(warmth[0], warmth[-1]) if warmth else None,
+        clocks=_clocks(states),
+        throttled=tuple(throttled),
+        device=by.device,
+        scope=by.scope,
+        window_j_per_frame=tuple(each.joules / each.frames for each in windows),
+        power_j_per_frame=power_j_per_frame,
+        warnings=warnings,
+    )
+
+
+def _clocks(states: Sequence[DeviceState]) -> dict[str, tuple[float, float]]:
+    """Return the lowest and highest MHz of each clock."""
+    seen: dict[str, list[float]] = {}
+    for state in states:
+        for name, mhz in state.clocks_mhz.items():
+            seen.setdefault(name, []).append(mhz)
+    return {name: (min(each), max(each)) for name, each in seen.items()}

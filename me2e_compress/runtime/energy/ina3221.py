@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from me2e_compress.errors import EnergyError
 from me2e_compress.runtime.energy.energy_counter import EnergyCounter
-from me2e_compress.runtime.energy.reader import Absent, Reader
+from me2e_compress.runtime.energy.reader import Absent, Reader, text_in
 
 INPUTS = ("VDD_IN", "POM_5V_IN")
 """Rails that feed the module (Xavier NX, Orin NX and Nano, TX2; Nano). All others
@@ -85,11 +85,11 @@ class Ina3221Reader(Reader):
         averaging = ", ".join(
             f"{name} {text}"
             for name in ("samples", "update_interval")
-            if (text := _text(sensors[0] / name))
+            if (text := text_in(sensors[0] / name))
         )
         rails = " + ".join(each.label for each in channels)
         self.scope = f"{rails} ({averaging})" if averaging else rails
-        self.step_s = _seconds(_text(sensors[0] / "update_interval"))
+        self.step_s = _seconds(text_in(sensors[0] / "update_interval"))
 
     def watts(self) -> float:
         """Return the summed power of the chosen rails."""
@@ -112,7 +112,7 @@ def _channels(sensor: Path) -> list[Channel]:
     return [
         Channel(label, sensor / f"in{number}_input", sensor / f"curr{number}_input")
         for number in (1, 2, 3)
-        if (label := _text(sensor / f"in{number}_label")) not in ("", "NC")
+        if (label := text_in(sensor / f"in{number}_label")) not in ("", "NC")
         and (sensor / f"curr{number}_input").exists()
     ]
 
@@ -122,10 +122,3 @@ def _seconds(milliseconds: str) -> float | None:
         return int(milliseconds) / 1e3 or None
     except ValueError:
         return None
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text().strip()
-    except OSError:
-        return ""

@@ -11,8 +11,11 @@ from statistics import fmean, median
 import numpy as np
 
 from me2e_compress.errors import EnergyError
-from me2e_compress.runtime.energy.energy_result import EnergyResult
-from me2e_compress.runtime.energy.energy_summary import CountedBy, summarise
+from me2e_compress.runtime.energy.energy_result import (
+    CountedBy,
+    EnergyResult,
+    summarise,
+)
 from me2e_compress.runtime.energy.estimate import BEATS, Window, beat, detuning
 from me2e_compress.runtime.energy.power import (
     FEWEST_SAMPLES,

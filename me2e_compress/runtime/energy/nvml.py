@@ -49,12 +49,12 @@ class Nvml(EnergyCounter):
             pynvml.nvmlInit()
         except pynvml.NVMLError as error:
             return Absent(str(error))
-        reader = self._asked()
+        reader = self._reader()
         if isinstance(reader, Absent):
             pynvml.nvmlShutdown()
         return reader
 
-    def _asked(self) -> Reader | Absent:
+    def _reader(self) -> Reader | Absent:
         try:
             handle = pynvml.nvmlDeviceGetHandleByIndex(self.index)
         except pynvml.NVMLError as error:
@@ -104,8 +104,8 @@ class NvmlReader(Reader):
             for bit, words in _SLOWED.items()
             if mask is not None and int(mask) & getattr(pynvml, bit)
         )
-        told = {name: mhz for name, mhz in clocks.items() if mhz is not None}
-        return DeviceState(degrees, told, slowed)
+        known = {name: mhz for name, mhz in clocks.items() if mhz is not None}
+        return DeviceState(degrees, known, slowed)
 
     def close(self) -> None:
         """Shut down NVML."""

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from me2e_compress.errors import EnergyError
 from me2e_compress.runtime.energy.energy_counter import EnergyCounter
-from me2e_compress.runtime.energy.reader import Absent, Reader
+from me2e_compress.runtime.energy.reader import Absent, Reader, text_in
 from me2e_compress.runtime.profile import processor
 
 _COUNTED = ("package", "dram")
@@ -34,7 +34,7 @@ class Rapl(EnergyCounter):
         zones = {
             zone: name
             for zone in sorted(self.root.glob("intel-rapl:*"))
-            if (name := _text(zone / "name")) and name.startswith(_COUNTED)
+            if (name := text_in(zone / "name")) and name.startswith(_COUNTED)
         }
         if not any(name.startswith("package") for name in zones.values()):
             return Absent(f"no package in {self.root}")
@@ -90,10 +90,3 @@ class _Zone:
                 )
         self._last, self._moved = now, self._moved + step
         return self._moved
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text().strip()
-    except OSError:
-        return ""

@@ -1,4 +1,4 @@
-"""Attention and feed-forward blocks."""
+"""Attention blocks."""
 
 import torch
 from torch import Tensor, nn
@@ -6,14 +6,13 @@ from torch.nn import functional
 
 from me2e_compress.zoo.bev.fused_attention import fused_deformable_attention
 from me2e_compress.zoo.bev.sampling import sample
-from me2e_compress.zoo.bev.sizes import ATTENTION_HEADS, EMBED, FEED_FORWARD, Sampling
+from me2e_compress.zoo.bev.sizes import ATTENTION_HEADS, EMBED, Sampling
 
 Levels = tuple[tuple[int, int], ...]
 """Height and width of each feature level."""
 
 MASKED_LOGIT = -1.0e4
 """Softmax makes it 0; unlike minus infinity it fits float16 and any observer."""
-
 
 HEAD_SCALE = (EMBED // ATTENTION_HEADS) ** -0.5
 
@@ -60,7 +59,7 @@ def _split_heads(x: Tensor) -> Tensor:
 
 
 class MultiheadAttention(nn.Module):
-    """Attention with positions added to query and key, and a residual."""
+    """Attention with a residual; positions may be added to query and key."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -70,29 +69,18 @@ class MultiheadAttention(nn.Module):
         self,
         query: Tensor,
         key: Tensor,
-        query_pos: Tensor,
-        key_pos: Tensor,
+        query_pos: Tensor | None = None,
+        key_pos: Tensor | None = None,
         ignore: Tensor | None = None,
     ) -> Tensor:
-        """Map [B, Q, 256] and keys, which are also the values, to [B, Q, 256]."""
-        attended: Tensor = self.attn(query + query_pos, key + key_pos, key, ignore)
+        """Map [B, Q, 256] and keys, which are also the values, to [B, Q, 256].
+
+        ``ignore`` is as in `PackedAttention`.
+        """
+        asked = query if query_pos is None else query + query_pos
+        offered = key if key_pos is None else key + key_pos
+        attended: Tensor = self.attn(asked, offered, key, ignore)
         return query + attended
-
-
-class FeedForward(nn.Module):
-    """Linear, ReLU, linear, residual."""
-
-    def __init__(self, width: int = FEED_FORWARD) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
-            nn.Sequential(nn.Linear(EMBED, width), nn.ReLU()),
-            nn.Linear(width, EMBED),
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map [..., 256] to [..., 256]."""
-        out: Tensor = x + self.layers(x)
-        return out
 
 
 def deformable_attention(

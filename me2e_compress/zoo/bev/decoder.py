@@ -3,12 +3,9 @@
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.bev.attention import (
-    DecoderAttention,
-    FeedForward,
-    MultiheadAttention,
-)
-from me2e_compress.zoo.bev.sizes import EMBED, BevGrid, Sampling
+from me2e_compress.zoo.bev.attention import DecoderAttention, MultiheadAttention
+from me2e_compress.zoo.bev.layers import AttentionLayer
+from me2e_compress.zoo.bev.sizes import BevGrid, Sampling
 
 EPSILON = torch.tensor(1.0e-5)
 """Keeps the inverse sigmoid finite (deformable DETR). A tensor: the exporter would
@@ -38,34 +35,15 @@ def in_metres(raw: Tensor, at: Tensor, grid: BevGrid) -> Tensor:
     return torch.cat([x, y, raw[..., 2:4], z, raw[..., 5:]], -1)
 
 
-class DecoderLayer(nn.Module):
-    """Self-attention, cross-attention to the BEV, and feed-forward."""
-
-    def __init__(self, hw: tuple[int, int], sampling: Sampling) -> None:
-        super().__init__()
-        self.attentions = nn.ModuleList(
-            [MultiheadAttention(), DecoderAttention(hw, sampling)]
-        )
-        self.ffns = nn.ModuleList([FeedForward()])
-        self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(3))
-
-    def forward(
-        self,
-        query: Tensor,
-        pos: Tensor,
-        bev: Tensor,
-        at: Tensor,
-        ignore: Tensor | None = None,
-    ) -> Tensor:
-        """Map [1, Q, 256] to the same; ``at`` is [1, Q, 2], ``ignore`` [1, Q] bool."""
-        query = self.norms[0](self.attentions[0](query, query, pos, pos, ignore))
-        query = self.norms[1](self.attentions[1](query, pos, bev, at))
-        out: Tensor = self.norms[2](self.ffns[0](query))
-        return out
+Decoded = tuple[list[Tensor], list[Tensor], list[Tensor]]
+"""What a `Decoder` returns for its layers: queries, raw regressions, references."""
 
 
 class Decoder(nn.Module):
-    """`DecoderLayer`s and branches; ``precise`` if references are fed back."""
+    """Self-attention and attention to the BEV in layers, and a branch for each.
+
+    ``precise`` is for references that are fed back.
+    """
 
     def __init__(
         self,
@@ -79,7 +57,10 @@ class Decoder(nn.Module):
         super().__init__()
         self.height = height
         self.sigmoid = precise_sigmoid if precise else torch.sigmoid
-        self.layers = nn.ModuleList(DecoderLayer(hw, sampling) for _ in range(layers))
+        self.layers = nn.ModuleList(
+            AttentionLayer(MultiheadAttention(), DecoderAttention(hw, sampling))
+            for _ in range(layers)
+        )
 
     def forward(
         self,
@@ -89,7 +70,7 @@ class Decoder(nn.Module):
         reference: Tensor,
         branches: nn.ModuleList,
         ignore: Tensor | None = None,
-    ) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+    ) -> Decoded:
         """Decode queries [1, Q, 256] with references [1, Q, 2 or 3], 0..1.
 
         Columns 0 and 1 of a layer's branch, and 4 with heights, move the reference.
@@ -99,7 +80,8 @@ class Decoder(nn.Module):
         """
         queries, regressions, references = [], [], []
         for layer, branch in zip(self.layers, branches, strict=True):
-            query = layer(query, pos, bev, reference[..., :2], ignore)
+            known = query, pos, pos, ignore
+            query = layer(query, known, (pos, bev, reference[..., :2]))
             raw = branch(query)
             # Move the reference in logit space
             moves = raw[..., :2]
@@ -112,36 +94,25 @@ class Decoder(nn.Module):
         return queries, regressions, references
 
 
-class InteractionLayer(nn.Module):
-    """Cross-attention and feed-forward."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.attentions = nn.ModuleList([MultiheadAttention()])
-        self.ffns = nn.ModuleList([FeedForward()])
-        self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(2))
-
-    def forward(
-        self,
-        query: Tensor,
-        key: Tensor,
-        query_pos: Tensor,
-        key_pos: Tensor,
-        ignore: Tensor | None,
-    ) -> Tensor:
-        """Map [B, Q, 256] and keys [B or 1, K, 256] to [B, Q, 256]."""
-        attended = self.attentions[0](query, key, query_pos, key_pos, ignore)
-        query = self.norms[0](attended)
-        out: Tensor = self.norms[1](self.ffns[0](query))
-        return out
+def detections(
+    decoded: Decoded, branches: nn.ModuleList, grid: BevGrid
+) -> tuple[Tensor, Tensor]:
+    """Return the scores of all layers, [layers, 1, Q, classes], and boxes in metres."""
+    queries, regressions, references = decoded
+    scores = [branch(query) for branch, query in zip(branches, queries, strict=True)]
+    boxes = [
+        in_metres(raw, at, grid)
+        for raw, at in zip(regressions, references, strict=True)
+    ]
+    return torch.stack(scores), torch.stack(boxes)
 
 
 class Interaction(nn.Module):
-    """Cross-attention of one kind of query to another: one `InteractionLayer`."""
+    """Cross-attention of one kind of query to another, and a feed-forward."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.layers = nn.ModuleList([InteractionLayer()])
+        self.layers = nn.ModuleList([AttentionLayer(MultiheadAttention())])
 
     def forward(
         self,
@@ -151,6 +122,6 @@ class Interaction(nn.Module):
         key_pos: Tensor,
         ignore: Tensor | None = None,
     ) -> Tensor:
-        """Apply the layer."""
-        out: Tensor = self.layers[0](query, key, query_pos, key_pos, ignore)
+        """Map [B, Q, 256] and keys [B or 1, K, 256] to [B, Q, 256]."""
+        out: Tensor = self.layers[0](query, (key, query_pos, key_pos, ignore))
         return out

@@ -3,8 +3,9 @@
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.bev.attention import FeedForward, Levels, deformable_attention
-from me2e_compress.zoo.bev.reference_points import pillars, project
+from me2e_compress.zoo.bev.attention import Levels, deformable_attention
+from me2e_compress.zoo.bev.layers import AttentionLayer
+from me2e_compress.zoo.bev.reference_points import cell_centres, pillars, project
 from me2e_compress.zoo.bev.sizes import (
     ATTENTION_HEADS,
     EMBED,
@@ -127,36 +128,11 @@ class SpatialCrossAttention(nn.Module):
         return query + read
 
 
-class EncoderLayer(nn.Module):
-    """Temporal attention, camera attention and feed-forward, each normalised."""
-
-    def __init__(self, hw: tuple[int, int], hws: Levels, sampling: Sampling) -> None:
-        super().__init__()
-        self.attentions = nn.ModuleList(
-            [TemporalSelfAttention(hw, sampling), SpatialCrossAttention(hws, sampling)]
-        )
-        self.ffns = nn.ModuleList([FeedForward()])
-        self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(3))
-
-    def forward(
-        self,
-        query: Tensor,
-        pos: Tensor,
-        queue: Tensor,
-        cells_at: Tensor,
-        tokens: Tensor,
-        pillars_at: Tensor,
-        visible: Tensor,
-    ) -> Tensor:
-        """Map [1, cells, 256] to [1, cells, 256]."""
-        query = self.norms[0](self.attentions[0](query, pos, queue, cells_at))
-        query = self.norms[1](self.attentions[1](query, tokens, pillars_at, visible))
-        out: Tensor = self.norms[2](self.ffns[0](query))
-        return out
-
-
 class BevEncoder(nn.Module):
-    """`EncoderLayer`s over a grid; ``hws`` are the feature levels of a camera."""
+    """Layers of temporal and camera attention over a grid.
+
+    ``hws`` are the feature levels of a camera.
+    """
 
     pillars: Tensor
     cells: Tensor
@@ -172,18 +148,16 @@ class BevEncoder(nn.Module):
         super().__init__()
         self.image_hw = image_hw
         self.layers = nn.ModuleList(
-            EncoderLayer(grid.hw, hws, sampling) for _ in range(layers)
+            AttentionLayer(
+                TemporalSelfAttention(grid.hw, sampling),
+                SpatialCrossAttention(hws, sampling),
+            )
+            for _ in range(layers)
         )
         # Constant reference points
         points = pillars(grid.hw, grid.pc_range, PILLAR_POINTS)
         self.register_buffer("pillars", points, False)
-        rows, columns = torch.meshgrid(
-            (torch.arange(grid.hw[0]) + 0.5) / grid.hw[0],
-            (torch.arange(grid.hw[1]) + 0.5) / grid.hw[1],
-            indexing="ij",
-        )
-        cells = torch.stack([columns, rows], -1).view(1, -1, 2)
-        self.register_buffer("cells", cells, False)
+        self.register_buffer("cells", cell_centres(grid.hw), False)
 
     def forward(
         self,
@@ -212,7 +186,7 @@ class BevEncoder(nn.Module):
             older = torch.where(first, query, previous)
             newer = torch.where(first, query, start)
             queue = torch.cat([older, newer], 0)
-            query = layer(query, pos, queue, cells_at, tokens, pillars_at, visible)
+            query = layer(query, (pos, queue, cells_at), (tokens, pillars_at, visible))
         return query
 
 

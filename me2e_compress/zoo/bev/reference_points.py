@@ -24,6 +24,14 @@ def pillars(hw: tuple[int, int], pc_range: tuple[float, ...], heights: int) -> T
     return torch.cat([metres, torch.ones_like(metres[..., :1])], -1).unsqueeze(-1)
 
 
+def cell_centres(hw: tuple[int, int]) -> Tensor:
+    """Return the centres of the cells of a grid, [1, cells, 2]: x and y, 0..1."""
+    rows, columns = torch.meshgrid(
+        *((torch.arange(count) + 0.5) / count for count in hw), indexing="ij"
+    )
+    return torch.stack([columns, rows], -1).view(1, -1, 2)
+
+
 def project(
     points: Tensor, lidar2img: Tensor, image_hw: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:

@@ -19,9 +19,6 @@ ACTIONS = 39
 DISTRIBUTIONS = 2
 """The original: one Beta distribution of acceleration and one of steer."""
 
-EXPERT_FEATURES = 1536
-"""Features of Bench2Drive's expert, which training imitates."""
-
 ACTION_SIZE: dict[ActionHeads, int] = {
     "bench2drive": ACTIONS,
     "beta": 2 * DISTRIBUTIONS,

@@ -1,26 +1,92 @@
 """The whole TCP model."""
 
+import itertools
+
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
+from me2e_compress.zoo.drawing import Gains, draw_weights, one_thread, take_statistics
 from me2e_compress.zoo.regions import region
-from me2e_compress.zoo.tcp.branches import (
-    ImageTrunk,
-    MapReader,
-    RecurrentCell,
-    layers,
-    scorer,
-)
+from me2e_compress.zoo.resnet import ResNet
 from me2e_compress.zoo.tcp.config import (
     ACTION_SIZE,
     DISTRIBUTIONS,
-    EXPERT_FEATURES,
     STATE,
     ActionHeads,
     TcpConfig,
 )
 
 PUBLISHED = TcpConfig()
+
+GAINS = Gains(
+    by_name=(
+        (r"weight_(ih|hh)|action_head|dist_", 1.0),
+        (r"output_traj", 1.0),
+    ),
+    last_norm=r"layer\d\.\d\.bn2\.weight$",
+)
+
+
+class ImageTrunk(ResNet):
+    """ResNet-34 with its classifier: maps the strip to a vector and a feature map."""
+
+    def __init__(self, config: TcpConfig) -> None:
+        super().__init__(config.stem, bottleneck=False)
+        self.fc = nn.Linear(self.channels[-1], config.classes)
+
+    def forward(self, img: Tensor) -> tuple[Tensor, Tensor]:
+        """Map [1, 3, 256, 900] to [1, 1000] and [1, 512, 8, 29]."""
+        features = self.stages(img)[-1]
+        return self.fc(features.mean((2, 3))), features
+
+
+class RecurrentCell(nn.Module):
+    """An ``nn.GRUCell`` (Cho et al. 2014) that the exporter supports."""
+
+    def __init__(self, size: int, hidden: int) -> None:
+        super().__init__()
+        self.weight_ih = nn.Parameter(torch.empty(3 * hidden, size))
+        self.weight_hh = nn.Parameter(torch.empty(3 * hidden, hidden))
+        self.bias_ih = nn.Parameter(torch.empty(3 * hidden))
+        self.bias_hh = nn.Parameter(torch.empty(3 * hidden))
+
+    def forward(self, x: Tensor, hidden: Tensor) -> Tensor:
+        """Map [1, size] and [1, hidden] to [1, hidden]."""
+        seen = functional.linear(x, self.weight_ih, self.bias_ih).chunk(3, 1)
+        known = functional.linear(hidden, self.weight_hh, self.bias_hh).chunk(3, 1)
+        reset = torch.sigmoid(seen[0] + known[0])
+        keep = torch.sigmoid(seen[1] + known[1])
+        new = torch.tanh(seen[2] + reset * known[2])
+        return new + keep * (hidden - new)
+
+
+class MapReader(nn.Sequential):
+    """Maps a vector to weights over the cells of the image map, which sum to 1."""
+
+    def __init__(self, size: int, config: TcpConfig) -> None:
+        rows, columns = config.map_hw
+        super().__init__(
+            nn.Linear(size, config.hidden),
+            nn.ReLU(),
+            nn.Linear(config.hidden, rows * columns),
+            nn.Softmax(1),
+        )
+        self.hw = config.map_hw
+
+    def read(self, features: Tensor, by: Tensor) -> Tensor:
+        """Return [1, 512], the weighted sum of the map [1, 512, 8, 29]."""
+        weights = self(by).view(1, 1, *self.hw)
+        read: Tensor = (features * weights).sum((2, 3))
+        return read
+
+
+def layers(*sizes: int) -> nn.Sequential:
+    """Build linear layers of the given sizes, each with a ReLU."""
+    built = nn.Sequential()
+    for size, out in itertools.pairwise(sizes):
+        built.extend([nn.Linear(size, out), nn.ReLU()])
+    return built
 
 
 class Tcp(nn.Module):
@@ -30,16 +96,14 @@ class Tcp(nn.Module):
     dimensions and the original's parameter names. Nothing is remembered between frames.
     PID control of the waypoints, the choice of an action and the fusion of both heads
     are up to the host. Head ``bench2drive`` scores 39 actions; ``beta``, the original,
-    returns Beta distributions of acceleration and steer. ``training_branches`` holds
-    the branches used only in training: 1,375,491 parameters of Bench2DriveZoo's
-    26,593,444.
+    returns Beta distributions of acceleration and steer. The branches used only in
+    training are left out: 1,375,491 parameters of Bench2DriveZoo's 26,593,444.
     """
 
     def __init__(
         self,
         heads: ActionHeads = "bench2drive",
         *,
-        training_branches: bool = False,
         config: TcpConfig = PUBLISHED,
     ) -> None:
         super().__init__()
@@ -72,8 +136,6 @@ class Tcp(nn.Module):
         self.merge = nn.Sequential(
             nn.Linear(channels + hidden, joint), nn.ReLU(), nn.Linear(joint, hidden)
         )
-        if training_branches:
-            self._add_training_branches()
 
     def _add_action_head(self, hidden: int) -> None:
         if self.heads == "bench2drive":
@@ -82,15 +144,6 @@ class Tcp(nn.Module):
         for name in ("dist_mu", "dist_sigma"):
             positive = nn.Sequential(nn.Linear(hidden, DISTRIBUTIONS), nn.Softplus())
             self.add_module(name, positive)
-
-    def _add_training_branches(self) -> None:
-        hidden = self.config.hidden
-        self.speed_branch = scorer(self.config.classes, hidden)
-        self.value_branch_traj = scorer(hidden, hidden)
-        self.value_branch_ctrl = scorer(hidden, hidden)
-        if self.heads == "bench2drive":
-            self.feature_branch_traj = layers(hidden, EXPERT_FEATURES)
-            self.feature_branch_ctrl = layers(hidden, EXPERT_FEATURES)
 
     def forward(
         self, img: Tensor, state: Tensor, target_point: Tensor
@@ -160,3 +213,10 @@ class Tcp(nn.Module):
             return out
         parameters = [self.get_submodule(n)(policy) for n in ("dist_mu", "dist_sigma")]
         return torch.cat(parameters, -1)
+
+
+def initialise(model: Tcp, images: Tensor, seed: int) -> None:
+    """Draw parameters, then statistics of images [N, 3, H, W], normalised, in place."""
+    draw_weights(model, GAINS, seed)
+    with one_thread():
+        take_statistics(model.perception, images)

@@ -66,7 +66,8 @@ class UniadConfig:
         upsampled: scale of the view for the heads after tracking.
         labels: of the data set.
         queries: new track queries per frame, the last of which is the ego vehicle's.
-        tracks: slots for tracks that survive a frame.
+        tracks: slots for tracks that survive a frame: with the new queries 1150,
+            DL4AGX's maximum.
         encoder_layers: of the BEV encoder.
         decoder_layers: of the track decoder, and of both halves of the map head.
         map_queries: number of lanes.

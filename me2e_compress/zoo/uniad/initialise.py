@@ -1,21 +1,20 @@
-"""Build UniAD with weights from a seed, calibrated on images of six cameras."""
+"""Draw weights of UniAD, calibrated on images of six cameras."""
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from me2e_compress.zoo.bev.can_bus import CAN_BUS
-from me2e_compress.zoo.bev.neck import FeaturePyramid
-from me2e_compress.zoo.bev.sizes import BOX_CODE, EMBED, Sampling
-from me2e_compress.zoo.drawing import Gains, draw_weights, one_thread, take_statistics
-from me2e_compress.zoo.stacks import Stack
-from me2e_compress.zoo.synthetic_frames import frames
-from me2e_compress.zoo.uniad.config import (
-    AGENT_MODES,
-    CONFIGS,
+from me2e_compress.zoo.bev.sizes import BOX_CODE, EMBED
+from me2e_compress.zoo.bev.transformer import CAN_BUS, Motions
+from me2e_compress.zoo.drawing import (
+    Gains,
+    draw_weights,
+    normalise_neck,
+    one_thread,
+    take_statistics,
 )
+from me2e_compress.zoo.uniad.config import AGENT_MODES
 from me2e_compress.zoo.uniad.motion import Agents, Forecasts
-from me2e_compress.zoo.uniad.perception import Motions
 from me2e_compress.zoo.uniad.stack import UniadTiny
 from me2e_compress.zoo.uniad.track_life import BEGINS
 
@@ -64,22 +63,6 @@ STEADY = 0.1
 AGENTS = 8
 
 
-def build_uniad(
-    spec: Stack,
-    *,
-    seed: int = 0,
-    sampling: Sampling = "operator",
-    dead: bool = False,
-) -> UniadTiny:
-    """Build and initialise; the same seed gives the same bytes."""
-    config = CONFIGS[spec.name]
-    model = UniadTiny(config, sampling, dead=dead).requires_grad_(False).eval()
-    (frame,) = frames(spec, 1, seed)
-    images = torch.from_numpy(frame["img"])[0]
-    initialise(model, images, torch.from_numpy(frame["lidar2img"]), seed)
-    return model
-
-
 def initialise(
     model: UniadTiny,
     images: Tensor,
@@ -107,7 +90,7 @@ def initialise(
     # Normalise the features, then balance classes and occupancy
     with one_thread():
         take_statistics(model.img_backbone, images)
-        levels = _normalised(model.img_neck, model.img_backbone(images))
+        levels = normalise_neck(model.img_neck, model.img_backbone(images))
         view = _view(model, levels, lidar2img)
         _balance_classes(model, view, beginning)
         noise = torch.Generator().manual_seed(seed)
@@ -133,17 +116,6 @@ def _open_masks(model: UniadTiny) -> None:
     last.get_parameter("bias").abs_()
 
 
-def _normalised(neck: FeaturePyramid, stages: list[Tensor]) -> list[Tensor]:
-    maps = [
-        _unit(conv, stage)
-        for conv, stage in zip(neck.lateral_convs, stages, strict=True)
-    ]
-    levels = [_unit(conv, x) for conv, x in zip(neck.fpn_convs, maps, strict=False)]
-    for convolution in neck.fpn_convs[len(maps) :]:
-        levels.append(_unit(convolution, levels[-1]))
-    return levels
-
-
 def _view(model: UniadTiny, levels: list[Tensor], lidar2img: Tensor) -> Tensor:
     """Return the first bird's eye view, [1, cells, 256], of levels of any size."""
     config, head = model.config, model.pts_bbox_head
@@ -153,22 +125,8 @@ def _view(model: UniadTiny, levels: list[Tensor], lidar2img: Tensor) -> Tensor:
     ]
     still = torch.zeros(CAN_BUS), torch.zeros(config.grid.cells, 1, EMBED)
     cells = head.bev_embedding.weight[None], head.positional_encoding()
-    return head.transformer.bev(right, *cells, Motions(lidar2img, *still))
-
-
-def _unit(module: nn.Module, x: Tensor) -> Tensor:
-    (convolution,) = (m for m in module.modules() if isinstance(m, nn.Conv2d))
-    out = convolution(x)
-    # Normalise the output per channel, keeping the bias
-    scale = out.std((0, 2, 3)).reciprocal()
-    own = convolution.bias
-    if own is None:
-        raise TypeError("a convolution of the neck has no bias")
-    kept = own.clone()
-    convolution.weight.mul_(scale[:, None, None, None])
-    own.copy_((kept - out.mean((0, 2, 3))) * scale + kept)
-    y: Tensor = convolution(x)
-    return y
+    tokens = torch.cat(head.transformer.tokens(right), 1)
+    return head.transformer.bev(tokens, cells, Motions(lidar2img, *still))
 
 
 def _balance_classes(model: UniadTiny, cells: Tensor, beginning: float) -> None:

@@ -1,4 +1,4 @@
-"""The map head of UniAD: lanes as queries, boxes and masks."""
+"""The map head of UniAD: lanes as queries, boxes and masks (Panoptic SegFormer)."""
 
 from typing import NamedTuple
 
@@ -6,82 +6,52 @@ import torch
 from torch import Tensor, nn
 
 from me2e_compress.zoo.bev.attention import (
+    HEAD_SCALE,
     DecoderAttention,
-    FeedForward,
     MultiheadAttention,
 )
 from me2e_compress.zoo.bev.decoder import inverse_sigmoid
-from me2e_compress.zoo.bev.sizes import EMBED, Sampling
+from me2e_compress.zoo.bev.layers import AttentionLayer, mlp
+from me2e_compress.zoo.bev.reference_points import cell_centres
+from me2e_compress.zoo.bev.sizes import ATTENTION_HEADS, EMBED, Sampling
 from me2e_compress.zoo.uniad.config import UniadConfig
-from me2e_compress.zoo.uniad.layers import mlp
-from me2e_compress.zoo.uniad.map_masks import MaskHead
 from me2e_compress.zoo.uniad.positions import CellSines
 
-THING_BLOCKS, STUFF_BLOCKS = 4, 6
+MASK_BLOCKS = 4
+MASK_FEED_FORWARD = 1024
 LEVEL_EMBEDDINGS = 4
 """Level embeddings, of which only the first is read."""
 
 
-class CellLayer(nn.Module):
-    """Cells attend to cells around them, then feed-forward."""
-
-    def __init__(self, hw: tuple[int, int], sampling: Sampling, levels: int) -> None:
-        super().__init__()
-        self.attentions = nn.ModuleList([DecoderAttention(hw, sampling, held=levels)])
-        self.ffns = nn.ModuleList([FeedForward()])
-        self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(2))
-
-    def forward(self, cells: Tensor, pos: Tensor, at: Tensor) -> Tensor:
-        """Map [1, cells, 256] to [1, cells, 256]; ``at`` are their positions, 0..1."""
-        cells = self.norms[0](self.attentions[0](cells, pos, cells, at))
-        out: Tensor = self.norms[1](self.ffns[0](cells))
-        return out
-
-
 class CellEncoder(nn.Module):
-    """Six `CellLayer`s."""
+    """Layers in which cells attend to cells around them."""
 
     def __init__(self, config: UniadConfig, sampling: Sampling, levels: int) -> None:
         super().__init__()
         self.layers = nn.ModuleList(
-            CellLayer(config.head_hw, sampling, levels)
+            AttentionLayer(DecoderAttention(config.head_hw, sampling, held=levels))
             for _ in range(config.decoder_layers)
         )
 
     def forward(self, cells: Tensor, pos: Tensor, at: Tensor) -> Tensor:
         """Map [1, cells, 256] to the same; ``at`` are their positions, 0..1."""
         for layer in self.layers:
-            cells = layer(cells, pos, at)
+            cells = layer(cells, (pos, cells, at))
         return cells
 
 
-class LaneLayer(nn.Module):
-    """Self-attention, cross-attention to the cells, feed-forward."""
-
-    def __init__(
-        self, hw: tuple[int, int], sampling: Sampling, levels: int, *, boxes: bool
-    ) -> None:
-        super().__init__()
-        read = DecoderAttention(hw, sampling, held=levels, boxes=boxes)
-        self.attentions = nn.ModuleList([MultiheadAttention(), read])
-        self.ffns = nn.ModuleList([FeedForward()])
-        self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(3))
-
-    def forward(self, query: Tensor, pos: Tensor, cells: Tensor, at: Tensor) -> Tensor:
-        """Map [1, Q, 256] to [1, Q, 256]; ``at`` are points or boxes, 0..1."""
-        query = self.norms[0](self.attentions[0](query, query, pos, pos))
-        query = self.norms[1](self.attentions[1](query, pos, cells, at))
-        out: Tensor = self.norms[2](self.ffns[0](query))
-        return out
-
-
 class LaneDecoder(nn.Module):
-    """Six `LaneLayer`s."""
+    """Layers of self-attention and attention to the cells."""
 
     def __init__(self, config: UniadConfig, sampling: Sampling, levels: int) -> None:
         super().__init__()
         self.layers = nn.ModuleList(
-            LaneLayer(config.head_hw, sampling, levels, boxes=layer > 0)
+            AttentionLayer(
+                MultiheadAttention(),
+                DecoderAttention(
+                    config.head_hw, sampling, held=levels, boxes=layer > 0
+                ),
+            )
             for layer in range(config.decoder_layers)
         )
 
@@ -96,7 +66,7 @@ class LaneDecoder(nn.Module):
         query, pos = lanes
         layers = zip(self.layers, branches, strict=True)
         for number, (layer, branch) in enumerate(layers):
-            query = layer(query, pos, cells, at)
+            query = layer(query, (query, pos, pos), (pos, cells, at))
             moved = branch(query)
             centre = moved[..., :2] + inverse_sigmoid(at[..., :2])
             size = moved[..., 2:]
@@ -115,13 +85,7 @@ class MapTransformer(nn.Module):
         self.decoder = LaneDecoder(config, sampling, levels)
         self.level_embeds = nn.Parameter(torch.empty(LEVEL_EMBEDDINGS, EMBED))
         self.reference_points = nn.Linear(EMBED, 2)
-        rows, columns = torch.meshgrid(
-            (torch.arange(config.head_hw[0]) + 0.5) / config.head_hw[0],
-            (torch.arange(config.head_hw[1]) + 0.5) / config.head_hw[1],
-            indexing="ij",
-        )
-        places = torch.stack([columns, rows], -1).view(1, -1, 2)
-        self.register_buffer("places", places, False)
+        self.register_buffer("places", cell_centres(config.head_hw), False)
 
     places: Tensor
 
@@ -141,6 +105,94 @@ class MapTransformer(nn.Module):
         return cells, query, at
 
 
+class MaskAttention(nn.Module):
+    """Attention of queries to cells, from which a mask is computed."""
+
+    def __init__(self, *, tail: bool = False) -> None:
+        super().__init__()
+        self.q = nn.Linear(EMBED, EMBED)
+        self.k = nn.Linear(EMBED, EMBED)
+        self.tail = tail
+        if not tail:
+            self.v = nn.Linear(EMBED, EMBED)
+            self.proj = nn.Linear(EMBED, EMBED)
+        heads = ATTENTION_HEADS
+        self.linear_l1 = nn.Sequential(nn.Linear(heads, heads), nn.ReLU())
+        self.linear = nn.Sequential(nn.Linear(heads, 1), nn.ReLU())
+
+    def forward(
+        self, query: Tensor, key: Tensor, value: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Map [1, Q, 256] and cells [1, K, 256] to [1, Q, 256] and masks [1, Q, K].
+
+        The last layer, the tail, returns its query unchanged.
+        """
+        q, k = _heads(self.q(query)), _heads(self.k(key))
+        logits = torch.matmul(q, k.transpose(-2, -1)) * HEAD_SCALE
+        mask = self.linear(self.linear_l1(logits.permute(0, 2, 3, 1))).squeeze(-1)
+        if self.tail:
+            return query, mask
+        mixed = torch.matmul(logits.softmax(-1), _heads(self.v(value)))
+        return self.proj(mixed.transpose(1, 2).flatten(2)), mask
+
+
+def _heads(x: Tensor) -> Tensor:
+    heads: Tensor = x.unflatten(2, (ATTENTION_HEADS, -1)).transpose(1, 2)
+    return heads
+
+
+class GeluFeedForward(nn.Module):
+    """Linear, GELU, linear."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(EMBED, MASK_FEED_FORWARD)
+        self.act = nn.GELU()
+        self.fc2 = nn.Linear(MASK_FEED_FORWARD, EMBED)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [..., 256] to [..., 256]."""
+        out: Tensor = self.fc2(self.act(self.fc1(x)))
+        return out
+
+
+class MaskBlock(nn.Module):
+    """`MaskAttention` and `GeluFeedForward`, each normalised."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.head_norm1 = nn.LayerNorm(EMBED, eps=1e-6)
+        self.attn = MaskAttention()
+        self.head_norm2 = nn.LayerNorm(EMBED, eps=1e-6)
+        self.mlp = GeluFeedForward()
+
+    def forward(self, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+        """Map [1, Q, 256] and cells [1, K, 256] to [1, Q, 256]."""
+        attended, _ = self.attn(query, key, value)
+        query = self.head_norm1(query + attended)
+        out: Tensor = self.head_norm2(query + self.mlp(query))
+        return out
+
+
+class MaskHead(nn.Module):
+    """Maps queries to masks over the cells."""
+
+    def __init__(self, blocks: int) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(MaskBlock() for _ in range(blocks))
+        self.attnen = MaskAttention(tail=True)
+
+    def forward(
+        self, query: Tensor, query_pos: Tensor, cells: Tensor, cells_pos: Tensor
+    ) -> Tensor:
+        """Map [1, Q, 256] and cells [1, K, 256] to masks [1, Q, K]."""
+        key = cells + cells_pos
+        for block in self.blocks:
+            query = block(query + query_pos, key, cells)
+        mask: Tensor = self.attnen(query + query_pos, key, cells)[1]
+        return mask
+
+
 class Lanes(NamedTuple):
     """The result of the map head."""
 
@@ -154,22 +206,15 @@ class Lanes(NamedTuple):
 class MapHead(nn.Module):
     """Finds lanes in the upsampled view.
 
-    ``dead`` holds weights that inference never reads: an embedding of the cells, the
-    background head, the branches of the mask heads, attention for three more levels.
-    ``trained`` uses that attention as in training (see `DecoderAttention`).
+    ``trained`` is for published weights, whose attention holds levels that are not
+    there (see `DecoderAttention`).
     """
 
     def __init__(
-        self,
-        config: UniadConfig,
-        sampling: Sampling,
-        *,
-        dead: bool = False,
-        trained: bool = False,
+        self, config: UniadConfig, sampling: Sampling, *, trained: bool
     ) -> None:
         super().__init__()
-        # Unused levels are held only for published weights
-        levels = config.map_levels if dead or trained else 1
+        levels = config.map_levels if trained else 1
         layers, things = config.decoder_layers, config.labels.things
         self.hw = config.head_hw
         self.positional_encoding = CellSines(self.hw)
@@ -178,20 +223,10 @@ class MapHead(nn.Module):
         self.cls_branches = nn.ModuleList(
             nn.Linear(EMBED, things) for _ in range(layers)
         )
-        self.reg_branches = nn.ModuleList(_boxes() for _ in range(layers))
-        self.things_mask_head = MaskHead(THING_BLOCKS)
-        # Weights that inference never reads
-        if dead:
-            cells = config.head_hw[0] * config.head_hw[1]
-            self.bev_embedding = nn.Embedding(cells, EMBED)
-            self.stuff_mask_head = MaskHead(STUFF_BLOCKS, self_attention=True)
-            self.reg_branches2 = nn.ModuleList(_boxes() for _ in range(THING_BLOCKS))
-            self.cls_thing_branches = nn.ModuleList(
-                nn.Linear(EMBED, things) for _ in range(THING_BLOCKS)
-            )
-            self.cls_stuff_branches = nn.ModuleList(
-                nn.Linear(EMBED, 1) for _ in range(STUFF_BLOCKS)
-            )
+        self.reg_branches = nn.ModuleList(
+            mlp(EMBED, EMBED, EMBED, 4) for _ in range(layers)
+        )
+        self.things_mask_head = MaskHead(MASK_BLOCKS)
 
     def forward(self, bev: Tensor) -> Lanes:
         """Find lanes in the upsampled view, [1, cells, 256]."""
@@ -201,7 +236,3 @@ class MapHead(nn.Module):
         masks = self.things_mask_head(query, lane_pos, cells, pos)
         masks = masks.unflatten(2, self.hw)
         return Lanes(query, lane_pos, self.cls_branches[-1](query), boxes, masks)
-
-
-def _boxes() -> nn.Sequential:
-    return mlp(EMBED, EMBED, EMBED, 4)

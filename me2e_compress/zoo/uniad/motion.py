@@ -1,23 +1,34 @@
 """The motion head of UniAD: forecasts of the agents and the ego vehicle."""
 
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
 
+from me2e_compress.zoo.bev.layers import (
+    AttentionLayer,
+    TransformerLayer,
+    classifier,
+    mlp,
+)
 from me2e_compress.zoo.bev.sizes import EMBED, Sampling
 from me2e_compress.zoo.uniad.config import AGENT_MODES, AGENT_STEPS, UniadConfig
-from me2e_compress.zoo.uniad.layers import TransformerLayer, mlp, projection
-from me2e_compress.zoo.uniad.motion_anchors import AgentFrames, anchors
-from me2e_compress.zoo.uniad.motion_goal import GoalLayer
+from me2e_compress.zoo.uniad.motion_goal import GoalAttention
 from me2e_compress.zoo.uniad.positions import PointSines
 
 LAYERS = 3
 OUTPUTS = 5
 """Mean x and y, both standard deviations, correlation."""
 
-TRACK_LAYERS = 6
+STEP_S = 0.5
 
+WAYS = ((0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (1.5, 0.0), (0.7, 0.4), (0.7, -0.4))
+"""Fraction of a group's speed, and radians per second, for each arc."""
+
+SPEEDS_MPS = (8.0, 4.0, 1.5, 0.5)
+"""Speeds of vehicles, bicycles, pedestrians and nuScenes' other objects."""
+
+TINY = torch.tensor(1.0e-5)
 
 Goals = tuple[Tensor, Tensor, Tensor]
 """A goal in the agent's frame, along the axes of the ego, and from the ego."""
@@ -51,10 +62,11 @@ class MotionFormer(nn.Module):
     def __init__(self, config: UniadConfig, sampling: Sampling) -> None:
         super().__init__()
         self.intention_interaction_layers = Wrapped(cross=False)
-        self.track_agent_interaction_layers = _repeat(Wrapped)
-        self.map_interaction_layers = _repeat(Wrapped)
+        self.track_agent_interaction_layers = _readers()
+        self.map_interaction_layers = _readers()
         self.bev_interaction_layers = nn.ModuleList(
-            GoalLayer(config.grid, config.head_hw, sampling) for _ in range(LAYERS)
+            AttentionLayer(GoalAttention(config.grid, config.head_hw, sampling))
+            for _ in range(LAYERS)
         )
         self.static_dynamic_fuser = mlp(2 * EMBED, 2 * EMBED, EMBED)
         self.dynamic_embed_fuser = mlp(3 * EMBED, 2 * EMBED, EMBED)
@@ -90,16 +102,16 @@ class MotionFormer(nn.Module):
             asked, track + track_pos, empty
         )
         aware = self.map_interaction_layers[layer](asked, lanes)
-        flat = [x.flatten(0, 1).unsqueeze(0) for x in (query, pos, at)]
-        goal = self.bev_interaction_layers[layer](flat[0], flat[1], bev, flat[2])
+        modes, places, ways = (x.flatten(0, 1).unsqueeze(0) for x in (query, pos, at))
+        goal = self.bev_interaction_layers[layer](modes, (places, bev, ways))
         own = track[0][:, None].expand_as(query) + pos
         parts = [social, aware, goal[0].view_as(query), own]
         out: Tensor = self.out_query_fuser(torch.cat(parts, -1))
         return out
 
 
-def _repeat(layer: type[Wrapped]) -> nn.ModuleList:
-    return nn.ModuleList(layer(cross=True) for _ in range(LAYERS))
+def _readers() -> nn.ModuleList:
+    return nn.ModuleList(Wrapped(cross=True) for _ in range(LAYERS))
 
 
 class Agents(NamedTuple):
@@ -120,12 +132,59 @@ class Forecasts(NamedTuple):
     pos: Tensor  # [1, A, 256], of the agents
 
 
-class MotionHead(nn.Module):
-    """Anchors, embeddings and `MotionFormer`; ``dead`` holds an unused fuser."""
+def anchors(groups: int) -> Tensor:
+    """Return [groups, 6, 12, 2], metres, in the agent's frame, y ahead.
 
-    def __init__(
-        self, config: UniadConfig, sampling: Sampling, *, dead: bool = False
-    ) -> None:
+    The published anchors are k-means centres of the data set's trajectories; they are
+    in no checkpoint, and six arcs per group replace them.
+    """
+    seconds = torch.arange(1, AGENT_STEPS + 1) * STEP_S
+    ways = []
+    for part, rate in WAYS:
+        heading = seconds * rate
+        steps = torch.stack([-heading.sin(), heading.cos()], -1) * (part * STEP_S)
+        ways.append(steps.cumsum(0))
+    speeds = torch.tensor(SPEEDS_MPS[:groups]).view(-1, 1, 1, 1)
+    return torch.stack(ways) * speeds
+
+
+class AgentFrames(NamedTuple):
+    """Positions and orientations of agents in the lidar frame."""
+
+    centre: Tensor  # [A, 1, 1, 2], metres
+    cos: Tensor  # [A, 1, 1]
+    sin: Tensor  # [A, 1, 1]
+
+    @classmethod
+    def of(cls, boxes: Tensor) -> Self:
+        """Return the frames of boxes [A, 10]; agents face yaw - pi (original)."""
+        sin, cos = boxes[:, 6:7], boxes[:, 7:8]
+        length = torch.maximum((sin * sin + cos * cos).sqrt(), TINY)
+        return cls(
+            boxes[:, None, None, :2],
+            (-cos / length).unsqueeze(2),
+            (-sin / length).unsqueeze(2),
+        )
+
+    def turned(self, points: Tensor) -> Tensor:
+        """Rotate points [A, modes, steps, 2] of the agents to the axes of the lidar."""
+        x, y = points[..., 0], points[..., 1]
+        return torch.stack(
+            [self.cos * x - self.sin * y, self.sin * x + self.cos * y], -1
+        )
+
+    def turned_back(self, points: Tensor) -> Tensor:
+        """Undo `turned`."""
+        x, y = points[..., 0], points[..., 1]
+        return torch.stack(
+            [self.cos * x + self.sin * y, self.cos * y - self.sin * x], -1
+        )
+
+
+class MotionHead(nn.Module):
+    """Anchors, embeddings and `MotionFormer`."""
+
+    def __init__(self, config: UniadConfig, sampling: Sampling) -> None:
         super().__init__()
         groups = max(config.labels.groups) + 1
         self.learnable_motion_query_embedding = nn.Embedding(
@@ -138,19 +197,10 @@ class MotionHead(nn.Module):
         self.scene_level_offset_embedding_layer = mlp(EMBED, 2 * EMBED, EMBED)
         self.boxes_query_embedding_layer = mlp(EMBED, 2 * EMBED, EMBED)
         # One branch per layer
-        self.traj_cls_branches = nn.ModuleList(
-            nn.Sequential(
-                *projection(EMBED, EMBED),
-                *projection(EMBED, EMBED),
-                nn.Linear(EMBED, 1),
-            )
-            for _ in range(LAYERS)
-        )
+        self.traj_cls_branches = nn.ModuleList(classifier(1) for _ in range(LAYERS))
         self.traj_reg_branches = nn.ModuleList(
             mlp(EMBED, EMBED, EMBED, AGENT_STEPS * OUTPUTS) for _ in range(LAYERS)
         )
-        if dead:
-            self.layer_track_query_fuser = projection(TRACK_LAYERS * EMBED, EMBED)
         self.sines = PointSines(config.grid.pc_range)
         self.register_buffer("kmeans_anchors", anchors(groups))
         self.register_buffer("group_of", torch.tensor(config.labels.groups), False)

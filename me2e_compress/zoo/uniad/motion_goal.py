@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.bev.attention import FeedForward, deformable_attention
+from me2e_compress.zoo.bev.attention import deformable_attention
+from me2e_compress.zoo.bev.layers import projection
 from me2e_compress.zoo.bev.sizes import ATTENTION_HEADS, EMBED, BevGrid, Sampling
 from me2e_compress.zoo.uniad.config import AGENT_STEPS
-from me2e_compress.zoo.uniad.layers import projection
 
 GOAL_POINTS = 4
 
@@ -57,20 +57,4 @@ class GoalAttention(nn.Module):
         )
         joined = read.unflatten(1, (-1, steps)).flatten(2)
         out: Tensor = query + self.output_proj(joined)
-        return out
-
-
-class GoalLayer(nn.Module):
-    """`GoalAttention` and a feed-forward, each normalised."""
-
-    def __init__(self, grid: BevGrid, hw: tuple[int, int], sampling: Sampling) -> None:
-        super().__init__()
-        self.attentions = nn.ModuleList([GoalAttention(grid, hw, sampling)])
-        self.ffns = nn.ModuleList([FeedForward()])
-        self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(2))
-
-    def forward(self, query: Tensor, pos: Tensor, bev: Tensor, at: Tensor) -> Tensor:
-        """Map [1, Q, 256] to [1, Q, 256]; see `GoalAttention`."""
-        query = self.norms[0](self.attentions[0](query, pos, bev, at))
-        out: Tensor = self.norms[1](self.ffns[0](query))
         return out

@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.bev.attention import FeedForward, PackedAttention
+from me2e_compress.zoo.bev.attention import MultiheadAttention
+from me2e_compress.zoo.bev.layers import AttentionLayer, projection
 from me2e_compress.zoo.bev.sizes import EMBED, Sampling
 from me2e_compress.zoo.uniad.config import UniadConfig
-from me2e_compress.zoo.uniad.layers import projection
 from me2e_compress.zoo.uniad.motion import Agents, Forecasts
 from me2e_compress.zoo.uniad.occ_images import (
     AreaSampler,
@@ -26,49 +26,30 @@ REACH = 0.5
 """Cells of at least this probability belong to an instance."""
 
 
-class StateAttention(nn.Module):
-    """`PackedAttention` with a residual, under the names of mmcv."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.attn = PackedAttention()
-
-    def forward(self, x: Tensor, key: Tensor, ignore: Tensor | None = None) -> Tensor:
-        """Attend to keys [1, K, 256]; ``ignore`` is [1, cells, K] bool."""
-        out: Tensor = x + self.attn(x, key, key, ignore)
-        return out
-
-
-class StateLayer(nn.Module):
-    """Cells attend to cells, then to their own instances."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.attentions = nn.ModuleList([StateAttention(), StateAttention()])
-        self.ffns = nn.ModuleList([FeedForward(WIDE_FEED_FORWARD)])
-        self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(3))
-
-    def forward(self, x: Tensor, instances: Tensor, ignore: Tensor) -> Tensor:
-        """Map [1, cells, 256] and [1, A, 256] to [1, cells, 256]."""
-        x = self.norms[0](self.attentions[0](x, x))
-        x = self.norms[1](self.attentions[1](x, instances, ignore))
-        out: Tensor = self.norms[2](self.ffns[0](x))
-        return out
-
-
 class StateDecoder(nn.Module):
-    """One `StateLayer` per step, and a normalisation that is never applied here."""
+    """A layer per step, in which cells attend to cells, then to their instances.
+
+    The normalisation is never applied here.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(StateLayer() for _ in range(FUTURES))
+        self.layers = nn.ModuleList(
+            AttentionLayer(
+                MultiheadAttention(), MultiheadAttention(), hidden=WIDE_FEED_FORWARD
+            )
+            for _ in range(FUTURES)
+        )
         self.post_norm = nn.LayerNorm(EMBED)
 
     def forward(
         self, step: int, x: Tensor, instances: Tensor, ignore: Tensor
     ) -> Tensor:
-        """Apply the layer of a step; see `StateLayer`."""
-        out: Tensor = self.layers[step](x, instances, ignore)
+        """Map cells [1, cells, 256] and instances [1, A, 256] to [1, cells, 256].
+
+        ``ignore`` is [1, cells, A] bool.
+        """
+        out: Tensor = self.layers[step](x, (x,), (instances, None, None, ignore))
         return out
 
 

@@ -5,35 +5,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.bev.can_bus import CanBusEncoder
 from me2e_compress.zoo.bev.decoder import (
+    Decoded,
     Decoder,
-    in_metres,
+    detections,
     inverse_sigmoid,
     precise_sigmoid,
 )
-from me2e_compress.zoo.bev.encoder import BevEncoder, GridPosition
-from me2e_compress.zoo.bev.reference_points import cell_positions, ego_shift, turn
-from me2e_compress.zoo.bev.sizes import (
-    BOX_CODE,
-    CAMERAS,
-    EMBED,
-    FEATURE_LEVELS,
-    Sampling,
-)
+from me2e_compress.zoo.bev.encoder import GridPosition
+from me2e_compress.zoo.bev.layers import classifier, mlp
+from me2e_compress.zoo.bev.sizes import BOX_CODE, EMBED, Sampling
+from me2e_compress.zoo.bev.transformer import BevTransformer, Motions
 from me2e_compress.zoo.regions import region
 from me2e_compress.zoo.uniad.config import UniadConfig
-from me2e_compress.zoo.uniad.layers import mlp, projection
-
-PAST_STEPS = 8
-
-
-class Motions(NamedTuple):
-    """The vehicle's motion and the previous view."""
-
-    lidar2img: Tensor  # [1, cameras, 4, 4]
-    can_bus: Tensor  # [18]
-    prev_bev: Tensor  # [cells, 1, 256]
 
 
 class Queries(NamedTuple):
@@ -55,50 +39,16 @@ class Found(NamedTuple):
     reference: Tensor  # [Q, 3], of the last layer, logits
 
 
-class TrackTransformer(nn.Module):
+class TrackTransformer(BevTransformer):
     """BEV encoder and track decoder."""
 
     def __init__(self, config: UniadConfig, sampling: Sampling) -> None:
-        super().__init__()
-        self.grid = config.grid
-        self.sampling: Sampling = sampling
-        self.level_embeds = nn.Parameter(torch.empty(FEATURE_LEVELS, EMBED))
-        self.cams_embeds = nn.Parameter(torch.empty(CAMERAS, EMBED))
-        self.can_bus_mlp = CanBusEncoder()
-        self.encoder = BevEncoder(
+        super().__init__(
             config.grid, config.image_hw, config.hws, config.encoder_layers, sampling
         )
         self.decoder = Decoder(
             config.grid.hw, config.decoder_layers, sampling, height=True, precise=True
         )
-        self.register_buffer("cells", cell_positions(config.grid), False)
-
-    cells: Tensor
-
-    def bev(
-        self, levels: list[Tensor], query: Tensor, pos: Tensor, motions: Motions
-    ) -> Tensor:
-        """Encode levels [cameras, 256, h, w] to [1, cells, 256]."""
-        # Tokens of all cameras and levels
-        tokens = torch.cat(
-            [
-                level.flatten(2).transpose(1, 2)
-                + self.cams_embeds[:, None]
-                + self.level_embeds[index]
-                for index, level in enumerate(levels)
-            ],
-            1,
-        )
-        # The previous view, turned to the current heading
-        lidar2img, can_bus, prev_bev = motions
-        first = torch.logical_not(torch.any(prev_bev != 0))
-        previous = turn(prev_bev, can_bus, self.cells, self.grid, self.sampling)
-        query = query + self.can_bus_mlp(can_bus.unsqueeze(0))
-        shift = ego_shift(can_bus, self.grid)
-        bev: Tensor = self.encoder(
-            query, pos, previous, first, shift, tokens, lidar2img
-        )
-        return bev
 
     def forward(
         self,
@@ -107,13 +57,14 @@ class TrackTransformer(nn.Module):
         motions: Motions,
         queries: Queries,
         branches: nn.ModuleList,
-    ) -> tuple[Tensor, tuple[list[Tensor], ...]]:
+    ) -> tuple[Tensor, Decoded]:
         """Encode levels [cameras, 256, h, w], then decode the track queries.
 
         ``cells`` are BEV queries and their positions, [1, cells, 256] each.
         """
         with region("bev_encoder"):
-            bev = self.bev(levels, *cells, motions)
+            tokens = torch.cat(self.tokens(levels), 1)
+            bev = self.bev(tokens, cells, motions)
         with region("track"):
             pos, content = queries.query.chunk(2, 2)
             reference = precise_sigmoid(queries.reference)
@@ -124,7 +75,7 @@ class TrackTransformer(nn.Module):
 class TrackHead(nn.Module):
     """The perception transformer, and the branches that read it."""
 
-    def __init__(self, config: UniadConfig, sampling: Sampling, *, dead: bool) -> None:
+    def __init__(self, config: UniadConfig, sampling: Sampling) -> None:
         super().__init__()
         self.grid = config.grid
         layers = range(config.decoder_layers)
@@ -134,26 +85,16 @@ class TrackHead(nn.Module):
         self.bev_embedding = nn.Embedding(config.grid.cells, EMBED)
         # One branch per decoder layer
         self.cls_branches = nn.ModuleList(
-            nn.Sequential(
-                *projection(EMBED, EMBED),
-                *projection(EMBED, EMBED),
-                nn.Linear(EMBED, config.labels.classes),
-            )
-            for _ in layers
+            classifier(config.labels.classes) for _ in layers
         )
         self.reg_branches = nn.ModuleList(
             mlp(EMBED, EMBED, EMBED, BOX_CODE) for _ in layers
         )
-        if dead:
-            self.past_traj_reg_branches = nn.ModuleList(
-                mlp(EMBED, EMBED, EMBED, PAST_STEPS * 2) for _ in layers
-            )
 
     def forward(
         self, levels: list[Tensor], motions: Motions, queries: Queries
     ) -> Found:
         """Encode the view and decode the queries."""
-        # Encode the view and decode the queries
         with region("bev_encoder"):
             pos = self.positional_encoding()
             cells = self.bev_embedding.weight.unsqueeze(0), pos
@@ -162,20 +103,7 @@ class TrackHead(nn.Module):
         )
         # Apply the branches
         with region("track"):
-            states, raw, at = decoded
-            scores = [
-                branch(state)
-                for branch, state in zip(self.cls_branches, states, strict=True)
-            ]
-            boxes = [
-                in_metres(each, place, self.grid)
-                for each, place in zip(raw, at, strict=True)
-            ]
-            return Found(
-                bev,
-                pos,
-                torch.stack(scores),
-                torch.stack(boxes),
-                states[-1][0],
-                inverse_sigmoid(at[-1][0]),
-            )
+            scores, boxes = detections(decoded, self.cls_branches, self.grid)
+            states, _, at = decoded
+            state, reference = states[-1][0], inverse_sigmoid(at[-1][0])
+            return Found(bev, pos, scores, boxes, state, reference)

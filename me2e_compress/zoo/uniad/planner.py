@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor, nn
 
+from me2e_compress.zoo.bev.layers import TransformerLayer, mlp, projection
 from me2e_compress.zoo.bev.sizes import EMBED
 from me2e_compress.zoo.uniad.config import PLAN_STEPS
-from me2e_compress.zoo.uniad.layers import TransformerLayer, mlp, projection
 
 ADAPTERS, LAYERS = 3, 3
 ADAPTER_WIDTH = 128

@@ -8,30 +8,32 @@ from torch.nn import functional
 
 from me2e_compress.zoo.bev.neck import FeaturePyramid
 from me2e_compress.zoo.bev.sizes import EMBED, Sampling
+from me2e_compress.zoo.bev.transformer import Motions
 from me2e_compress.zoo.regions import region
-from me2e_compress.zoo.resnet import BLOCKS, Bottleneck, ResNet
+from me2e_compress.zoo.resnet import ResNet
 from me2e_compress.zoo.uniad.config import PUBLISHED, UniadConfig
 from me2e_compress.zoo.uniad.map import MapHead
 from me2e_compress.zoo.uniad.motion import Agents, MotionHead
 from me2e_compress.zoo.uniad.occ import OccHead
-from me2e_compress.zoo.uniad.perception import Found, Motions, Queries, TrackHead
+from me2e_compress.zoo.uniad.perception import Found, Queries, TrackHead
 from me2e_compress.zoo.uniad.planner import PlanningHead
 from me2e_compress.zoo.uniad.track_life import (
     SAVE_PERIOD,
     SLEEPS,
     LidarPose,
+    MemoryBank,
+    QueryInteraction,
     TrackLife,
     TrackSlots,
     VelocityUpdate,
 )
-from me2e_compress.zoo.uniad.tracking import MemoryBank, QueryInteraction
 
 
 class CameraTrunk(ResNet):
     """ResNet-50 up to the feature maps that the neck reads."""
 
     def __init__(self, stem: int, stages: tuple[int, ...]) -> None:
-        super().__init__(Bottleneck, BLOCKS, stem)
+        super().__init__(stem, bottleneck=True)
         self.chosen = stages
         self.read = [self.channels[stage] for stage in stages]
 
@@ -64,7 +66,6 @@ class UniadTiny(nn.Module):
     Args:
         config: sizes.
         sampling: see `sample`.
-        dead: hold the weights that inference never reads, as the published file does.
         trained: build the map head's attention for the weights of the published file.
     """
 
@@ -73,7 +74,6 @@ class UniadTiny(nn.Module):
         config: UniadConfig = PUBLISHED,
         sampling: Sampling = "operator",
         *,
-        dead: bool = False,
         trained: bool = False,
     ) -> None:
         super().__init__()
@@ -91,9 +91,9 @@ class UniadTiny(nn.Module):
         self.query_interact = QueryInteraction()
         self.memory_bank = MemoryBank()
         # Heads
-        self.pts_bbox_head = TrackHead(config, sampling, dead=dead)
-        self.seg_head = MapHead(config, sampling, dead=dead, trained=trained)
-        self.motion_head = MotionHead(config, sampling, dead=dead)
+        self.pts_bbox_head = TrackHead(config, sampling)
+        self.seg_head = MapHead(config, sampling, trained=trained)
+        self.motion_head = MotionHead(config, sampling)
         self.occ_head = OccHead(config, sampling)
         self.planning_head = PlanningHead(config.head_hw, config.labels.commands)
 

@@ -6,12 +6,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.bev.decoder import in_metres
+from me2e_compress.zoo.bev.decoder import Decoded, Decoder, detections
 from me2e_compress.zoo.bev.encoder import GridPosition
+from me2e_compress.zoo.bev.layers import classifier, mlp
 from me2e_compress.zoo.bev.sizes import BOX_CODE, EMBED, Sampling
+from me2e_compress.zoo.bev.transformer import BevTransformer, Motions
 from me2e_compress.zoo.regions import region
 from me2e_compress.zoo.vad.config import LAYERS, Heads, VadConfig
-from me2e_compress.zoo.vad.transformer import PerceptionTransformer
 
 
 class AgentOutputs(NamedTuple):
@@ -32,32 +33,49 @@ class MapOutputs(NamedTuple):
     queries: Tensor  # [1, 100, 20, 256]
 
 
-def classifier(classes: int, width: int = EMBED) -> nn.Sequential:
-    """Build two normalised layers and the logits."""
-    return nn.Sequential(
-        nn.Linear(width, width),
-        nn.LayerNorm(width),
-        nn.ReLU(),
-        nn.Linear(width, width),
-        nn.LayerNorm(width),
-        nn.ReLU(),
-        nn.Linear(width, classes),
-    )
+class PerceptionTransformer(BevTransformer):
+    """BEV encoder, detection decoder and map decoder."""
 
+    def __init__(self, sampling: Sampling, config: VadConfig) -> None:
+        grid = config.grid
+        super().__init__(grid, config.image_hw, config.feature_hws, LAYERS, sampling)
+        self.reference_points = nn.Linear(EMBED, 3)
+        self.decoder = Decoder(grid.hw, LAYERS, sampling, height=True)
+        self.map_reference_points = nn.Linear(EMBED, 2)
+        self.map_decoder = Decoder(grid.hw, LAYERS, sampling, height=False)
 
-def regressor(outputs: int, width: int = EMBED) -> nn.Sequential:
-    """Build two layers and the values."""
-    return nn.Sequential(
-        nn.Linear(width, width),
-        nn.ReLU(),
-        nn.Linear(width, width),
-        nn.ReLU(),
-        nn.Linear(width, outputs),
-    )
+    def forward(
+        self,
+        features: Tensor,
+        cells: tuple[Tensor, Tensor],
+        agents: Tensor,
+        points: Tensor,
+        branches: tuple[nn.ModuleList, nn.ModuleList],
+        motions: Motions,
+    ) -> tuple[Tensor, Decoded, Decoded]:
+        """Encode features [cameras, 256, h, w] and decode agents and map points.
+
+        ``cells`` are BEV queries and their positions, [1, cells, 256] each; ``agents``
+        [300, 512] and ``points`` [2000, 512] are position then content; ``branches``
+        are those of detection and map. Returns the BEV [1, cells, 256] and the results
+        of both `Decoder`s.
+        """
+        with region("bev_encoder"):
+            (tokens,) = self.tokens([features])
+            bev = self.bev(tokens, cells, motions)
+        with region("det"):
+            pos, query = agents.unsqueeze(0).chunk(2, dim=2)
+            at = self.reference_points(pos).sigmoid()
+            found = self.decoder(query, pos, bev, at, branches[0])
+        with region("map"):
+            pos, query = points.unsqueeze(0).chunk(2, dim=2)
+            at = self.map_reference_points(pos).sigmoid()
+            mapped = self.map_decoder(query, pos, bev, at, branches[1])
+        return bev, found, mapped
 
 
 class PerceptionHead(nn.Module):
-    """Queries, the perception transformer, and the branches that read it."""
+    """Queries, their transformer, and the branches that read it."""
 
     def __init__(self, heads: Heads, sampling: Sampling, config: VadConfig) -> None:
         super().__init__()
@@ -72,13 +90,13 @@ class PerceptionHead(nn.Module):
         self.map_instance_embedding = nn.Embedding(config.vectors, 2 * EMBED)
         self.map_pts_embedding = nn.Embedding(config.vector_points, 2 * EMBED)
         # Branches per layer
-        self.cls_branches = _repeat(classifier, heads.det_classes)
-        self.reg_branches = _repeat(regressor, BOX_CODE)
-        self.map_cls_branches = _repeat(classifier, heads.map_classes)
-        self.map_reg_branches = _repeat(regressor, 2)
+        self.cls_branches = _repeat(lambda: classifier(heads.det_classes))
+        self.reg_branches = _repeat(lambda: mlp(EMBED, EMBED, EMBED, BOX_CODE))
+        self.map_cls_branches = _repeat(lambda: classifier(heads.map_classes))
+        self.map_reg_branches = _repeat(lambda: mlp(EMBED, EMBED, EMBED, 2))
 
     def perceive(
-        self, features: Tensor, lidar2img: Tensor, can_bus: Tensor, prev_bev: Tensor
+        self, features: Tensor, motions: Motions
     ) -> tuple[Tensor, AgentOutputs, MapOutputs]:
         """Map camera features [cameras, 256, h, w] to BEV, boxes and map vectors."""
         with region("bev_encoder"):
@@ -95,33 +113,21 @@ class PerceptionHead(nn.Module):
             self.query_embedding.weight,
             points,
             (self.reg_branches, self.map_reg_branches),
-            lidar2img,
-            can_bus,
-            prev_bev,
+            motions,
         )
         with region("det"):
-            agents = self._agents(*found)
+            agents = self._agents(found)
         with region("map"):
-            vectors = self._map(*mapped)
+            vectors = self._map(mapped)
         return bev, agents, vectors
 
-    def _agents(
-        self, queries: list[Tensor], raw: list[Tensor], at: list[Tensor]
-    ) -> AgentOutputs:
-        scores = [
-            branch(query)
-            for branch, query in zip(self.cls_branches, queries, strict=True)
-        ]
-        boxes = [
-            in_metres(r, a, self.config.grid) for r, a in zip(raw, at, strict=True)
-        ]
-        return AgentOutputs(
-            torch.stack(scores), torch.stack(boxes), queries[-1], at[-1][..., :2]
-        )
+    def _agents(self, decoded: Decoded) -> AgentOutputs:
+        scores, boxes = detections(decoded, self.cls_branches, self.config.grid)
+        queries, _, at = decoded
+        return AgentOutputs(scores, boxes, queries[-1], at[-1][..., :2])
 
-    def _map(
-        self, queries: list[Tensor], _raw: list[Tensor], at: list[Tensor]
-    ) -> MapOutputs:
+    def _map(self, decoded: Decoded) -> MapOutputs:
+        queries, _, at = decoded
         shape = 1, self.config.vectors, self.config.vector_points
         grouped = [q.view(*shape, EMBED) for q in queries]
         scores = [
@@ -135,8 +141,8 @@ class PerceptionHead(nn.Module):
         )
 
 
-def _repeat(make: Callable[[int], nn.Module], outputs: int) -> nn.ModuleList:
-    return nn.ModuleList(make(outputs) for _ in range(LAYERS))
+def _repeat(make: Callable[[], nn.Module]) -> nn.ModuleList:
+    return nn.ModuleList(make() for _ in range(LAYERS))
 
 
 def _enclosing(points: Tensor) -> Tensor:

@@ -104,13 +104,12 @@ def test_what_may_not_be_read_says_so(
 
 
 @pytest.mark.parametrize(
-    ("folder", "name", "says"),
-    [("intel-rapl:0", "psys", "no package in"), ("dtpm", "dtpm", "no package in")],
+    ("folder", "name"), [("intel-rapl:0", "psys"), ("dtpm", "dtpm")]
 )
-def test_no_package(folder: str, name: str, says: str, tmp_path: Path) -> None:
+def test_no_package(folder: str, name: str, tmp_path: Path) -> None:
     zone(tmp_path, folder, name)
 
-    assert says in reason(Rapl(tmp_path).open())
+    assert "no package in" in reason(Rapl(tmp_path).open())
 
 
 def jetson(root: Path, rails: dict[str, tuple[int, int]]) -> Path:
@@ -282,10 +281,6 @@ def test_no_counter_lists_what_each_answered(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_counter_that_is_none(text: str, fault: str) -> None:
     with pytest.raises(EnergyError, match=fault):
         open_counter(text)
-
-
-def test_every_counter_of_ours_loads() -> None:
-    assert ENERGY_COUNTERS.usable()[:4] == ("nvml", "ina3221", "rapl", "recorded")
 
 
 @pytest.mark.parametrize("text", ["nvml:1", "ina3221", "rapl", "recorded:r.csv"])

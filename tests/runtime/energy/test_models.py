@@ -30,12 +30,15 @@ def model(tmp_path: Path) -> Path:
     return tmp_path / "m.onnx"
 
 
-def test_any_packages_counter_measures_models_in_turn(
-    model: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+@pytest.fixture
+def clockwork(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     target = "tests.runtime.energy.clockwork:Clockwork"
     group = "me2e_compress.energy_counters"
     install(monkeypatch, tmp_path, "clockwork", group, {"clockwork": target})
+
+
+@pytest.mark.usefixtures("clockwork")
+def test_any_packages_counter_measures_models_in_turn(model: Path) -> None:
     seen, closed = list[tuple[int, int, str]](), Clock.closed
 
     found = measure_energy(
@@ -72,12 +75,7 @@ def test_a_recording_is_of_one_model(model: Path, tmp_path: Path) -> None:
         )
 
 
-def test_no_frame_is_an_error(
-    model: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    target = "tests.runtime.energy.clockwork:Clockwork"
-    group = "me2e_compress.energy_counters"
-    install(monkeypatch, tmp_path, "clockwork", group, {"clockwork": target})
-
+@pytest.mark.usefixtures("clockwork")
+def test_no_frame_is_an_error(model: Path) -> None:
     with pytest.raises(EnergyError, match="there is no frame to run"):
         measure_energy({"m": model}, [], "clockwork", SHORT)

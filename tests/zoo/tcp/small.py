@@ -4,11 +4,9 @@ import dataclasses
 
 import torch
 
-from me2e_compress.zoo.drawing import draw_weights, take_statistics
 from me2e_compress.zoo.stacks import TCP, Stack
 from me2e_compress.zoo.tcp.config import ActionHeads, TcpConfig
-from me2e_compress.zoo.tcp.initialise import GAINS
-from me2e_compress.zoo.tcp.stack import Tcp
+from me2e_compress.zoo.tcp.stack import Tcp, initialise
 
 SMALL = TcpConfig(
     image_hw=(64, 96), stem=8, classes=20, measured=8, joint=24, hidden=16
@@ -22,8 +20,7 @@ def small_spec(heads: ActionHeads) -> Stack:
 
 def small_tcp(heads: ActionHeads) -> Tcp:
     model = Tcp(heads, config=SMALL).requires_grad_(False).eval()
-    draw_weights(model, GAINS, seed=0)
     noise = torch.Generator().manual_seed(0)
     images = torch.randn(4, 3, *SMALL.image_hw, generator=noise)
-    take_statistics(model.perception, images)
+    initialise(model, images, seed=0)
     return model

@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -80,17 +81,21 @@ def test_waypoints_do_not_depend_on_the_control_branch() -> None:
     assert not torch.equal(before[1], after[1])
 
 
-def test_unknown_heads_are_an_error(tmp_path: Path) -> None:
-    with pytest.raises(GraphError, match="tcp has no heads 'nuscenes': there is"):
-        export_stack("tcp", tmp_path / "x.onnx", ExportOptions(heads="nuscenes"))
-
-
-def test_plugins_are_an_error(tmp_path: Path) -> None:
-    with pytest.raises(GraphError, match="tcp has no deformable attention"):
-        export_stack("tcp", tmp_path / "x.onnx", ExportOptions(operators="plugin"))
-
-
-def test_plugins_and_the_dynamo_exporter_are_an_error(tmp_path: Path) -> None:
-    options = ExportOptions(operators="plugin", opset=18)
-    with pytest.raises(GraphError, match="opset 18 with plugins, which take up to 17"):
-        export_stack("vad-tiny", tmp_path / "x.onnx", options)
+@pytest.mark.parametrize(
+    ("stack", "options", "words"),
+    [
+        ("tcp", {"heads": "nuscenes"}, "tcp has no heads 'nuscenes': there is bench2"),
+        ("uniad-tiny", {"heads": "nuscenes"}, "'nuscenes': there is nothing to choose"),
+        ("tcp", {"operators": "plugin"}, "tcp has no deformable attention"),
+        (
+            *("vad-tiny", {"operators": "plugin", "opset": 18}),
+            "opset 18 with plugins, which take up to 17",
+        ),
+        ("highway", {"operators": "plugin"}, "--operators cannot be chosen"),
+    ],
+)
+def test_what_a_stack_does_not_have_is_refused(
+    tmp_path: Path, stack: str, options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(GraphError, match=words):
+        export_stack(stack, tmp_path / "x.onnx", ExportOptions(**options))

@@ -4,8 +4,7 @@ import torch
 from torch.nn import functional
 
 from me2e_compress.zoo.stacks import TCP
-from me2e_compress.zoo.synthetic_frames import Frame, frames
-from me2e_compress.zoo.synthetic_strip import interpolation, strip
+from me2e_compress.zoo.synthetic_frames import Frame, frames, interpolation, strip
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """UniAD in small: the same classes, fewer pixels, cells, queries and slots."""
 
-import dataclasses
 import functools
 
 import numpy as np
@@ -8,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from me2e_compress.zoo.bev.sizes import BevGrid, Sampling
-from me2e_compress.zoo.stacks import UNIAD_TINY, Stack
+from me2e_compress.zoo.stacks import Stack, uniad_stack
 from me2e_compress.zoo.uniad.config import RANGE, UniadConfig
 from me2e_compress.zoo.uniad.initialise import initialise
 from me2e_compress.zoo.uniad.stack import UniadTiny
@@ -29,13 +28,7 @@ SMALL = UniadConfig(
 
 def small_spec() -> Stack:
     """The interface of the stack at these sizes."""
-    sizes = {249: SMALL.tracks, 10_000: SMALL.grid.cells}
-    inputs = {
-        name: tuple(sizes.get(size, size) for size in shape)
-        for name, shape in UNIAD_TINY.inputs.items()
-    }
-    inputs["img"] = (1, 6, 3, *SMALL.image_hw)
-    return dataclasses.replace(UNIAD_TINY, inputs=inputs)
+    return uniad_stack("uniad-tiny", SMALL, scale=1.0, straight_on=3)
 
 
 @functools.cache

@@ -1,14 +1,14 @@
 """VAD-tiny at its published size and in small: the same classes, layers and edges."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from me2e_compress.zoo.bev.sizes import BevGrid, Sampling
+from me2e_compress.zoo.drawing import rendered
 from me2e_compress.zoo.export import GRID_SAMPLE_OPSET, build, export, save, trace
-from me2e_compress.zoo.stacks import VAD_TINY, Stack
+from me2e_compress.zoo.stacks import VAD_TINY, Stack, vad_stack
 from me2e_compress.zoo.vad.config import PUBLISHED, RANGE, VadConfig
-from me2e_compress.zoo.vad.initialise import initialise, rendered
-from me2e_compress.zoo.vad.stack import VadTiny
+from me2e_compress.zoo.vad.stack import VadTiny, initialise
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,8 @@ class VadSize:
     def build(self, sampling: Sampling = "operator") -> VadTiny:
         """Build and initialise it, seed 0, nuScenes heads."""
         model = VadTiny("nuscenes", sampling, self.config)
-        initialise(model.requires_grad_(False).eval(), rendered(self.stack, 0), 0)
+        images = rendered(self.stack, seed=0, stride=1)
+        initialise(model.requires_grad_(False).eval(), images, seed=0)
         return model
 
     def export(self, path: Path, *, opset: int = 17, fused: bool = False) -> Path:
@@ -53,15 +54,6 @@ class PublishedSize(VadSize):
         return export("vad-tiny", path, opset=opset, fused=fused)
 
 
-def small_stack(config: VadConfig, scale: float) -> Stack:
-    """Return the interface of a configuration whose cameras have another scale."""
-    sizes = {
-        "img": (1, 6, 3, *config.image_hw),
-        "prev_bev": (config.grid.cells, 1, 256),
-    }
-    return replace(VAD_TINY, inputs={**VAD_TINY.inputs, **sizes}, scale=scale)
-
-
 SMALL = VadConfig(
     image_hw=(96, 160),  # 0.1 of 900 x 1600, padded
     stem=8,
@@ -74,7 +66,7 @@ SMALL = VadConfig(
 SIZES = {
     size.name: size
     for size in (
-        VadSize("small", SMALL, small_stack(SMALL, scale=0.1)),
+        VadSize("small", SMALL, vad_stack(SMALL, scale=0.1)),
         PublishedSize("published", PUBLISHED, VAD_TINY),
     )
 }
