@@ -24,11 +24,8 @@ from me2e_compress.errors import Me2eError, PassError, VerificationError
 from me2e_compress.manager.pass_manager import PassManager
 from me2e_compress.passes import Context
 from me2e_compress.runtime.frames import Frame
-from tests.fuzz.exact.findings import Judged
-from tests.fuzz.exact.judging import Case, Verdict
-from tests.fuzz.exact.module_map import MODULES, modules_of
+from tests.fuzz.exact.judging import MODULES, Case, Verdict, modules_of
 from tests.fuzz.exact.running import Arrays, RefusedError, Runner, drawn_inputs
-from tests.fuzz.exact.stripping import StrippingError, stripped
 
 METHODS = ("max-min", "moving-average:0.5", "percentile:99.9", "mse", "entropy")
 SCHEMES = ("full", "full", "feature-ext", "prediction")
@@ -64,8 +61,8 @@ class Held:
         return (self[index] for index in range(len(self)))
 
 
-def ways(seed: int, *, named: bool) -> Iterator[tuple[str, str]]:
-    """Draw how a graph is quantized: a label and a pipeline, one for each target.
+def ways(seed: int, *, named: bool) -> Iterator[str]:
+    """Draw how a graph is quantized: pipelines for each target.
 
     Args:
         seed: of the drawing.
@@ -85,18 +82,18 @@ def ways(seed: int, *, named: bool) -> Iterator[tuple[str, str]]:
             text = f"quantize-int8{{{given}}}"
             if target == "lowered":
                 text += ", lower-int8"
-            yield f"int8 {target}", text
+            yield text
 
 
-def judged(seed: int, model: onnx.ModelProto) -> Iterator[Judged]:
+def judged(seed: int, model: onnx.ModelProto) -> Iterator[Verdict]:
     """Judge a drawn graph by all of these."""
     try:
         case = Case(model, seed)
     except RefusedError:
         return
     named = modules_of(model) is MODULES
-    for label, text in ways(seed, named=named):
-        yield Judged(label, judge_int8(case, text, seed))
+    for text in ways(seed, named=named):
+        yield judge_int8(case, text, seed)
 
 
 def judge_int8(case: Case, pipeline: str, seed: int) -> Verdict:
@@ -191,3 +188,85 @@ def _unlike(
         if whole and not np.isfinite(other).all():
             return f"{name} is no longer finite"
     return ""
+
+
+HALF = 0.5 * (1 + 1e-4)
+"""How many steps a weight may be off; its scale is a rounded number itself."""
+
+
+class StrippingError(Exception):
+    """A weight is none of the float graph's, to half a step."""
+
+
+def stripped(
+    model: onnx.ModelProto, weights: Sequence[npt.NDArray[Any]]
+) -> onnx.ModelProto:
+    """Take every QuantizeLinear and DequantizeLinear out.
+
+    Args:
+        model: quantized for TensorRT.
+        weights: those of the float graph.
+
+    Raises:
+        StrippingError: a weight is none of these.
+    """
+    copy = onnx.ModelProto.FromString(model.SerializeToString())
+    held = {each.name: numpy_helper.to_array(each) for each in copy.graph.initializer}
+    source = {
+        node.output[0]: node.input[0]
+        for node in copy.graph.node
+        if node.op_type == "QuantizeLinear"
+    }
+    for node in copy.graph.node:
+        if node.op_type != "DequantizeLinear":
+            continue
+        if node.input[0] in source:
+            _become(node, "Identity", [source[node.input[0]]])
+            continue
+        name = f"{node.output[0]}__float"
+        original = _original(node, held, weights)
+        copy.graph.initializer.append(numpy_helper.from_array(original, name))
+        _become(node, "Identity", [name])
+    kept = [node for node in copy.graph.node if node.op_type != "QuantizeLinear"]
+    del copy.graph.node[:]
+    copy.graph.node.extend(kept)
+    return copy
+
+
+def _become(node: onnx.NodeProto, kind: str, inputs: Sequence[str]) -> None:
+    node.op_type = kind
+    del node.input[:]
+    node.input.extend(inputs)
+    del node.attribute[:]
+
+
+def _original(
+    node: onnx.NodeProto,
+    held: Mapping[str, npt.NDArray[Any]],
+    weights: Sequence[npt.NDArray[Any]],
+) -> npt.NDArray[Any]:
+    """Find the float weight that an integer one stands for."""
+    if node.input[0] not in held:
+        raise StrippingError(f"{node.output[0]} dequantizes what nobody quantized")
+    integers, scale = held[node.input[0]], held[node.input[1]]
+    axis = next((each.i for each in node.attribute if each.name == "axis"), 1)
+    if scale.ndim == 1 and integers.ndim:
+        shape = [1] * integers.ndim
+        shape[axis] = -1
+        scale = scale.reshape(shape)
+    found = integers.astype(np.float64) * scale.astype(np.float64)
+    best = np.inf
+    for weight in weights:
+        for each in (weight, weight.T):
+            if each.dtype.kind != "f" or each.size != found.size:
+                continue
+            if each.squeeze().shape != found.squeeze().shape:
+                continue
+            array = each.reshape(found.shape)
+            off = np.abs(array - found) / scale
+            if off.size == 0 or off.max() <= HALF:
+                return np.asarray(array, scale.dtype)
+            best = min(best, float(off.max()))
+    raise StrippingError(
+        f"{node.output[0]}: a weight {list(integers.shape)} is {best:.3g} steps off"
+    )
