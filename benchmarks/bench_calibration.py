@@ -26,6 +26,7 @@ from pathlib import Path
 import psutil
 
 from benchmarks.peer import peak_mb
+from benchmarks.processes import has_modelopt
 from benchmarks.subject import Subject, at
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
@@ -152,11 +153,6 @@ def watch(command: list[str], limit_gb: float) -> Row | str:
     if process.returncode:
         return f"failed: {(err.strip().splitlines() or ['no message'])[-1][:120]}"
     return Row(**json.loads(out.strip().splitlines()[-1]))
-
-
-def has_modelopt(python: Path) -> bool:
-    probe = [str(python), "-W", "ignore", "-c", "import modelopt.onnx.quantization"]
-    return subprocess.run(probe, capture_output=True, check=False).returncode == 0
 
 
 def measure(chosen: argparse.Namespace) -> dict[str, float | int | None]:

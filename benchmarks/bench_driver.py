@@ -11,8 +11,8 @@ model's own under one device scale), scales (float and int8 on devices that are 
 and slower), latency (fewer decisions a second), determinism (the driver twice, compared
 byte by byte). They share OUT, so what one has driven the
 next does not drive again, and a run that was stopped goes on: every route is written
-when it is driven (OUT/results/). Each study writes OUT/<study>/tables.md, scores.csv,
-routes.csv, study.json and report.html; the tables of all are in OUT/tables.md.
+when it is driven (OUT/results/). Each study writes OUT/<study>/tables.md, routes.csv,
+study.json and report.html; the tables of all are in OUT/tables.md.
 """
 
 import argparse
@@ -27,7 +27,6 @@ from benchmarks.driver_records import (
     among_variants,
     losers,
     routes_csv,
-    scores_csv,
 )
 from benchmarks.driver_studies import (
     IDEAL,
@@ -124,7 +123,6 @@ def run(bench: Bench, name: str, workers: int) -> None:
         parts.append(losers(outcome))
     text = "\n".join(parts)
     write_bytes(folder / MARKDOWN, f"# {study.title}\n\n{text}".encode())
-    write_bytes(folder / "scores.csv", scores_csv(outcome).encode())
     write_bytes(folder / "routes.csv", routes_csv(outcome).encode())
     print(text)
 

@@ -2,48 +2,33 @@
 
 import csv
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from me2e_compress.evaluators.highway.results import ResultsFolder
 from me2e_compress.metrics.differences import PairedDifference, difference
 from me2e_compress.metrics.episode import Episode
-from me2e_compress.metrics.measure import Estimate
-from me2e_compress.metrics.scores import Scores
 from me2e_compress.study import Condition, StudyResult, Variant
-from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.tables import estimate_cell
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import Cell, Table
 
-Value = float | int | str | None
-Row = Mapping[str, Value]
-
-DIGITS = 4
-"""After the point, of means and intervals."""
-
-
-def scores_csv(outcome: StudyResult) -> str:
-    """One row a variant and condition; what was not measured is empty."""
-    return _csv([_scores(outcome, drive) for drive in outcome.drives])
+COLUMNS = (
+    *("scheme", "condition", "route", "driving_score_percent", "succeeded", "ending"),
+    "infractions",
+)
 
 
 def routes_csv(outcome: StudyResult) -> str:
     """One row a variant, condition and route."""
-    return _csv(
-        [
-            {
-                "scheme": drive.variant,
-                "condition": drive.condition,
-                "route": each.route,
-                "driving_score_percent": each.driving_score,
-                "succeeded": int(each.succeeded),
-                "ending": each.ending,
-                "infractions": " ".join(kind for kind, _ in each.moments),
-            }
-            for drive in outcome.drives
-            for each in drive.routes
-        ]
-    )
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for drive in outcome.drives:
+        for each in drive.routes:
+            infractions = " ".join(kind for kind, _ in each.moments)
+            found = (each.driving_score, int(each.succeeded), each.ending, infractions)
+            writer.writerow((drive.variant, drive.condition, each.route, *found))
+    return text.getvalue()
 
 
 def among_conditions(
@@ -134,56 +119,3 @@ def _driven(
     if not workspace.results(variant, condition).is_dir():
         return []
     return _episodes(workspace, variant, condition)
-
-
-def _scores(outcome: StudyResult, drive: DriveRecord) -> Row:
-    variant = outcome.variant(drive.variant)
-    return {
-        "scheme": drive.variant,
-        "condition": drive.condition,
-        **_means(drive.scores),
-        **_losses(drive.difference),
-        "size_mb": variant.size_mb.value,
-        "latency_p50_ms": variant.latency_ms[50].value,
-        "latency_p99_ms": variant.latency_ms[99].value,
-        "plan_displacement_mean_m": variant.fidelity.mean_m.value,
-        "plan_displacement_max_m": variant.fidelity.max_m.value,
-        "plan_sqnr_db": variant.fidelity.plan_sqnr_db.value,
-    }
-
-
-def _means(found: Scores | None) -> Row:
-    return {
-        "routes": None if found is None else found.routes,
-        **_ends("driving_score_percent", None if not found else found.driving_score),
-        **_ends("success_rate_percent", None if not found else found.success_rate),
-        **_ends("efficiency_percent", None if not found else found.efficiency),
-        **_ends("comfort", None if not found else found.comfort),
-    }
-
-
-def _losses(found: PairedDifference | None) -> Row:
-    return {
-        **_ends("driving_score_difference", None if not found else found.driving_score),
-        **_ends("success_rate_difference", None if not found else found.success_rate),
-        "routes_better": None if found is None else found.better,
-        "routes_worse": None if found is None else found.worse,
-    }
-
-
-def _ends(name: str, found: Estimate | None) -> Row:
-    keys = (name, f"{name}_low", f"{name}_high")
-    if found is None:
-        return dict.fromkeys(keys)
-    ends = (found.value, found.low, found.high)
-    rounded = (None if each is None else round(each, DIGITS) for each in ends)
-    return dict(zip(keys, rounded, strict=True))
-
-
-def _csv(rows: list[Row]) -> str:
-    text = io.StringIO()
-    if rows:
-        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    return text.getvalue()

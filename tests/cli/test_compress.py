@@ -160,8 +160,8 @@ def test_an_open_batch_gets_one_size_in_every_command(cli: Cli, tmp_path: Path) 
     for name in "bc":
         cli.done(f"compress m.onnx -r {name}.toml --frames frames -o {name}.onnx")
     for name in "abc":
-        made = graph.load(tmp_path / f"{name}.onnx")
-        assert str(made.graph.inputs[0].shape) == "[1,16,8,8]"
+        sized = graph.load(tmp_path / f"{name}.onnx")
+        assert str(sized.graph.inputs[0].shape) == "[1,16,8,8]"
 
 
 FRAME = {

@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -167,7 +168,7 @@ OVERRIDES = {
     "concat": '[[concat]]\nnodes = "/radar/*"\nscale = "own"',
     "radar": '[modules.radar]\nrole = "feature"\npatterns = ["radar_net"]\n',
 }
-RANGES: Mapping[str, Mapping[str, object]] = {
+RANGES: Mapping[str, Mapping[str, Any]] = {
     "nan": {"tensors": {"a": [float("nan"), 1]}},
     "inf": {"tensors": {"a": [-1, float("inf")]}},
     "large": {"tensors": {"a": [-1e39, 1]}},

@@ -5,8 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.dims import Dim, Open, Shape, broadcast, is_static, product
-from tests.fuzz.exact.values import INT64, Attributes, Val
+from tests.fuzz.exact.values import (
+    INT64,
+    Attributes,
+    Dim,
+    Open,
+    Shape,
+    Val,
+    broadcast,
+    is_static,
+    product,
+)
 
 UNARY: dict[str, tuple[int, bool]] = {
     "Abs": (11, True), "Cos": (11, True), "Elu": (11, False), "Erf": (11, False),

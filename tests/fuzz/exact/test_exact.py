@@ -6,10 +6,9 @@ import pytest
 
 from me2e_compress.passes import PASSES
 from tests.fuzz.exact import int8
-from tests.fuzz.exact.drawing import draw, drawing
+from tests.fuzz.exact.drawing import MOTIFS, draw, drawing
 from tests.fuzz.exact.judging import Case, judged, report
 from tests.fuzz.exact.pipelines import SLOW, some_for
-from tests.fuzz.exact.registry_of_motifs import MOTIFS
 
 FIRST, GRAPHS, PARTS = 1000, 300, 4
 LEAST_MOTIF, LEAST_PASS = 3, 3

@@ -7,9 +7,8 @@ import numpy as np
 
 from tests.fuzz.exact import spelling as sp
 from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.dims import Dim, product
 from tests.fuzz.exact.motifs.linear import layer
-from tests.fuzz.exact.values import BOOL, Val
+from tests.fuzz.exact.values import BOOL, Dim, Val, product
 
 
 @dataclasses.dataclass(frozen=True)

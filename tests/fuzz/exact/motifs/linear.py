@@ -2,8 +2,7 @@
 
 from tests.fuzz.exact import spelling as sp
 from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.dims import is_static, product
-from tests.fuzz.exact.values import Val
+from tests.fuzz.exact.values import Val, is_static, product
 
 
 def layer(b: Builder, x: Val, width: int | None = None) -> Val:

@@ -53,12 +53,6 @@ def _scaled(b: Builder, x: Val, kind: str) -> Val:
     return sp.binary(b, kind, *([x, gamma] if b.chance(0.6) else [gamma, x]))
 
 
-def rms_norm(b: Builder) -> None:
-    x = b.rows(2, 4)
-    mean = sp.reduce(b, "ReduceMean", _square(b, x), [-1], keep=True)
-    _scaled(b, _rooted(b, x, mean), "Mul")
-
-
 def gelu(b: Builder) -> None:
     """The erf or the tanh form, its factors in any order."""
     x = b.rows(1, 4)
@@ -134,21 +128,3 @@ def constant_chain(b: Builder) -> None:
             continue
         flip = kind != "Div" and b.chance(0.3)
         x = sp.binary(b, kind, *([other, x] if flip else [x, other]))
-
-
-def powers(b: Builder) -> None:
-    """Squares, roots and reciprocals of what is positive."""
-    x = b.rows(1, 4)
-    y = sp.binary(b, "Add", _square(b, x), sp.scalar(b, 0.5, 0))
-    for _ in range(b.rng.randint(1, 3)):
-        kind = b.rng.choice(("Sqrt", "Reciprocal", "Log", "Pow", "Exp"))
-        if kind == "Pow":
-            power = b.rng.choice((0.5, 1.0, 2.0, -1.0, -0.5, 0.0))
-            y = b.op("Pow", [y, sp.scalar(b, power, 0)], y.shape)
-        elif kind == "Exp":
-            y = b.op("Exp", [b.op("Tanh", [y], y.shape)], y.shape)
-        elif kind == "Log":
-            y = b.op("Abs", [b.op("Log", [y], y.shape)], y.shape)
-            y = sp.binary(b, "Add", y, sp.scalar(b, 0.5, 0))
-        else:
-            y = b.op(kind, [y], y.shape)

@@ -6,9 +6,8 @@ import numpy as np
 
 from tests.fuzz.exact import spelling as sp
 from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.dims import Dim, Open, elements, is_static, product, sizes
 from tests.fuzz.exact.motifs.linear import layer
-from tests.fuzz.exact.values import Val
+from tests.fuzz.exact.values import Dim, Open, Val, elements, is_static, product, sizes
 
 LARGEST = 1 << 15
 """Elements that a repetition may make."""
