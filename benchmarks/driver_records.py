@@ -17,6 +17,8 @@ COLUMNS = (
     "infractions",
 )
 
+Drive = tuple[Variant, Condition]
+
 
 def routes_csv(outcome: StudyResult) -> str:
     """One row a variant, condition and route."""
@@ -45,18 +47,11 @@ def among_conditions(
         conditions: All of them were driven.
         to: The one that is subtracted.
     """
-    reference = _episodes(workspace, variant, to)
-    rows = [
-        (Cell(each.name), *_cells(difference(episodes, reference)))
-        for each in conditions
-        if each != to and (episodes := _episodes(workspace, variant, each))
+    pairs = [
+        (each.name, (variant, each), (variant, to)) for each in conditions if each != to
     ]
-    return Table(
-        f"{variant.name}: difference to {to.name} on the same routes",
-        ("condition", "DS, points", "SR, points", "routes better", "routes worse"),
-        tuple(rows),
-        "Mean over routes with its 95 % interval, paired bootstrap.",
-    )
+    title = f"{variant.name}: difference to {to.name} on the same routes"
+    return _paired(workspace, title, "condition", pairs)
 
 
 def among_variants(
@@ -69,15 +64,27 @@ def among_variants(
         pairs: Both of each were driven, or the row is left out.
         condition: Of all.
     """
-    rows = [
-        (Cell(f"{one.name} minus {two.name}"), *_cells(difference(more, less)))
+    named = [
+        (f"{one.name} minus {two.name}", (one, condition), (two, condition))
         for one, two in pairs
-        if (more := _driven(workspace, one, condition))
-        and (less := _driven(workspace, two, condition))
+    ]
+    return _paired(workspace, "One more module away", "variants", named)
+
+
+def _paired(
+    workspace: Workspace,
+    title: str,
+    first: str,
+    pairs: Iterable[tuple[str, Drive, Drive]],
+) -> Table:
+    rows = [
+        (Cell(name), *_cells(difference(more, less)))
+        for name, one, two in pairs
+        if (more := _driven(workspace, *one)) and (less := _driven(workspace, *two))
     ]
     return Table(
-        "One more module away",
-        ("variants", "DS, points", "SR, points", "routes better", "routes worse"),
+        title,
+        (first, "DS, points", "SR, points", "routes better", "routes worse"),
         tuple(rows),
         "Mean over routes with its 95 % interval, paired bootstrap.",
     )
@@ -105,17 +112,11 @@ def _cells(found: PairedDifference) -> tuple[Cell, ...]:
     )
 
 
-def _episodes(
-    workspace: Workspace, variant: Variant, condition: Condition
-) -> list[Episode]:
-    folder = ResultsFolder.open(workspace.results(variant, condition))
-    return list(folder.episodes().values())
-
-
 def _driven(
     workspace: Workspace, variant: Variant, condition: Condition
 ) -> list[Episode]:
     """Give the episodes; none where nobody drove."""
-    if not workspace.results(variant, condition).is_dir():
+    folder = workspace.results(variant, condition)
+    if not folder.is_dir():
         return []
-    return _episodes(workspace, variant, condition)
+    return list(ResultsFolder.open(folder).episodes().values())

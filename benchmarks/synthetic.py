@@ -9,6 +9,7 @@ identities, repeated expressions and float scalars stand where the exporter puts
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +28,7 @@ class Builder:
     weights: list[onnx.TensorProto] = dataclasses.field(default_factory=list)
     scope: str = ""
 
-    def add(self, op_type: str, *inputs: str, **attributes: object) -> str:
+    def add(self, op_type: str, *inputs: str, **attributes: Any) -> str:
         name = f"{self.scope}/{op_type}_{len(self.nodes)}"
         result = f"{name}_output_0"
         node = onnx.helper.make_node(op_type, inputs, [result], name, **attributes)

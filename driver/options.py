@@ -65,7 +65,7 @@ def claim(manifest: Path, what: str, options: Mapping[str, Any]) -> None:
                 raise TrainingError(
                     f"{folder}: not empty, and holds no {manifest.name}"
                 )
-            write_json(manifest, options, indent=1)
+            write_json(manifest, dict(options), indent=1)
         before = json.loads(manifest.read_bytes())
     except OSError as error:
         raise TrainingError(f"{folder}: cannot be used: {error.strerror}") from error

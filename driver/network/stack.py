@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from driver.network.bev_encoder import BevEncoder
 from driver.network.blocks import Residual, conv_block
 from driver.network.config import STEPS, HighwayConfig
-from driver.network.interfaces import EgoState, PlannerInput, gather
+from driver.network.interfaces import EgoState, PlannerInput
 from driver.network.map import Choice, Map, RoadMap
 from driver.network.motion import Futures, Motion
 from driver.network.planner import Planner
@@ -138,15 +138,23 @@ class Highway(nn.Module):
         Every part is made in a scope of the exported graph that begins with the name
         of its module, so that ablating a module removes all of it, outputs too.
         """
-        road, futures = seen.road, seen.futures
-        return gather(
-            seen.tracks,
-            road,
-            self.map_route(road, command),
-            self.map_raster(road.raster),
-            futures,
-            self.motion_modes(futures.logits),
-            self.occ_taken(seen.occupancy),
+        tracks, road, futures = seen.tracks, seen.road, seen.futures
+        route = self.map_route(road, command)
+        return PlannerInput(
+            agents=futures.query,
+            boxes=tracks.boxes,
+            score=tracks.score,
+            travel=futures.travel,
+            modes=self.motion_modes(futures.logits),
+            lateral=route.lateral,
+            path=route.path,
+            headings=route.headings,
+            attributes=route.attributes,
+            points=route.points,
+            raster=self.map_raster(road.raster),
+            signal_query=road.signal_query,
+            signals=road.signals,
+            occupancy=self.occ_taken(seen.occupancy),
         )
 
     def forward(

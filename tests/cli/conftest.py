@@ -124,14 +124,6 @@ def dense(files: Path) -> Path:
     return files
 
 
-def save_text(path: Path, text: str, **metadata: str) -> Path:
-    """Write a graph of opset 17 that is given as ONNX text, without its head."""
-    model = ir.from_onnx_text(f'<ir_version: 9, opset_import: ["" : 17]>\n{text}')
-    model.metadata_props.update(metadata)
-    graph.save(model, path)
-    return path
-
-
 def strict(text: str) -> Any:
     """Read JSON as programs do: it knows neither NaN nor Infinity."""
 

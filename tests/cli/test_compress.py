@@ -9,9 +9,9 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph, rewrite
-from tests.cli.conftest import Cli, save_text, write_frames
+from tests.cli.conftest import Cli, write_frames
 from tests.frames import record
-from tests.nets import conv_attention, image
+from tests.nets import conv_attention, image, save_text
 from tests.plugins import exported
 
 ABLATE = "compress in.onnx --passes ablate-modules{drop=[occ]} --map map.toml"

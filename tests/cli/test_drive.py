@@ -11,9 +11,10 @@ from me2e_compress.marks import IN_JSON
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.simulator.routes import load_routes, save_routes
-from tests.cli.conftest import Cli, save_text
+from tests.cli.conftest import Cli
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
 from tests.frames import record
+from tests.nets import save_text
 from tests.simulator.world.driving import route_of
 from tests.workflows.test_check_model import ADAPTER, tcp_like
 

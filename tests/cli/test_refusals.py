@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph, rewrite
-from tests.cli.conftest import Cli, contents, save_text, write_frames
+from tests.cli.conftest import Cli, contents, write_frames
+from tests.nets import save_text
 
 F = "dense.onnx frames --map map.toml"
 EXACT = "in.onnx --map map.toml -o out.onnx --passes fold-constants"
@@ -176,7 +177,7 @@ RANGES: Mapping[str, Mapping[str, Any]] = {
     "other-graph": {"model": "another"},
     "other-frames": {"source": "others"},
 }
-FRAMES = {
+FRAMES: Mapping[str, Mapping[str, np.ndarray]] = {
     "wrong-name": {"radar": np.zeros((1, 4), np.float32)},
     "wrong-shape": {"camera": np.zeros((1, 5), np.float32)},
     "wrong-dtype": {"camera": np.zeros((1, 4), np.float64)},

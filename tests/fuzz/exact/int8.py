@@ -10,7 +10,9 @@ close the numbers are is a matter of fidelity, not of this test.
 
 import dataclasses
 import random
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,12 +22,13 @@ import onnx_ir as ir
 from onnx import numpy_helper
 
 from me2e_compress import recipe
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import Me2eError, PassError, VerificationError
 from me2e_compress.manager.pass_manager import PassManager
 from me2e_compress.passes import Context
-from me2e_compress.runtime.frames import Frame
+from tests.frames import record
 from tests.fuzz.exact.judging import MODULES, Case, Verdict, modules_of
-from tests.fuzz.exact.running import Arrays, RefusedError, Runner, drawn_inputs
+from tests.fuzz.exact.running import RefusedError, Runner, drawn_inputs
 
 METHODS = ("max-min", "moving-average:0.5", "percentile:99.9", "mse", "entropy")
 SCHEMES = ("full", "full", "feature-ext", "prediction")
@@ -34,31 +37,6 @@ EACH = 2
 """How many ways a graph is quantized."""
 
 FRAMES = 2
-
-
-@dataclasses.dataclass(frozen=True)
-class Held:
-    """A recording in memory."""
-
-    arrays: Sequence[Arrays]
-    fingerprint: str
-
-    @property
-    def scenes(self) -> Sequence[int]:
-        return (0,)
-
-    @property
-    def places(self) -> Sequence[int]:
-        return range(len(self.arrays))
-
-    def __len__(self) -> int:
-        return len(self.arrays)
-
-    def __getitem__(self, index: int) -> Frame:
-        return Frame(index, index == 0, dict(self.arrays[index]))
-
-    def __iter__(self) -> Iterator[Frame]:
-        return (self[index] for index in range(len(self)))
 
 
 def ways(seed: int, *, named: bool) -> Iterator[str]:
@@ -101,12 +79,12 @@ def judge_int8(case: Case, pipeline: str, seed: int) -> Verdict:
     runner = case.answers.runner
     size = case.sizes[0]
     fed = [drawn_inputs(runner, seed + turn, size) for turn in range(FRAMES)]
-    context = dataclasses.replace(
-        case.context, frames=Held(fed, f"drawn-{seed}-{size}"), measured={}
-    )
     try:
-        base = _run("fold-constants", case.imported, context)
-        after = _run(pipeline, base, context)
+        with tempfile.TemporaryDirectory(prefix="int8-") as folder:
+            frames = CalibrationSet(record(Path(folder, "frames"), fed))
+            context = dataclasses.replace(case.context, frames=frames, measured={})
+            base = _run("fold-constants", case.imported, context)
+            after = _run(pipeline, base, context)
     except (PassError, VerificationError) as error:
         return Verdict("crash", pipeline, str(error))
     except Me2eError as error:
