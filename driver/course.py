@@ -11,8 +11,7 @@ from driver.episodes import Collection, collect
 from driver.log import Log
 from driver.loop import train
 from driver.network.config import HighwayConfig
-from driver.network.stack import Highway
-from driver.network.to_onnx import write
+from driver.network.stack import Highway, write_onnx
 from driver.options import claim
 from driver.process import LOG
 from driver.stored_episode import samples_in
@@ -106,7 +105,7 @@ class _CourseRun:
         self.start, log = self._train(each, place, label)
         self.driver = place / "driver.onnx"
         if not self.driver.exists():
-            write(load(self.start, self.course.config), self.driver)
+            write_onnx(load(self.start, self.course.config), self.driver)
         # drive routes that were never learned from, for the log
         scores = self._evaluate(self.driver, place / "trial", label)
         row = {"learned_frames": frames_in(self.learned), **trial.row_of(scores)}

@@ -1,6 +1,7 @@
 """The whole stack: backbone, neck and occupancy head, and all modules in order."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +14,8 @@ from driver.network.map import Choice, Map, RoadMap
 from driver.network.motion import Futures, Motion
 from driver.network.planner import Planner
 from driver.network.track import Track, Tracks
+from me2e_compress.zoo.export import save, trace
+from me2e_compress.zoo.stacks import find
 
 
 class Backbone(nn.Module):
@@ -209,3 +212,23 @@ def stood_lately(speed: Tensor, before: Tensor, elapsed_s: Tensor) -> Tensor:
     faded = before * torch.exp(-elapsed_s / STOOD_S)
     standing = (speed.abs() < STANDING_MPS).to(speed.dtype)
     return torch.maximum(faded, standing)
+
+
+OPSET = 17
+"""LayerNormalization is one operator from here on."""
+
+
+def write_onnx(model: Highway, path: Path) -> Path:
+    """Write a model in evaluation mode, standard operators only, nothing folded.
+
+    Args:
+        model: the stack, its weights as they are to drive.
+        path: the ``.onnx``; replaced in one step.
+
+    Raises:
+        GraphError: the exporter wrote another opset, or it cannot be written.
+    """
+    spec = find("highway")
+    # torch's stubs leave this form of `to` out
+    model.eval().to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+    return save(trace(spec, model, OPSET), spec.metadata(), path)
