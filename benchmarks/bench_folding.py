@@ -11,7 +11,6 @@ original's on one random frame.
 import argparse
 import tempfile
 import time
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,7 +36,7 @@ def outputs(path: Path) -> list[Any]:
     return list(session.run(None, {"tokens": tokens.astype(np.float32)}))
 
 
-def compare(count: int, tools: Sequence[str]) -> None:
+def compare(count: int) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         source = Path(scratch) / "source.onnx"
         model = exported(count)
@@ -45,7 +44,7 @@ def compare(count: int, tools: Sequence[str]) -> None:
         print(f"\n{len(model.graph.node):,} nodes, {source.stat().st_size:,} bytes")
         print(f"{'':9} {'nodes':>6} {'weights':>11} {'CPU s':>6} {'RSS MB':>7}  error")
         want = outputs(source)
-        for tool in tools:
+        for tool in TOOLS:
             target = Path(scratch) / f"{tool}.onnx"
             taken = measure(tool, Job(source, target, "", None))
             off = error(want, outputs(target))
@@ -90,7 +89,6 @@ def price() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tool", choices=TOOLS, help="that one alone")
     parser.add_argument("--nodes", type=int, nargs="+", default=SIZES)
     parser.add_argument("--price", action="store_true")
     given = parser.parse_args()
@@ -98,7 +96,7 @@ def main() -> None:
         price()
     else:
         for count in given.nodes:
-            compare(count, (given.tool,) if given.tool else TOOLS)
+            compare(count)
 
 
 if __name__ == "__main__":

@@ -42,6 +42,13 @@ def binary(b: Builder, kind: str, left: Val, right: Val) -> Val:
     return b.op(kind, [left, right], broadcast(left.shape, right.shape))
 
 
+def either_way(b: Builder, kind: str, left: Val, right: Val) -> Val:
+    """Apply an operator of two operands, at times the other way round."""
+    if kind != "Div" and b.chance(0.4):
+        left, right = right, left
+    return binary(b, kind, left, right)
+
+
 def scalar(b: Builder, value: float, rank: int | None = None) -> Val:
     """Make a constant of one element, of some rank."""
     shape = (1,) * (b.rng.choice((0, 0, 1, 2)) if rank is None else rank)

@@ -91,14 +91,6 @@ def broadcast(*shapes: Sequence[Dim]) -> Shape:
     return tuple(result)
 
 
-def fits(small: Sequence[Dim], large: Sequence[Dim]) -> bool:
-    """Say whether a shape is broadcast to another."""
-    try:
-        return broadcast(small, large) == tuple(large)
-    except ValueError:
-        return False
-
-
 @dataclasses.dataclass(frozen=True)
 class Val:
     """A value of the graph.

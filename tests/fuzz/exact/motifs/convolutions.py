@@ -88,8 +88,7 @@ def follow(b: Builder, x: Val, shared: list[Val] | None = None) -> Val:
         array = np.asarray(array * 0 + b.rng.choice((0.0, 1.0, -0.0)))
         kind = "Mul" if kind == "Div" else kind
     other = b.const(np.asarray(array, b.dtype))
-    flip = kind != "Div" and b.chance(0.3)
-    return sp.binary(b, kind, *([other, x] if flip else [x, other]))
+    return sp.either_way(b, kind, x, other)
 
 
 def _bias(b: Builder, channels: int) -> Val | None:

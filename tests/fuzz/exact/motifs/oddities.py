@@ -66,8 +66,7 @@ def twins(b: Builder) -> None:
     made = []
     for _ in range(b.rng.randint(2, 3)):
         other = b.const(number)
-        pair = [x, other] if b.chance(0.5) else [other, x]
-        y = sp.binary(b, b.rng.choice(("Add", "Mul", "Max", "Sub")), *pair)
+        y = sp.either_way(b, b.rng.choice(("Add", "Mul", "Max", "Sub")), x, other)
         made.append(b.op("Tanh", [y], y.shape) if b.chance(0.7) else y)
     if b.chance(0.6):
         sp.binary(b, "Sub", made[0], made[1])

@@ -154,8 +154,7 @@ def row_wise(b: Builder, x: Val) -> Val:
         name = b.rng.choice(("Add", "Sub", "Mul", "Div", "Max", "Min"))
         if name == "Div" and not np.all(other.array):
             name = "Mul"
-        flip = name != "Div" and b.chance(0.3)
-        return sp.binary(b, name, *([other, x] if flip else [x, other]))
+        return sp.either_way(b, name, x, other)
     if kind < 0.65:
         name = b.rng.choice(("Softmax", "Softmax", "LogSoftmax"))
         if b.chance(0.2) and b.opset >= 13:
