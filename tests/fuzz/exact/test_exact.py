@@ -68,7 +68,8 @@ def test_a_seed_gives_the_same_bytes() -> None:
         assert draw(seed).SerializeToString() == draw(seed).SerializeToString()
 
 
-@pytest.mark.parametrize("seed", [0, 7, 14, 21])
+@pytest.mark.parametrize("seed", [17, 58, 85, 154])
 def test_int8_keeps_the_graph(seed: int) -> None:
+    """Of graphs that have something to quantize, each way."""
     for found in int8.judged(seed, draw(seed)):
-        assert not found.is_bad, found
+        assert found.kind == "right", found
