@@ -142,22 +142,26 @@ class Highway(nn.Module):
         of its module, so that ablating a module removes all of it, outputs too.
         """
         tracks, road, futures = seen.tracks, seen.road, seen.futures
+        # the order in which the exporter traces them: that of the nodes in the file
         route = self.map_route(road, command)
+        raster = self.map_raster(road.raster)
+        modes = self.motion_modes(futures.logits)
+        occupancy = self.occ_taken(seen.occupancy)
         return PlannerInput(
             agents=futures.query,
             boxes=tracks.boxes,
             score=tracks.score,
             travel=futures.travel,
-            modes=self.motion_modes(futures.logits),
+            modes=modes,
             lateral=route.lateral,
             path=route.path,
             headings=route.headings,
             attributes=route.attributes,
             points=route.points,
-            raster=self.map_raster(road.raster),
+            raster=raster,
             signal_query=road.signal_query,
             signals=road.signals,
-            occupancy=self.occ_taken(seen.occupancy),
+            occupancy=occupancy,
         )
 
     def forward(
