@@ -20,8 +20,8 @@ test: check  ## lint, types, layers, tests
 test-slow: $(VENV)/.test  ## what takes minutes: TensorRT-RTX builds of whole stacks, training killed and resumed, 2 GB
 	$(PYTEST) -m slow
 
-nightly: $(VENV)/.test  ## hours: all that make test leaves out; FIRST=seed GRAPHS=count of the drawn graphs, which resume from out/nightly
-	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.exact --graphs $(or $(GRAPHS),20000) --jobs $(JOBS) --first $(or $(FIRST),0) --out $(OUT)/nightly
+nightly: $(VENV)/.test  ## hours: all that make test leaves out; FIRST=seed GRAPHS=count of the drawn graphs
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.exact --graphs $(or $(GRAPHS),20000) --jobs $(JOBS) --first $(or $(FIRST),0)
 	$(PYTEST) -m "slow or not slow" --hypothesis-profile=night --cov --cov-report=term:skip-covered
 	$(MAKE) --no-print-directory docs
 	$(MAKE) --no-print-directory newest

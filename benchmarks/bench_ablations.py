@@ -2,7 +2,6 @@
 
     python -m benchmarks.bench_ablations OUT
     python -m benchmarks.bench_ablations OUT --stacks uniad-tiny,vad-tiny,highway
-    python -m benchmarks.bench_ablations OUT --recipes uniad-scheme-6,uniad-scheme-7
 
 Exports each stack into OUT unless it is there, and runs every recipe of its schemes.
 Parameters, MACs, nodes and bytes of weights are held against what the recipe ``exact``
@@ -103,38 +102,19 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("out", type=Path)
     parser.add_argument("--stacks", default=",".join(STACKS))
-    parser.add_argument("--recipes", default="", help="of these alone; default: all")
     given = parser.parse_args(argv)
     given.out.mkdir(parents=True, exist_ok=True)
     try:
-        asked = chosen(given.stacks.split(","), given.recipes)
         print(HEAD, flush=True)
-        for name, recipes in asked.items():
-            for line in rows(name, recipes, given.out):
+        for name in given.stacks.split(","):
+            for line in rows(name, given.out):
                 print(line, flush=True)
     except Me2eError as error:
         sys.exit(f"bench_ablations: {error}")
 
 
-def chosen(stacks: Sequence[str], recipes: str) -> Mapping[str, Sequence[str]]:
-    """Return each stack's recipes that were asked for, a stack without any left out.
-
-    Raises:
-        Me2eError: one of them is a recipe of none of the stacks.
-    """
-    known = {name: tuple(STACKS[name].recipes) for name in stacks}
-    if not recipes:
-        return known
-    wanted = recipes.split(",")
-    all_known = {each for some in known.values() for each in some}
-    if unknown := [each for each in wanted if each not in all_known]:
-        raise Me2eError(f"{', '.join(unknown)}: no recipe of {', '.join(stacks)}")
-    asked = {name: [e for e in some if e in wanted] for name, some in known.items()}
-    return {name: some for name, some in asked.items() if some}
-
-
-def rows(name: str, recipes: Sequence[str], out: Path) -> Iterable[str]:
-    """Run some recipes of a stack; yield a row each.
+def rows(name: str, out: Path) -> Iterable[str]:
+    """Run the recipes of a stack; yield a row each.
 
     Raises:
         Me2eError: a recipe fails.
@@ -148,8 +128,6 @@ def rows(name: str, recipes: Sequence[str], out: Path) -> Iterable[str]:
     folded = run(graph.load(source), recipe.load("exact")[:COMMON], context)
     whole = made(folded, "exact", context)
     for number, (wanted, modules) in enumerate(stack.recipes.items(), 1):
-        if wanted not in recipes:
-            continue
         left = made(folded, wanted, context)
         scheme = wanted.removeprefix("uniad-scheme-").removeprefix("vad-scheme-")
         label = f"({scheme})" if scheme.isdigit() else f"({number}) of UniAD"

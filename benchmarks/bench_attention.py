@@ -10,12 +10,13 @@ threads. Below 1, the operator is faster.
 """
 
 import argparse
-import time
+from functools import partial
 
 import numpy as np
 import onnx_ir as ir
 import onnxruntime as ort
 
+from benchmarks.processes import in_turn
 from me2e_compress.runtime.profile import processor
 from me2e_compress.runtime.session import Session
 
@@ -65,13 +66,8 @@ def measured(tokens: int, threads: int, rounds: int) -> dict[str, float]:
     feeds = {name: draws.normal(size=(1, tokens, ROW)) for name in "qkv"}
     fed = {name: each.astype(np.float32) for name, each in feeds.items()}
     sessions = {name: opened(each, tokens, threads) for name, each in FORMS.items()}
-    taken: dict[str, list[float]] = {name: [] for name in FORMS}
-    for _ in range(rounds + 1):
-        for name, session in sessions.items():
-            begun = time.process_time()
-            session.run(fed)
-            taken[name].append(time.process_time() - begun)
-    return {name: min(seconds[1:]) for name, seconds in taken.items()}
+    works = {name: partial(each.run, fed) for name, each in sessions.items()}
+    return {name: min(seconds) for name, seconds in in_turn(works, rounds).items()}
 
 
 def main() -> None:

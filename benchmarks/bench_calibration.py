@@ -26,6 +26,7 @@ from pathlib import Path
 import psutil
 
 from benchmarks.peer import peak_mb
+from benchmarks.processes import has_modelopt
 from benchmarks.subject import Subject, at
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
@@ -77,7 +78,6 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--limit-gb", type=float, default=14)
     parser.add_argument("--peer-python", type=Path, default=Path(sys.executable))
-    parser.add_argument("--without", default="", help="rows to leave out, parted by ;")
     parser.add_argument("--only", default="", help="rows to measure, parted by ;")
     parser.add_argument("--run", help="what this process is to measure")
     chosen = parser.parse_args()
@@ -100,7 +100,7 @@ def rows_of(
     """Measure everything, one process after the other."""
     rows: dict[str, Row | str] = {}
     common = ["--frames", str(count), "--threads", str(chosen.threads)]
-    wanted = asked(chosen.only, chosen.without)
+    wanted = asked(chosen.only)
     for name in filter(wanted.__contains__, OURS):
         command = [sys.executable, "-m", "benchmarks.bench_calibration"]
         command += [str(subject.folder), "--run", name, *common]
@@ -119,15 +119,14 @@ def rows_of(
     return rows
 
 
-def asked(only: str, without: str) -> tuple[str, ...]:
+def asked(only: str) -> tuple[str, ...]:
     """Name the rows to measure, in order."""
     every = (*OURS, *PEERS)
-    first = [name.strip() for name in only.split(";") if name.strip()] or every
-    rest = [name.strip() for name in without.split(";") if name.strip()]
-    for name in (*first, *rest):
+    wanted = [name.strip() for name in only.split(";") if name.strip()] or every
+    for name in wanted:
         if name not in every:
             raise SystemExit(f"no row {name!r}; there are {'; '.join(every)}")
-    return tuple(name for name in every if name in first and name not in rest)
+    return tuple(name for name in every if name in wanted)
 
 
 def watch(command: list[str], limit_gb: float) -> Row | str:
@@ -152,11 +151,6 @@ def watch(command: list[str], limit_gb: float) -> Row | str:
     if process.returncode:
         return f"failed: {(err.strip().splitlines() or ['no message'])[-1][:120]}"
     return Row(**json.loads(out.strip().splitlines()[-1]))
-
-
-def has_modelopt(python: Path) -> bool:
-    probe = [str(python), "-W", "ignore", "-c", "import modelopt.onnx.quantization"]
-    return subprocess.run(probe, capture_output=True, check=False).returncode == 0
 
 
 def measure(chosen: argparse.Namespace) -> dict[str, float | int | None]:

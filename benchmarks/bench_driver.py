@@ -1,7 +1,6 @@
 """The driver that ships, in figures: ablated, compressed, slowed down.
 
     python -m benchmarks.bench_driver OUT [--only NAME ...] [--workers N] [--routes N]
-                                          [--model M.onnx] [--frames F --held-out H]
                                           [--target tensorrt|onnxruntime]
                                           [--rules safe|paper]
 
@@ -11,8 +10,8 @@ model's own under one device scale), scales (float and int8 on devices that are 
 and slower), latency (fewer decisions a second), determinism (the driver twice, compared
 byte by byte). They share OUT, so what one has driven the
 next does not drive again, and a run that was stopped goes on: every route is written
-when it is driven (OUT/results/). Each study writes OUT/<study>/tables.md, scores.csv,
-routes.csv, study.json and report.html; the tables of all are in OUT/tables.md.
+when it is driven (OUT/results/). Each study writes OUT/<study>/tables.md, routes.csv,
+study.json and report.html; the tables of all are in OUT/tables.md.
 """
 
 import argparse
@@ -27,7 +26,6 @@ from benchmarks.driver_records import (
     among_variants,
     losers,
     routes_csv,
-    scores_csv,
 )
 from benchmarks.driver_studies import (
     IDEAL,
@@ -123,7 +121,6 @@ def run(bench: Bench, name: str, workers: int) -> None:
         parts.append(losers(outcome))
     text = "\n".join(parts)
     write_bytes(folder / MARKDOWN, f"# {study.title}\n\n{text}".encode())
-    write_bytes(folder / "scores.csv", scores_csv(outcome).encode())
     write_bytes(folder / "routes.csv", routes_csv(outcome).encode())
     print(text)
 
@@ -135,14 +132,12 @@ def collect(out: Path) -> None:
     write_bytes(out / MARKDOWN, "\n".join(texts).encode())
 
 
-def frames_of(
-    given: Path | None, made: Path, model: Path, what: tuple[int, int]
-) -> Path:
-    """Take the frames that are given, or make them once."""
-    if given is not None or (made / "scenes.json").is_file():
-        return given or made
+def frames_of(made: Path, what: tuple[int, int]) -> Path:
+    """Make frames once."""
+    if (made / "scenes.json").is_file():
+        return made
     count, seed = what
-    return record_frames(model, made, FramesOptions(count, seed))
+    return record_frames(DRIVER, made, FramesOptions(count, seed))
 
 
 def main() -> None:
@@ -152,25 +147,20 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--only", action="append", choices=STUDIES)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--model", default=DRIVER)
     parser.add_argument("--routes", default="all", help="all, a number or ids")
-    parser.add_argument("--frames", type=Path, help="to calibrate on")
-    parser.add_argument("--held-out", type=Path, help="for fidelity and latency")
     parser.add_argument("--target", help="of int8: tensorrt or onnxruntime")
     parser.add_argument("--rules", help="of int8: safe or paper")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     shipped = load_routes()
     try:
-        model = model_path(given.model)
-        held_out = given.out / "frames-held-out"
         bench = Bench(
             given.out,
-            str(model),
+            str(model_path(DRIVER)),
             pick_routes(shipped, given.routes),
             len(shipped),
-            frames_of(given.frames, given.out / "frames", model, CALIBRATION),
-            frames_of(given.held_out, held_out, model, HELD_OUT),
+            frames_of(given.out / "frames", CALIBRATION),
+            frames_of(given.out / "frames-held-out", HELD_OUT),
             given.target,
             given.rules,
         )

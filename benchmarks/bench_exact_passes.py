@@ -1,20 +1,16 @@
 """Recipe ``exact`` against its peers: time, memory, nodes, bytes, error, latency.
 
     python -m benchmarks.bench_exact_passes model.onnx frames/ --map vad
-    python -m benchmarks.bench_exact_passes model.onnx --map uniad --rounds 1
     python -m benchmarks.bench_exact_passes --scaling
 
 Each tool works in a started process of its own, from file to file, round by round in
 turn. Ours is what a user runs: the workflow ``compress``, the manager's checks, report
 and hashes included. Three numbers are kept apart: start-up (the CPU time until the
 imports are done), the work, and verification (what two frames add to it). Latencies
-are interleaved too: round by round every graph runs one frame. Without frames nothing
-is verified and no graph is run: what is left are times, memory, nodes and bytes.
+are interleaved too: round by round every graph runs one frame.
 """
 
 import argparse
-import contextlib
-import io
 import os
 import tempfile
 import time
@@ -82,20 +78,16 @@ def replay(
     return feeds, wanted
 
 
-def compare(source: Path, folder: Path | None, preset: str, rounds: int) -> None:
-    tools = [tool for tool in TOOLS if folder is not None or tool != "ours, verified"]
+def compare(source: Path, folder: Path, preset: str, rounds: int) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         files = {"original": source}
-        files |= {tool: Path(scratch) / f"{tool}.onnx" for tool in tools}
-        taken: dict[str, list[Taken]] = {tool: [] for tool in tools}
+        files |= {tool: Path(scratch) / f"{tool}.onnx" for tool in TOOLS}
+        taken: dict[str, list[Taken]] = {tool: [] for tool in TOOLS}
         for _ in range(rounds):
             for tool, runs in taken.items():
                 runs.append(measure(tool, Job(source, files[tool], preset, folder)))
         show_times(taken)
-        if folder is None:
-            show_sizes(files)
-        else:
-            show_graphs(files, frames(folder, 2))
+        show_graphs(files, frames(folder, 2))
 
 
 def show_times(taken: Mapping[str, Sequence[Taken]]) -> None:
@@ -113,12 +105,6 @@ def show_times(taken: Mapping[str, Sequence[Taken]]) -> None:
         for mine, theirs in zip(taken["ours"], taken["onnxsim"], strict=True)
     ]
     print(f"ours / onnxsim, round by round: {np.median(ratios):.2f} (median)")
-
-
-def show_sizes(files: Mapping[str, Path]) -> None:
-    print(f"\n{'':17}  nodes        bytes")
-    for name, path in files.items():
-        print(f"{name:17} {nodes(path):6} {os.path.getsize(path):12,}")
 
 
 def show_graphs(files: Mapping[str, Path], shown: Sequence[Frame]) -> None:
@@ -155,8 +141,7 @@ def scaling() -> None:
             model = synthetic(count)
             onnx.save(model, source)
             target = Path(scratch) / "ours.onnx"
-            with contextlib.redirect_stdout(io.StringIO()):
-                cpu_s = measure("ours", Job(source, target, "", None)).cpu_s
+            cpu_s = measure("ours", Job(source, target, "", None)).cpu_s
             size = len(model.graph.node)
             print(
                 f"{size:8} {nodes(target):10} {cpu_s:6.2f} {1e3 * cpu_s / size:12.3f}"
@@ -173,10 +158,10 @@ def main() -> None:
     given = parser.parse_args()
     if given.scaling:
         scaling()
-    elif given.model:
+    elif given.model and given.frames:
         compare(given.model, given.frames, given.map, given.rounds)
     else:
-        parser.error("name a model, or --scaling")
+        parser.error("name a model and frames, or --scaling")
 
 
 if __name__ == "__main__":

@@ -9,12 +9,9 @@ original's on one random frame.
 """
 
 import argparse
-import json
-import resource
-import subprocess
-import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,29 +21,13 @@ import onnxruntime
 
 from benchmarks.bench_exact_passes import error
 from benchmarks.exported import exported
-from benchmarks.simplifiers import Job, onnxsim, onnxslim, ours
+from benchmarks.processes import in_turn
+from benchmarks.simplifiers import Job, measure
 from benchmarks.synthetic import TOKENS, WIDTH
 from me2e_compress import graph
 
-TOOLS = {"ours": ours, "onnxsim": onnxsim, "onnxslim": onnxslim}
+TOOLS = ("ours", "onnxsim", "onnxslim")
 SIZES = (8_000, 30_000)
-
-
-def work_alone(tool: str, source: Path, target: Path) -> None:
-    """Run one tool here; the last line says what the process took."""
-    TOOLS[tool](Job(source, target, "", None))()
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    taken = {"cpu_s": time.process_time(), "rss_mb": used.ru_maxrss / 1024}
-    print(json.dumps(taken))
-
-
-def run(tool: str, source: Path, target: Path) -> dict[str, float]:
-    words = [sys.executable, "-m", "benchmarks.bench_folding", "--tool", tool]
-    done = subprocess.run(
-        [*words, str(source), str(target)], capture_output=True, text=True, check=True
-    )
-    found: dict[str, float] = json.loads(done.stdout.strip().splitlines()[-1])
-    return found
 
 
 def outputs(path: Path) -> list[Any]:
@@ -55,7 +36,7 @@ def outputs(path: Path) -> list[Any]:
     return list(session.run(None, {"tokens": tokens.astype(np.float32)}))
 
 
-def compare(count: int, tools: list[str]) -> None:
+def compare(count: int) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         source = Path(scratch) / "source.onnx"
         model = exported(count)
@@ -63,14 +44,14 @@ def compare(count: int, tools: list[str]) -> None:
         print(f"\n{len(model.graph.node):,} nodes, {source.stat().st_size:,} bytes")
         print(f"{'':9} {'nodes':>6} {'weights':>11} {'CPU s':>6} {'RSS MB':>7}  error")
         want = outputs(source)
-        for tool in tools:
+        for tool in TOOLS:
             target = Path(scratch) / f"{tool}.onnx"
-            taken = run(tool, source, target)
+            taken = measure(tool, Job(source, target, "", None))
             off = error(want, outputs(target))
             made = graph.size(graph.load(target))
             print(
                 f"{tool:9} {made.nodes:6} {made.weight_bytes:11,}"
-                f" {taken['cpu_s']:6.1f} {taken['rss_mb']:7.0f}  {off:.1e}"
+                f" {taken.startup_s + taken.cpu_s:6.1f} {taken.peak_mb:7.0f}  {off:.1e}"
             )
 
 
@@ -93,12 +74,9 @@ def price() -> None:
         options.intra_op_num_threads = 2
         session = onnxruntime.InferenceSession(model.SerializeToString(), options)
         feeds = {name: np.ones(shape, np.float32) for name in ("x", "w")}
-        best = float("inf")
-        for _ in range(7):
-            start = time.perf_counter()
-            session.run(None, feeds)
-            best = min(best, time.perf_counter() - start)
-        return best / depth
+        runs = {op: partial(session.run, None, feeds)}
+        (taken,) = in_turn(runs, 7, time.perf_counter).values()
+        return min(taken) / depth
 
     node_s = seconds("Add", 1000, [4])
     product_s, sum_s = seconds("MatMul", 4, [1024, 1024]), seconds("Add", 8, [1 << 22])
@@ -111,18 +89,14 @@ def price() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("files", type=Path, nargs="*", help=argparse.SUPPRESS)
-    parser.add_argument("--tool", choices=list(TOOLS), help="that one alone")
     parser.add_argument("--nodes", type=int, nargs="+", default=SIZES)
     parser.add_argument("--price", action="store_true")
     given = parser.parse_args()
-    if given.files:
-        work_alone(given.tool, *given.files)
-    elif given.price:
+    if given.price:
         price()
     else:
         for count in given.nodes:
-            compare(count, [given.tool] if given.tool else list(TOOLS))
+            compare(count)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,7 +33,7 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 
-from benchmarks import subjects
+from benchmarks import processes, subjects
 from benchmarks.bench_runtime import sqnr_db
 from benchmarks.gpu_table import Found, write
 from benchmarks.runtime_files import (
@@ -43,7 +42,6 @@ from benchmarks.runtime_files import (
     REFERENCE,
     Entry,
     first_frame,
-    last_line,
     made,
     path_of,
 )
@@ -195,10 +193,9 @@ class Bench:
         command += ["--energy"] if given.energy else []
         for name in ("runs", "seconds", "warm_up", "threads"):
             command += [f"--{name.replace('_', '-')}", str(getattr(given, name))]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            return last_line(done)
-        found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+        found = processes.answer(command)
+        if isinstance(found, str):
+            return found
         with np.load(self._reference) as wanted, np.load(answers) as got:
             wild = [name for name in got if not np.isfinite(got[name]).all()]
             noise = {name: sqnr_db(wanted[name], got[name]) for name in wanted}

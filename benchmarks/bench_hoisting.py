@@ -9,6 +9,7 @@ pass itself takes on graphs of more and more products of repeated rows.
 
 import time
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import onnx
 import onnx_ir as ir
 import onnxruntime
 
+from benchmarks.processes import in_turn
 from me2e_compress import graph
 from me2e_compress.graph import provenance
 from me2e_compress.modules import ModuleMap
@@ -72,15 +74,14 @@ def session_of(model: ir.Model) -> onnxruntime.InferenceSession:
 
 def milliseconds(models: list[ir.Model], feeds: Arrays, runs: int) -> list[float]:
     """Time models in turns: the least CPU time of a run of each."""
-    sessions = [session_of(model) for model in models]
-    least = [float("inf")] * len(models)
-    for _ in range(ROUNDS):
-        for at, session in enumerate(sessions):
-            start = time.process_time()
-            for _ in range(runs):
-                session.run(None, dict(feeds))
-            least[at] = min(least[at], (time.process_time() - start) / runs * 1e3)
-    return least
+
+    def work(session: onnxruntime.InferenceSession) -> None:
+        for _ in range(runs):
+            session.run(None, dict(feeds))
+
+    works = {str(at): partial(work, session_of(m)) for at, m in enumerate(models)}
+    taken = in_turn(works, ROUNDS).values()
+    return [min(seconds) / runs * 1e3 for seconds in taken]
 
 
 def show_keys() -> None:

@@ -19,7 +19,6 @@ timed. The table says so.
 import argparse
 import dataclasses
 import json
-import subprocess
 import sys
 import tempfile
 import time
@@ -31,8 +30,9 @@ from typing import Any
 import onnx_ir as ir
 
 from benchmarks import subjects
-from benchmarks.bench_calibration import has_modelopt, watch
+from benchmarks.bench_calibration import watch
 from benchmarks.peer import peak_mb
+from benchmarks.processes import answer, has_modelopt
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import GraphError
@@ -213,9 +213,10 @@ def measure(
 
 def ask(command: list[str]) -> dict[str, Any]:
     """Run a child and read its answer."""
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE)
-    answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return answer
+    found = answer(command)
+    if isinstance(found, str):
+        raise SystemExit(found)
+    return found
 
 
 def weigh(chosen: argparse.Namespace) -> dict[str, object]:

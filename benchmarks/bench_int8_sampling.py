@@ -11,8 +11,8 @@ zero, as those of cameras that do not see it are. Ten CPU seconds.
 
 import argparse
 import dataclasses
-import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ import numpy.typing as npt
 import onnx
 import onnx_ir as ir
 
+from benchmarks.processes import in_turn
 from me2e_compress import graph
 from me2e_compress.runtime.session import Session
 
@@ -110,13 +111,9 @@ def milliseconds(
     sessions: Sequence[Session], feeds: Sequence[Arrays], rounds: int
 ) -> list[float]:
     """Time runs in turn: the least CPU time of each."""
-    least = [float("inf")] * len(sessions)
-    for _ in range(rounds):
-        for at, (session, fed) in enumerate(zip(sessions, feeds, strict=True)):
-            start = time.process_time()
-            session.run(fed)
-            least[at] = min(least[at], (time.process_time() - start) * 1e3)
-    return least
+    pairs = zip(sessions, feeds, strict=True)
+    works = {str(at): partial(one.run, fed) for at, (one, fed) in enumerate(pairs)}
+    return [min(seconds) * 1e3 for seconds in in_turn(works, rounds).values()]
 
 
 def show(case: Case, rounds: int) -> None:

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import onnxruntime as ort
 
+from benchmarks.processes import in_turn
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.opening import REFUSALS
@@ -167,14 +168,7 @@ def measured(
             session = _session(path, options_of(threads, each), each)
             seconds.append(time.process_time() - begun)
             runs.append(runner(session, feeds, each))
-    for run in runs:
-        run()
-    taken: list[list[float]] = [[], []]
-    for _ in range(rounds):
-        for run, seconds in zip(runs, taken, strict=True):
-            begun = time.process_time()
-            run()
-            seconds.append(time.process_time() - begun)
+    taken = in_turn(dict(zip(("ours", "other"), runs, strict=True)), rounds).values()
     ours, other = map(Cost, map(min, taken), map(min, opening))
     return ours, other
 

@@ -24,6 +24,7 @@ from time import process_time
 
 import onnx_ir as ir
 
+from benchmarks.processes import has_modelopt
 from benchmarks.subjects import Subject, make
 from benchmarks.synthetic import synthetic
 from me2e_compress import graph, recipe
@@ -76,8 +77,7 @@ def quantize_by_peer(subject: Subject, python: Path, frames: int) -> Path | None
     output = subject.folder / "modelopt.onnx"
     if output.is_file():
         return output
-    probe = [str(python), "-W", "ignore", "-c", "import modelopt.onnx.quantization"]
-    if subprocess.run(probe, check=False, capture_output=True).returncode:
+    if not has_modelopt(python):
         return None
     words = ["modelopt", subject.model, subject.frames, output, "--frames", frames]
     command = [str(python), "-W", "ignore", "benchmarks/peer.py", *map(str, words)]

@@ -1,7 +1,6 @@
 """What every shipped recipe makes of VAD-tiny: size, fidelity, and does it still see.
 
-    python -m benchmarks.bench_recipes [FOLDER] [--calibration 8] [--held-out 4]
-        [--only full,fused]
+    python -m benchmarks.bench_recipes [FOLDER] [--only full,fused]
 
 Exports VAD-tiny and writes its frames into FOLDER (default: a scratch folder), runs
 every recipe for it from file to file, compares each result with the source on
@@ -35,8 +34,6 @@ HEAD = "recipe            MB   nodes  int8 MB  ego dB  plan m (max)  least move 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path, nargs="?")
-    parser.add_argument("--calibration", type=int, default=8)
-    parser.add_argument("--held-out", type=int, default=4)
     parser.add_argument("--only", default=",".join(["source", *RECIPES]))
     options = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as scratch:
@@ -46,8 +43,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         seen, held_out = (
             record_frames(STACK, folder / name, FramesOptions(count, seed, length))
             for name, count, seed, length in (
-                ("frames", options.calibration, 0, 4),
-                ("held-out", options.held_out, 1, 1),
+                ("frames", 8, 0, 4),
+                ("held-out", 4, 1, 1),
             )
         )
         others = CalibrationSet(held_out)

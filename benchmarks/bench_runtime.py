@@ -25,13 +25,11 @@ that against the file as exported.
 
 import argparse
 import dataclasses
-import json
 import math
 import statistics
-import subprocess
 import sys
-import time
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +38,7 @@ import onnx_ir as ir
 
 from benchmarks import subjects
 from benchmarks.bench_int8_cpu import macs_of_a_frame
+from benchmarks.processes import answer, in_turn
 from benchmarks.runtime_files import (
     ENTRIES,
     OPTIONAL,
@@ -47,7 +46,6 @@ from benchmarks.runtime_files import (
     STACK,
     Entry,
     first_frame,
-    last_line,
     made,
     path_of,
     static,
@@ -82,11 +80,7 @@ def run(
     command += ["benchmarks/run_one.py" if peer else "benchmarks.run_one"]
     command += [entry.engine, target, str(first_frame(subject)), str(out)]
     command += ["--threads", str(given.threads), "--runs", str(given.runs)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        return last_line(done)
-    answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return answer
+    return answer(command)
 
 
 def answers_of(subject: Subject, entry: Entry) -> Path:
@@ -157,11 +151,7 @@ def peaks(size: int = 2048) -> dict[str, float]:
             key: array.astype(np.float32) if name == "float32" else array
             for key, array in feeds.items()
         }
-        taken = []
-        for _ in range(5):
-            start = time.process_time()
-            run_once(model, feeds)
-            taken.append(time.process_time() - start)
+        (taken,) = in_turn({name: partial(run_once, model, feeds)}, 5).values()
         found[name] = size**3 / min(taken)
     return found
 

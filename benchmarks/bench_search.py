@@ -54,13 +54,13 @@ def main() -> None:
         record_frames("highway", frames, FramesOptions(FRAMES), listener)
     options = RoadSearchOptions(
         drives=out / "drives",
-        limits=Limits(max_mb=asked.max_mb, max_ms=asked.max_ms),
-        ablate=asked.ablate,
-        most_ablated=asked.most_ablated,
+        limits=Limits(max_mb=1000.0),
+        ablate="map,motion,occ",
+        most_ablated=2,
         routes=asked.routes,
-        latency=asked.latency,
+        latency="trace",
         baseline_median_s=DEVICE_S,
-        first_rung=asked.first_rung,
+        first_rung=22,
     )
     engine = LocalEngine(asked.workers)
     study, grid = planned(model_path("highway"), frames, options)
@@ -157,12 +157,6 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("out", type=Path)
     parser.add_argument("--routes", default="44", help="44, or all 220")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--latency", default="trace", help="trace, fps:F, none")
-    parser.add_argument("--max-mb", type=float, default=1000.0)
-    parser.add_argument("--max-ms", type=float, default=None)
-    parser.add_argument("--ablate", default="map,motion,occ")
-    parser.add_argument("--most-ablated", type=int, default=2)
-    parser.add_argument("--first-rung", type=int, default=22)
     parser.add_argument("--skip-exhaustive", action="store_true")
     return parser.parse_args()
 

@@ -2,48 +2,35 @@
 
 import csv
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from me2e_compress.evaluators.highway.results import ResultsFolder
 from me2e_compress.metrics.differences import PairedDifference, difference
-from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_summary import RouteSummary
-from me2e_compress.metrics.scores import Scores
 from me2e_compress.study import Condition, StudyResult, Variant
 from me2e_compress.study.cells import estimate_cell
-from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import Cell, Table
 
-Value = float | int | str | None
-Row = Mapping[str, Value]
+COLUMNS = (
+    *("scheme", "condition", "route", "driving_score_percent", "succeeded", "ending"),
+    "infractions",
+)
 
-DIGITS = 4
-"""After the point, of means and intervals."""
-
-
-def scores_csv(outcome: StudyResult) -> str:
-    """One row a variant and condition; what was not measured is empty."""
-    return _csv([_scores(outcome, drive) for drive in outcome.drives])
+Drive = tuple[Variant, Condition]
 
 
 def routes_csv(outcome: StudyResult) -> str:
     """One row a variant, condition and route."""
-    return _csv(
-        [
-            {
-                "scheme": drive.variant,
-                "condition": drive.condition,
-                "route": each.route,
-                "driving_score_percent": each.driving_score,
-                "succeeded": int(each.succeeded),
-                "ending": each.ending,
-                "infractions": " ".join(kind for kind, _ in each.moments),
-            }
-            for drive in outcome.drives
-            for each in drive.routes
-        ]
-    )
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for drive in outcome.drives:
+        for each in drive.routes:
+            infractions = " ".join(kind for kind, _ in each.moments)
+            found = (each.driving_score, int(each.succeeded), each.ending, infractions)
+            writer.writerow((drive.variant, drive.condition, each.route, *found))
+    return text.getvalue()
 
 
 def among_conditions(
@@ -60,18 +47,11 @@ def among_conditions(
         conditions: All of them were driven.
         to: The one that is subtracted.
     """
-    reference = _routes(workspace, variant, to)
-    rows = [
-        (Cell(each.name), *_cells(difference(episodes, reference)))
-        for each in conditions
-        if each != to and (episodes := _routes(workspace, variant, each))
+    pairs = [
+        (each.name, (variant, each), (variant, to)) for each in conditions if each != to
     ]
-    return Table(
-        f"{variant.name}: difference to {to.name} on the same routes",
-        ("condition", "DS, points", "SR, points", "routes better", "routes worse"),
-        tuple(rows),
-        "Mean over routes with its 95 % interval, paired bootstrap.",
-    )
+    title = f"{variant.name}: difference to {to.name} on the same routes"
+    return _paired(workspace, title, "condition", pairs)
 
 
 def among_variants(
@@ -84,15 +64,27 @@ def among_variants(
         pairs: Both of each were driven, or the row is left out.
         condition: Of all.
     """
-    rows = [
-        (Cell(f"{one.name} minus {two.name}"), *_cells(difference(more, less)))
+    named = [
+        (f"{one.name} minus {two.name}", (one, condition), (two, condition))
         for one, two in pairs
-        if (more := _driven(workspace, one, condition))
-        and (less := _driven(workspace, two, condition))
+    ]
+    return _paired(workspace, "One more module away", "variants", named)
+
+
+def _paired(
+    workspace: Workspace,
+    title: str,
+    first: str,
+    pairs: Iterable[tuple[str, Drive, Drive]],
+) -> Table:
+    rows = [
+        (Cell(name), *_cells(difference(more, less)))
+        for name, one, two in pairs
+        if (more := _driven(workspace, *one)) and (less := _driven(workspace, *two))
     ]
     return Table(
-        "One more module away",
-        ("variants", "DS, points", "SR, points", "routes better", "routes worse"),
+        title,
+        (first, "DS, points", "SR, points", "routes better", "routes worse"),
         tuple(rows),
         "Mean over routes with its 95 % interval, paired bootstrap.",
     )
@@ -120,70 +112,12 @@ def _cells(found: PairedDifference) -> tuple[Cell, ...]:
     )
 
 
-def _routes(
-    workspace: Workspace, variant: Variant, condition: Condition
-) -> list[RouteSummary]:
-    folder = ResultsFolder.open(workspace.results(variant, condition))
-    return [RouteSummary.of(each) for each in folder.episodes().values()]
-
-
 def _driven(
     workspace: Workspace, variant: Variant, condition: Condition
 ) -> list[RouteSummary]:
     """Give the episodes; none where nobody drove."""
-    if not workspace.results(variant, condition).is_dir():
+    folder = workspace.results(variant, condition)
+    if not folder.is_dir():
         return []
-    return _routes(workspace, variant, condition)
-
-
-def _scores(outcome: StudyResult, drive: DriveRecord) -> Row:
-    variant = outcome.variant(drive.variant)
-    return {
-        "scheme": drive.variant,
-        "condition": drive.condition,
-        **_means(drive.scores),
-        **_losses(drive.difference),
-        "size_mb": variant.size_mb.value,
-        "latency_p50_ms": variant.latency_ms[50].value,
-        "latency_p99_ms": variant.latency_ms[99].value,
-        "plan_displacement_mean_m": variant.fidelity.mean_m.value,
-        "plan_displacement_max_m": variant.fidelity.max_m.value,
-        "plan_sqnr_db": variant.fidelity.plan_sqnr_db.value,
-    }
-
-
-def _means(found: Scores | None) -> Row:
-    return {
-        "routes": None if found is None else found.routes,
-        **_ends("driving_score_percent", None if not found else found.driving_score),
-        **_ends("success_rate_percent", None if not found else found.success_rate),
-        **_ends("efficiency_percent", None if not found else found.efficiency),
-        **_ends("comfort", None if not found else found.comfort),
-    }
-
-
-def _losses(found: PairedDifference | None) -> Row:
-    return {
-        **_ends("driving_score_difference", None if not found else found.driving_score),
-        **_ends("success_rate_difference", None if not found else found.success_rate),
-        "routes_better": None if found is None else found.better,
-        "routes_worse": None if found is None else found.worse,
-    }
-
-
-def _ends(name: str, found: Estimate | None) -> Row:
-    keys = (name, f"{name}_low", f"{name}_high")
-    if found is None:
-        return dict.fromkeys(keys)
-    ends = (found.value, found.low, found.high)
-    rounded = (None if each is None else round(each, DIGITS) for each in ends)
-    return dict(zip(keys, rounded, strict=True))
-
-
-def _csv(rows: list[Row]) -> str:
-    text = io.StringIO()
-    if rows:
-        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    return text.getvalue()
+    episodes = ResultsFolder.open(folder).episodes().values()
+    return [RouteSummary.of(each) for each in episodes]

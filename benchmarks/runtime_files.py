@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.processes import last_line
 from benchmarks.subject import Subject
 from me2e_compress import graph
 
@@ -119,12 +120,6 @@ def made(subject: Subject, entry: Entry, frames: int) -> str | None:
         [sys.executable, *command], capture_output=True, text=True, check=False
     )
     return None if path.is_file() else last_line(done)
-
-
-def last_line(done: "subprocess.CompletedProcess[str]") -> str:
-    """Say why a child ended without what it was started for."""
-    lines = done.stderr.strip().splitlines() or [f"exit {done.returncode}"]
-    return lines[-1][:160]
 
 
 def first_frame(subject: Subject) -> Path:

@@ -11,11 +11,13 @@ import contextlib
 import dataclasses
 import io
 import json
-import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+
+from benchmarks.processes import answer
+from benchmarks.run_one import peak_mb
 
 SYNTHETIC_MAP = """
 [modules.stack]
@@ -71,9 +73,7 @@ def ours(job: Job, verify_frames: int = 0) -> Work:
     frames = job.frames if verify_frames else None
 
     def work() -> None:
-        done = compress(job.source, job.target, "exact", frames, options)
-        for step in done.report.steps:
-            print(f"{step.name}: {step.seconds:.2f} s, {step.changes} changes")
+        compress(job.source, job.target, "exact", frames, options)
 
     return work
 
@@ -135,28 +135,15 @@ def work_alone(tool: str, job: Job) -> None:
     print(json.dumps(dataclasses.asdict(taken)))
 
 
-def peak_mb() -> float:
-    """Return the largest resident set of this process; Linux.
-
-    Not getrusage: there a process inherits the peak of the one that started it.
-    """
-    status = Path("/proc/self/status").read_text(encoding="utf-8")
-    (line,) = (each for each in status.splitlines() if each.startswith("VmHWM"))
-    return int(line.split()[1]) / 1024
-
-
 def measure(tool: str, job: Job) -> Taken:
     """Run one tool in its own process."""
     command = [sys.executable, "-m", "benchmarks.simplifiers", str(job.source)]
     command += [str(job.target), "--tool", tool, "--map", job.preset]
     command += [] if job.frames is None else ["--verify", str(job.frames)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"{tool}: {done.stderr.strip().splitlines()[-1]}")
-    *said, last = done.stdout.strip().splitlines()
-    if tool == "ours":
-        print(*said, sep="\n")
-    return Taken(**json.loads(last))
+    found = answer(command)
+    if isinstance(found, str):
+        raise SystemExit(f"{tool}: {found}")
+    return Taken(**found)
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ identities, repeated expressions and float scalars stand where the exporter puts
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,38 +28,12 @@ class Builder:
     weights: list[onnx.TensorProto] = dataclasses.field(default_factory=list)
     scope: str = ""
 
-    def add(
-        self,
-        op_type: str,
-        *inputs: str,
-        outputs: int = 1,
-        axis: int | None = None,
-        perm: Sequence[int] | None = None,
-        to: int | None = None,
-        keepdims: int | None = None,
-        axes: Sequence[int] | None = None,
-        mode: str | None = None,
-        kernel_shape: Sequence[int] | None = None,
-        pads: Sequence[int] | None = None,
-    ) -> str:
+    def add(self, op_type: str, *inputs: str, **attributes: Any) -> str:
         name = f"{self.scope}/{op_type}_{len(self.nodes)}"
-        results = [f"{name}_output_{index}" for index in range(outputs)]
-        given = {
-            "axis": axis,
-            "perm": perm,
-            "to": to,
-            "keepdims": keepdims,
-            "axes": axes,
-            "mode": mode,
-            "kernel_shape": kernel_shape,
-            "pads": pads,
-        }
-        node = onnx.helper.make_node(op_type, list(inputs), results, name)
-        for key, value in given.items():
-            if value is not None:
-                node.attribute.append(onnx.helper.make_attribute(key, value))
+        result = f"{name}_output_0"
+        node = onnx.helper.make_node(op_type, inputs, [result], name, **attributes)
         self.nodes.append(node)
-        return results[0]
+        return result
 
     def constant(self, value: npt.ArrayLike, kind: npt.DTypeLike = np.int64) -> str:
         result = self.add("Constant")
@@ -67,15 +42,15 @@ class Builder:
         return result
 
     def weight(self, name: str, *shape: int) -> str:
-        array = self.generator.normal(0, 0.1, shape).astype(np.float32)
-        full = f"{self.scope.strip('/').replace('/', '.')}.{name}.{len(self.weights)}"
-        self.weights.append(onnx.numpy_helper.from_array(array, full))
-        return full
+        return self._stored(name, self.generator.normal(0, 0.1, shape))
 
     def positive(self, name: str, *shape: int) -> str:
-        array = self.generator.uniform(0.5, 1.5, shape).astype(np.float32)
+        return self._stored(name, self.generator.uniform(0.5, 1.5, shape))
+
+    def _stored(self, name: str, array: npt.NDArray[np.floating]) -> str:
         full = f"{self.scope.strip('/').replace('/', '.')}.{name}.{len(self.weights)}"
-        self.weights.append(onnx.numpy_helper.from_array(array, full))
+        tensor = onnx.numpy_helper.from_array(array.astype(np.float32), full)
+        self.weights.append(tensor)
         return full
 
     def size(self, value: str, axis: int) -> str:

@@ -2,14 +2,12 @@
 
     python -m benchmarks.written_files make FOLDER MANIFEST.json [--tree CHECKOUT]
     python -m benchmarks.written_files compare BEFORE.json AFTER.json
-    python -m benchmarks.written_files show FOLDER FILE [--tree CHECKOUT]
 
 ``make`` runs `RUNS` in a new FOLDER, through the command line alone, so that it
 measures any commit that has these options: the one it is part of, or that of another
 CHECKOUT. The manifest gives every file's SHA-256 after `benchmarks.masks`. ``compare``
-lists the files that differ; exit code 1 if there are any. ``show`` prints what a file
-was hashed as, for a diff of two folders. Digests hold for one machine and its package
-versions: on another processor, float kernels round differently.
+lists the files that differ; exit code 1 if there are any. Digests hold for one machine
+and its package versions: on another processor, float kernels round differently.
 """
 
 import argparse
@@ -98,11 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     making = commands.add_parser("make")
     making.add_argument("folder", type=Path)
     making.add_argument("manifest", type=Path)
-    showing = commands.add_parser("show")
-    showing.add_argument("folder", type=Path)
-    showing.add_argument("file")
-    for each in (making, showing):
-        each.add_argument("--tree", type=Path, default=Path(__file__).parents[1])
+    making.add_argument("--tree", type=Path, default=Path(__file__).parents[1])
     comparing = commands.add_parser("compare")
     comparing.add_argument("before", type=Path)
     comparing.add_argument("after", type=Path)
@@ -111,9 +105,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         before, after = (json.loads(p.read_text()) for p in (given.before, given.after))
         return report(differences(before, after), len({*before, *after}))
     package = given.tree.resolve() / PACKAGE
-    if given.command == "show":
-        sys.stdout.buffer.write(masked(given.folder, given.file, package))
-        return 0
     make(given.folder, package)
     made = manifest(given.folder, package)
     given.manifest.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")

@@ -1,6 +1,5 @@
 """A course of training, from nothing to a driver: collect, train, drive, repeat."""
 
-import json
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,34 +11,17 @@ from driver.episodes import Collection, collect
 from driver.log import Log
 from driver.loop import train
 from driver.network.config import HighwayConfig
-from driver.network.stack import Highway
-from driver.network.to_onnx import write
-from driver.options import difference
+from driver.network.stack import Highway, write_onnx
+from driver.options import claim
 from driver.process import LOG
 from driver.stored_episode import samples_in
 from me2e_compress.driving.latency import FixedLatency, LatencySource
-from me2e_compress.errors import TrainingError
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.runtime.atomic import write_json
+from me2e_compress.workflows.listener import SILENT, Listener
 
 MANIFEST = "course.json"
 NO_LATENCY = FixedLatency()
-
-
-@dataclass(frozen=True)
-class CourseProgress:
-    """How far a course is.
-
-    Attributes:
-        what: the present part, in words.
-        done: of the present part.
-        total: of the present part.
-    """
-
-    what: str
-    done: int
-    total: int
 
 
 @dataclass(frozen=True)
@@ -57,14 +39,11 @@ class RoundResult:
     log: Path
 
 
-Listener = Callable[[CourseProgress], None]
-
-
 def run(
     course: Course,
     folder: Path,
     workers: int,
-    on_progress: Listener = lambda progress: None,
+    listener: Listener = SILENT,
     latency: LatencySource = NO_LATENCY,
 ) -> tuple[RoundResult, ...]:
     """Run the whole course, or what is left of it after an interruption.
@@ -77,20 +56,20 @@ def run(
         folder: gets a folder a round: ``episodes/``, ``training-0/``, ``trial/``,
             ``driver.onnx``.
         workers: processes, for driving and for training.
-        on_progress: called with how far it is.
+        listener: is called with how far every part is.
         latency: what a decision costs in the trials.
 
     Returns:
         The result of each round; the last driver is the one that was asked for.
 
     Raises:
-        TrainingError: the folder is of another course, an episode is damaged, or a
-            part failed.
-        EvaluationError: episodes or results of something else are in the way.
+        TrainingError: the folder or episodes are of something else, an episode is
+            damaged, or a part failed.
+        EvaluationError: results of something else are in the way.
     """
     course = course.on(workers)
-    claim(folder, course)
-    course_run = _CourseRun(course, folder, workers, on_progress, latency)
+    claim(folder / MANIFEST, "course", asdict(course))
+    course_run = _CourseRun(course, folder, workers, listener, latency)
     return tuple(
         course_run.run_round(number, each) for number, each in enumerate(course.rounds)
     )
@@ -104,11 +83,11 @@ class _CourseRun:
         course: Course,
         folder: Path,
         workers: int,
-        on_progress: Listener,
+        listener: Listener,
         latency: LatencySource,
     ) -> None:
         self.course, self.folder, self.workers = course, folder, workers
-        self.on_progress, self.latency = on_progress, latency
+        self.listener, self.latency = listener, latency
         self.learned, self.held_out = list[Path](), list[Path]()
         self.start: Path | None = None
         self.driver: Path | None = None
@@ -126,7 +105,7 @@ class _CourseRun:
         self.start, log = self._train(each, place, label)
         self.driver = place / "driver.onnx"
         if not self.driver.exists():
-            write(load(self.start, self.course.config), self.driver)
+            write_onnx(load(self.start, self.course.config), self.driver)
         # drive routes that were never learned from, for the log
         scores = self._evaluate(self.driver, place / "trial", label)
         row = {"learned_frames": frames_in(self.learned), **trial.row_of(scores)}
@@ -144,13 +123,7 @@ class _CourseRun:
             student=None if student is None else sha256_of(student),
         )
         on_done = self._progress(f"{label}: driving")
-        collect(
-            folder,
-            what,
-            student,
-            self.workers,
-            lambda now: on_done(now.done, now.total),
-        )
+        collect(folder, what, student, self.workers, on_done)
         return episodes_in(folder)
 
     def _train(self, each: Round, place: Path, label: str) -> tuple[Path, Log]:
@@ -174,7 +147,7 @@ class _CourseRun:
         return trial.drive(driver, routes, folder, self.workers, on_done, self.latency)
 
     def _progress(self, what: str) -> Callable[[int, int], None]:
-        return lambda done, total: self.on_progress(CourseProgress(what, done, total))
+        return lambda done, total: self.listener.on_progress(what, done, total, "")
 
 
 def load(checkpoint: Path, config: HighwayConfig) -> Highway:
@@ -193,33 +166,6 @@ def episodes_in(folder: Path) -> list[Path]:
     return sorted(
         file for file in folder.glob("*.npz") if not file.name.startswith(".")
     )
-
-
-def claim(folder: Path, course: Course) -> None:
-    """Make a folder that of a course, or check that it is.
-
-    Raises:
-        TrainingError: it belongs to another one, or holds something else.
-        OSError: it cannot be written.
-    """
-    manifest = folder / MANIFEST
-    folder.mkdir(parents=True, exist_ok=True)
-    if not manifest.exists():
-        if any(not file.name.startswith(".") for file in folder.iterdir()):
-            raise TrainingError(f"{folder}: not empty, and holds no {MANIFEST}")
-        write_json(manifest, asdict(course), indent=1)
-    try:
-        before = json.loads(manifest.read_bytes())
-    except ValueError as error:
-        raise TrainingError(f"{manifest}: not JSON") from error
-    if not isinstance(before, dict):
-        raise TrainingError(f"{manifest}: not a course")
-    if (words := difference(before, asdict(course))) is not None:
-        name, old, new = words
-        raise TrainingError(
-            f"{folder}: holds another course: its {name} is {old}, this one's {new}; "
-            "choose another folder, or the same options"
-        )
 
 
 def frames_in(files: Iterable[Path]) -> int:

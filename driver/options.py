@@ -1,8 +1,12 @@
-"""Options compared by name."""
+"""Options compared by name, and the folder that belongs to some of them."""
 
 import json
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Any
+
+from me2e_compress.errors import TrainingError
+from me2e_compress.runtime.atomic import write_json
 
 Words = tuple[str, str, str]
 
@@ -40,3 +44,38 @@ def _flat(options: Mapping[str, Any]) -> dict[str, str]:
         else:
             flat[name] = json.dumps(value)
     return flat
+
+
+def claim(manifest: Path, what: str, options: Mapping[str, Any]) -> None:
+    """Make a folder that of some options, or check that it is.
+
+    Args:
+        manifest: the file in it that holds the options.
+        what: they are of, in messages.
+        options: as `dataclasses.asdict` gives them.
+
+    Raises:
+        TrainingError: it belongs to others, holds something else, or cannot be used.
+    """
+    folder = manifest.parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not manifest.exists():
+            if any(not file.name.startswith(".") for file in folder.iterdir()):
+                raise TrainingError(
+                    f"{folder}: not empty, and holds no {manifest.name}"
+                )
+            write_json(manifest, dict(options), indent=1)
+        before = json.loads(manifest.read_bytes())
+    except OSError as error:
+        raise TrainingError(f"{folder}: cannot be used: {error.strerror}") from error
+    except ValueError as error:
+        raise TrainingError(f"{manifest}: not JSON") from error
+    if not isinstance(before, dict):
+        raise TrainingError(f"{manifest}: not a {what}")
+    if (words := difference(before, options)) is not None:
+        name, old, new = words
+        raise TrainingError(
+            f"{folder}: holds another {what}: its {name} is {old}, this one's {new}; "
+            "choose another folder, or the same options"
+        )

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from driver.curriculum import Trial
+from driver.episodes.collection import refuse_shipped
 from me2e_compress.driving.latency import LatencySource
-from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.engine import LocalEngine
@@ -49,14 +49,7 @@ def routes_of(
     for done, harvest in enumerate(generate(what.seed, types, variants, workers), 1):
         found += harvest.routes
         on_done(done, len(types))
-    shipped = {(route.scenario, route.seed): route.id for route in load_routes()}
-    for route in found:
-        if (route.scenario, route.seed) in shipped:
-            raise TrainingError(
-                f"trial: seed {what.seed} gives route "
-                f"{shipped[route.scenario, route.seed]}, which is for evaluation; "
-                "choose another"
-            )
+    refuse_shipped("trial", what.seed, [(e.scenario, e.seed) for e in found])
     picked = pick_routes(found, str(what.routes))
     save_routes(picked, path)
     return picked

@@ -3,7 +3,7 @@
 import dataclasses
 from pathlib import Path
 
-from driver.course import NO_LATENCY, CourseProgress, RoundResult, run
+from driver.course import NO_LATENCY, RoundResult, run
 from driver.curriculum import FULL, SMALL, SMALL_LATENCY
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.workflows.checks import check_folder
@@ -84,13 +84,9 @@ def train(
     """
     output = Path(output)
     check_folder(output, ())
-
-    def tell(news: CourseProgress) -> None:
-        listener.on_progress(news.what, news.done, news.total, "")
-
     course, latency = (SMALL, SMALL_LATENCY) if small else (FULL, NO_LATENCY)
     with writing(folders=[output]):
-        return TrainResult(run(course, output, workers, tell, latency))
+        return TrainResult(run(course, output, workers, listener, latency))
 
 
 def _between(estimate: Estimate) -> str:

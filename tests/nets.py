@@ -1,6 +1,7 @@
 """Small graphs with modules, for tests of calibration, targets and passes."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -73,6 +74,14 @@ def net(text: str, weights: Mapping[str, npt.NDArray[np.floating]]) -> ir.Model:
         provenance.stamp(node, Provenance(module, (name,)))
     graph.infer_shapes(model)
     return model
+
+
+def save_text(path: Path, text: str, **metadata: str) -> Path:
+    """Write a graph of opset 17 that is given as ONNX text, without its head."""
+    model = ir.from_onnx_text(f'<ir_version: 9, opset_import: ["" : 17]>\n{text}')
+    model.metadata_props.update(metadata)
+    graph.save(model, path)
+    return path
 
 
 def image(seed: int) -> dict[str, npt.NDArray[np.float32]]:

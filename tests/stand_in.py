@@ -9,6 +9,8 @@ import numpy as np
 import onnx
 from onnx import numpy_helper
 
+from tests.frames import record
+
 WIDTH = 8
 BODY = """
     ["/backbone/ReduceMean"] pooled = ReduceMean <axes = [3, 4], keepdims = 0> (img)
@@ -102,6 +104,22 @@ def write_shipped(folder: Path, name: str = "highway") -> Path:
     }
     (folder / f"{name}.json").write_text(json.dumps(card))
     return model
+
+
+def record_driver(folder: Path, count: int) -> Path:
+    """Record frames of noise for it, in one scene."""
+    random = np.random.default_rng(2)
+    frames = [
+        {
+            "img": random.normal(size=(1, 6, 3, 16, 24)).astype(np.float32),
+            "lidar2img": random.normal(size=(1, 6, 4, 4)).astype(np.float32),
+            "can_bus": random.normal(size=18).astype(np.float32),
+            "command": np.array([index % 6]),
+            "timestamp": np.array([0.5 * index], np.float32),
+        }
+        for index in range(count)
+    ]
+    return record(folder, frames)
 
 
 def _weights(seed: int) -> dict[str, np.ndarray]:

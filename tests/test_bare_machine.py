@@ -21,6 +21,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS: Mapping[str, list[str]] = PROJECT["optional-dependencies"]
 TOOLS = ("bench", "docs", "models", "test")
 """Extras whose own packages no module of ours imports: they are blocked together."""
+PACKAGE = "me2e_compress"
 ALL, EVERY_TOOL = "all at once", "+".join(TOOLS)
 
 TORCH = (
@@ -159,30 +160,16 @@ def rooms_without(case: str) -> set[str]:
 
 @bare
 @pytest.mark.parametrize("case", CASES)
-def test_every_module_is_imported_without_an_extra_but_in_its_rooms(
+def test_modules_fail_without_an_extra_in_its_rooms_and_nowhere_else(
     without: dict[str, Any], case: str
 ) -> None:
-    rooms = rooms_without(case)
-    broken = {
-        name: error
-        for name, error in without[case]["modules"].items()
-        if not any(f"{name}.".startswith(f"me2e_compress.{room}.") for room in rooms)
+    rooms, failing = rooms_without(case), without[case]["modules"]
+    homes = {
+        name: {room for room in rooms if f"{name}.".startswith(f"{PACKAGE}.{room}.")}
+        for name in failing
     }
-    assert broken == {}
-
-
-@bare
-@pytest.mark.parametrize("case", CASES)
-def test_a_room_that_needs_an_extra_really_does(
-    without: dict[str, Any], case: str
-) -> None:
-    failing = without[case]["modules"]
-    idle = {
-        room
-        for room in rooms_without(case)
-        if not any(f"{name}.".startswith(f"me2e_compress.{room}.") for name in failing)
-    }
-    assert idle == set()
+    assert {name: failing[name] for name, home in homes.items() if not home} == {}
+    assert rooms == set().union(*homes.values())
 
 
 @bare

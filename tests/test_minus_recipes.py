@@ -16,8 +16,7 @@ from me2e_compress.manager import PassManager
 from me2e_compress.modules import detect
 from me2e_compress.passes import Context
 from me2e_compress.runtime.session import Session, replay
-from tests.frames import record
-from tests.stand_in import write_model
+from tests.stand_in import record_driver, write_model
 
 DROPPED = {
     "track": ("agents",),
@@ -44,18 +43,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def recording(folder: Path, count: int) -> CalibrationSet:
-    random = np.random.default_rng(2)
-    frames = [
-        {
-            "img": random.normal(size=(1, 6, 3, 16, 24)).astype(np.float32),
-            "lidar2img": random.normal(size=(1, 6, 4, 4)).astype(np.float32),
-            "can_bus": random.normal(size=18).astype(np.float32),
-            "command": np.array([index % 6]),
-            "timestamp": np.array([0.5 * index], np.float32),
-        }
-        for index in range(count)
-    ]
-    return CalibrationSet(record(folder, frames))
+    return CalibrationSet(record_driver(folder, count))
 
 
 def without(module: str, model: Path, frames: CalibrationSet) -> ir.Model:

@@ -35,8 +35,8 @@ that sample, x forward and y left.
 """
 
 from driver.episodes.agents import GRID
-from driver.episodes.collecting import CollectionProgress, collect
+from driver.episodes.collecting import collect
 from driver.episodes.collection import Collection
 from driver.episodes.jpeg import decode
 
-__all__ = ["GRID", "Collection", "CollectionProgress", "collect", "decode"]
+__all__ = ["GRID", "Collection", "collect", "decode"]

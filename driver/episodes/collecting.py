@@ -4,22 +4,24 @@ import io
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from driver.episodes.collection import (
+    FORMAT,
+    MANIFEST,
     Collection,
     Task,
-    claim,
     tasks_of,
 )
 from driver.episodes.episode_arrays import Arrays, arrays_of
 from driver.episodes.recording_policy import RecordingPolicy
+from driver.options import claim
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.errors import EvaluationError
+from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.graph import sha256_of
@@ -32,25 +34,12 @@ SHORTEST_US = 2_000_000
 """An episode that ends earlier is not kept."""
 
 
-@dataclass(frozen=True)
-class CollectionProgress:
-    """How far a collection is.
-
-    Attributes:
-        done: Routes finished, those of earlier runs included.
-        total: Routes of the collection.
-    """
-
-    done: int
-    total: int
-
-
 def collect(
     folder: Path,
     what: Collection,
     student: Path | None,
     workers: int,
-    on_progress: Callable[[CollectionProgress], None],
+    on_done: Callable[[int, int], None],
 ) -> None:
     """Drive what is missing of a collection, one file a route.
 
@@ -62,40 +51,41 @@ def collect(
         what: What to collect.
         student: ONNX file of the student; None without one.
         workers: Processes; 1 stays in this one.
-        on_progress: Called at the start and after every route.
+        on_done: Called with the routes done and their total, those of earlier runs
+            included, at the start and after every route.
 
     Raises:
-        EvaluationError: The folder is of another collection, a route is one of those
+        TrainingError: The folder is of another collection, a route is one of those
             that ship, the student is not the collection's or fails, or a process was
             killed.
     """
     if workers < 1:
-        raise EvaluationError(f"collect: {workers} workers: at least one is needed")
+        raise TrainingError(f"collect: {workers} workers: at least one is needed")
     _check_student(what, student)
     tasks = tasks_of(what)
-    claim(folder, what)
+    claim(folder / MANIFEST, "collection", {"format": FORMAT, **asdict(what)})
     missing = [task for task in tasks if not _is_done(folder, task)]
     done = len(tasks) - len(missing)
-    on_progress(CollectionProgress(done, len(tasks)))
+    on_done(done, len(tasks))
     for _ in _driven(folder, what, student, missing, workers):
         done += 1
-        on_progress(CollectionProgress(done, len(tasks)))
+        on_done(done, len(tasks))
 
 
 def _check_student(what: Collection, student: Path | None) -> None:
     if student is None:
         if what.student is not None:
-            raise EvaluationError(
+            raise TrainingError(
                 f"collect: the collection's student is {what.student}, none was given"
             )
         return
     policy, found = OnnxPolicy.open(student), sha256_of(student)
     if found != what.student:
-        raise EvaluationError(
+        raise TrainingError(
             f"student {student}: its sha256 is {found}, the collection's {what.student}"
         )
     if policy.needs_images and policy.image_size != what.image_size:
-        raise EvaluationError(
+        raise TrainingError(
             f"student {student}: takes images of {policy.image_size}, the "
             f"collection's are {what.image_size}"
         )
@@ -128,7 +118,7 @@ def _driven(
                 job.result()
                 yield
     except BrokenProcessPool as error:
-        raise EvaluationError(
+        raise TrainingError(
             f"{folder}: a process was killed (out of memory?)"
         ) from error
 
@@ -146,9 +136,7 @@ def _collect_one(
             np.savez(content, allow_pickle=False, **arrays)
             write_bytes(folder / (task.name + SUFFIX), content.getvalue())
     except OSError as error:
-        raise EvaluationError(
-            f"{folder}: cannot be written: {error.strerror}"
-        ) from error
+        raise TrainingError(f"{folder}: cannot be written: {error.strerror}") from error
 
 
 @lru_cache(maxsize=1)
@@ -162,13 +150,13 @@ def episode_of(
     """Drive one route of a collection; None if it ended too early.
 
     Raises:
-        EvaluationError: The student failed.
+        TrainingError: The student failed.
     """
     recording = RecordingPolicy(what.seed, what.noise, what.expert_share, student)
     route = task.route()
     episode = drive(route, recording, Conditions(image_size=what.image_size))
     if episode.ending is Ending.POLICY_FAILED or recording.world is None:
-        raise EvaluationError(f"route {task.name}: {episode.failure}")
+        raise TrainingError(f"route {task.name}: {episode.failure}")
     frames, world = recording.frames, recording.world
     if len(frames) * world.dt_us < SHORTEST_US:
         return None

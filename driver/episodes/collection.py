@@ -1,12 +1,10 @@
 """What a data set is, and the folder that holds it."""
 
-import json
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Iterable
+from dataclasses import dataclass
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.generate import propose, seed_of
-from me2e_compress.runtime.atomic import write_json
 from me2e_compress.simulator.routes import Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 
@@ -31,7 +29,7 @@ class Collection:
         scenarios: The types; empty for all 44.
 
     Raises:
-        EvaluationError: A value is out of range.
+        TrainingError: A value is out of range.
     """
 
     seed: int
@@ -52,17 +50,17 @@ class Collection:
             ("noise", self.noise, 0.0),
         ):
             if not least <= value < float("inf"):
-                raise EvaluationError(
+                raise TrainingError(
                     f"collection: {name} is {value}, it must be at least {least}"
                 )
         if not 0.0 <= self.expert_share <= 1.0:
-            raise EvaluationError(
+            raise TrainingError(
                 f"collection: expert_share is {self.expert_share}, it must be "
                 "between 0 and 1"
             )
         if (self.student is None) != (self.expert_share == 1.0):
             who = "no student" if self.student is None else "a student"
-            raise EvaluationError(
+            raise TrainingError(
                 f"collection: expert_share is {self.expert_share} with {who}; it must "
                 "be 1 without a student and less with one"
             )
@@ -91,48 +89,28 @@ def tasks_of(what: Collection) -> tuple[Task, ...]:
     """Return all routes of a collection, variant by variant.
 
     Raises:
-        EvaluationError: One of them is a route that ships: those are for judging.
+        TrainingError: One of them is a route that ships: those are for judging.
     """
-    shipped = {(route.scenario, route.seed): route.id for route in load_routes()}
-    tasks = list[Task]()
-    for variant in range(what.variants):
-        for scenario in what.scenarios or SCENARIO_ABILITIES:
-            seed = seed_of(what.seed, scenario, variant)
-            if (scenario, seed) in shipped:
-                raise EvaluationError(
-                    f"collection: seed {what.seed} gives route "
-                    f"{shipped[scenario, seed]}, which is for evaluation; choose "
-                    "another"
-                )
-            tasks.append(Task(scenario, seed, f"{scenario}_{what.seed}_{variant:03d}"))
-    return tuple(tasks)
+    tasks = tuple(
+        Task(scenario, seed, f"{scenario}_{what.seed}_{variant:03d}")
+        for variant in range(what.variants)
+        for scenario in what.scenarios or SCENARIO_ABILITIES
+        for seed in (seed_of(what.seed, scenario, variant),)
+    )
+    refuse_shipped("collection", what.seed, [(e.scenario, e.seed) for e in tasks])
+    return tasks
 
 
-def claim(folder: Path, what: Collection) -> None:
-    """Make a folder that of a collection, or check that it is.
+def refuse_shipped(what: str, seed: int, routes: Iterable[tuple[str, int]]) -> None:
+    """Refuse types and seeds of routes that ship.
 
     Raises:
-        EvaluationError: It belongs to another one, holds something else, or cannot be
-            written.
+        TrainingError: one of them is such a route: those are for evaluation.
     """
-    wanted = json.loads(json.dumps({"format": FORMAT, **asdict(what)}))
-    manifest = folder / MANIFEST
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not manifest.exists():
-            if any(not file.name.startswith(".") for file in folder.iterdir()):
-                raise EvaluationError(f"{folder}: not empty, and holds no {MANIFEST}")
-            write_json(manifest, wanted, indent=1)
-        found = json.loads(manifest.read_bytes())
-    except OSError as error:
-        raise EvaluationError(f"{folder}: cannot be used: {error.strerror}") from error
-    except ValueError as error:
-        raise EvaluationError(f"{manifest}: not JSON") from error
-    if not isinstance(found, dict):
-        raise EvaluationError(f"{manifest}: not a collection")
-    for key in sorted({*found, *wanted}):
-        if found.get(key) != wanted.get(key):
-            raise EvaluationError(
-                f"{folder}: holds another collection: its {key} is {found.get(key)}, "
-                f"this one's {wanted.get(key)}; choose another folder"
+    shipped = {(route.scenario, route.seed): route.id for route in load_routes()}
+    for each in routes:
+        if each in shipped:
+            raise TrainingError(
+                f"{what}: seed {seed} gives route {shipped[each]}, which is for"
+                " evaluation; choose another"
             )

@@ -6,9 +6,6 @@ import torch
 from torch import Tensor
 
 from driver.network.config import STEPS
-from driver.network.map import MapRoute, RoadMap
-from driver.network.motion import Futures
-from driver.network.track import Tracks
 
 SPEED_SCALE_MPS = 10.0
 """The ego's speed is given in these units, about 1 in size."""
@@ -98,41 +95,3 @@ class Candidates:
         """Return the plan with the highest score: [B, 6, 2]."""
         first = self.logits.argmax(1)[:, None, None, None]
         return self.plans.gather(1, first.expand(-1, -1, STEPS, 2)).squeeze(1)
-
-
-def gather(
-    tracks: Tracks,
-    road: RoadMap,
-    route: MapRoute,
-    raster: Tensor,
-    futures: Futures,
-    modes: Tensor,
-    occupancy: Tensor,
-) -> PlannerInput:
-    """Collect what the planner reads.
-
-    Args:
-        tracks: of the track module.
-        road: of the map module.
-        route: that the command picks from it.
-        raster: [B, 4, H, W] probabilities, of the map module.
-        futures: of the motion module.
-        modes: [B, A, M] probabilities, of the motion module.
-        occupancy: [B, 6, H, W] probabilities, of the occ module.
-    """
-    return PlannerInput(
-        futures.query,
-        tracks.boxes,
-        tracks.score,
-        futures.travel,
-        modes,
-        route.lateral,
-        route.path,
-        route.headings,
-        route.attributes,
-        route.points,
-        raster,
-        road.signal_query,
-        road.signals,
-        occupancy,
-    )

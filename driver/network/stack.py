@@ -1,6 +1,7 @@
 """The whole stack: backbone, neck and occupancy head, and all modules in order."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -8,11 +9,13 @@ from torch import Tensor, nn
 from driver.network.bev_encoder import BevEncoder
 from driver.network.blocks import Residual, conv_block
 from driver.network.config import STEPS, HighwayConfig
-from driver.network.interfaces import EgoState, PlannerInput, gather
+from driver.network.interfaces import EgoState, PlannerInput
 from driver.network.map import Choice, Map, RoadMap
 from driver.network.motion import Futures, Motion
 from driver.network.planner import Planner
 from driver.network.track import Track, Tracks
+from me2e_compress.zoo.export import save, trace
+from me2e_compress.zoo.stacks import find
 
 
 class Backbone(nn.Module):
@@ -138,15 +141,27 @@ class Highway(nn.Module):
         Every part is made in a scope of the exported graph that begins with the name
         of its module, so that ablating a module removes all of it, outputs too.
         """
-        road, futures = seen.road, seen.futures
-        return gather(
-            seen.tracks,
-            road,
-            self.map_route(road, command),
-            self.map_raster(road.raster),
-            futures,
-            self.motion_modes(futures.logits),
-            self.occ_taken(seen.occupancy),
+        tracks, road, futures = seen.tracks, seen.road, seen.futures
+        # the order in which the exporter traces them: that of the nodes in the file
+        route = self.map_route(road, command)
+        raster = self.map_raster(road.raster)
+        modes = self.motion_modes(futures.logits)
+        occupancy = self.occ_taken(seen.occupancy)
+        return PlannerInput(
+            agents=futures.query,
+            boxes=tracks.boxes,
+            score=tracks.score,
+            travel=futures.travel,
+            modes=modes,
+            lateral=route.lateral,
+            path=route.path,
+            headings=route.headings,
+            attributes=route.attributes,
+            points=route.points,
+            raster=raster,
+            signal_query=road.signal_query,
+            signals=road.signals,
+            occupancy=occupancy,
         )
 
     def forward(
@@ -201,3 +216,23 @@ def stood_lately(speed: Tensor, before: Tensor, elapsed_s: Tensor) -> Tensor:
     faded = before * torch.exp(-elapsed_s / STOOD_S)
     standing = (speed.abs() < STANDING_MPS).to(speed.dtype)
     return torch.maximum(faded, standing)
+
+
+OPSET = 17
+"""LayerNormalization is one operator from here on."""
+
+
+def write_onnx(model: Highway, path: Path) -> Path:
+    """Write a model in evaluation mode, standard operators only, nothing folded.
+
+    Args:
+        model: the stack, its weights as they are to drive.
+        path: the ``.onnx``; replaced in one step.
+
+    Raises:
+        GraphError: the exporter wrote another opset, or it cannot be written.
+    """
+    spec = find("highway")
+    # torch's stubs leave this form of `to` out
+    model.eval().to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+    return save(trace(spec, model, OPSET), spec.metadata(), path)

@@ -2,6 +2,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,63 @@ import pytest
 from me2e_compress import graph, rewrite
 from me2e_compress.cli import main
 from tests.conftest import DRIVER, DRIVER_MAP
+from tests.docs.documents import faults
+from tests.frames import record
 
 Command = Callable[..., int]
+
+
+@dataclass(frozen=True)
+class Said:
+    """How a run of the command ended, and what it said."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def words(self) -> str:
+        """The output however wide the terminal is: words one space apart."""
+        return " ".join(self.out.split())
+
+
+@dataclass(frozen=True)
+class Cli:
+    """Runs the command in one folder, which is the working directory."""
+
+    command: Command
+    folder: Path
+    capsys: pytest.CaptureFixture[str]
+
+    def __call__(self, line: str, *more: str | Path) -> Said:
+        """Run the words of a line, and more words that may hold spaces."""
+        self.capsys.readouterr()
+        code = self.command(*line.split(), *more)
+        return Said(code, *self.capsys.readouterr())
+
+    def done(self, line: str, *more: str | Path) -> Said:
+        """Run what must succeed."""
+        said = self(line, *more)
+        assert said.code == 0, said.err
+        return said
+
+    def document(self, line: str, *more: str | Path, code: int = 0) -> Any:
+        """Return what ``--json`` prints; its keys are those of docs/json.md."""
+        said = self(line, *more, "--json")
+        assert said.code == code, said.err
+        found = strict(said.out)
+        assert faults(line.split()[0], found) == []
+        return found
+
+    def refused(self, line: str, *more: str | Path) -> str:
+        """Run what must be refused: one line says why, and no file changes."""
+        before = contents(self.folder)
+        said = self(line, *more)
+        assert said.code == 1
+        lines = [e for e in said.err.splitlines() if not e.startswith("warning: ")]
+        assert len(lines) == 1, said.err
+        assert contents(self.folder) == before
+        return lines[0]
 
 
 @pytest.fixture
@@ -26,6 +82,18 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
         return main()
 
     return run
+
+
+@pytest.fixture
+def cli(
+    command: Command,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Cli:
+    """The command in the folder of the test."""
+    monkeypatch.chdir(tmp_path)
+    return Cli(command, tmp_path, capsys)
 
 
 @pytest.fixture
@@ -65,12 +133,19 @@ def strict(text: str) -> Any:
     return json.loads(text, parse_constant=refuse)
 
 
-def write_frames(folder: Path, **arrays: np.ndarray) -> None:
-    """Write one scene of two frames."""
-    folder.mkdir()
-    for index in range(2):
-        moved = {
-            name: array + array.dtype.type(index) for name, array in arrays.items()
-        }
-        np.savez(folder / f"{index:06d}.npz", **moved)
-    (folder / "scenes.json").write_text('{"scenes": [0]}')
+def contents(folder: Path) -> dict[str, bytes]:
+    """Read all files of a folder, by name."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def write_frames(folder: Path, **arrays: np.ndarray) -> Path:
+    """Write one scene of two frames, the second one unit more than the first."""
+    moved = (
+        {name: array + array.dtype.type(index) for name, array in arrays.items()}
+        for index in range(2)
+    )
+    return record(folder, list(moved))

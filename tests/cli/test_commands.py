@@ -1,30 +1,39 @@
-import json
+"""Every command explains itself; what list, doctor, lint, build and export answer."""
+
 import re
 from pathlib import Path
 
-import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph
+from me2e_compress import graph, modules, recipe
 from me2e_compress.cli.app import COMMANDS
-from tests.cli.conftest import Command, strict, write_frames
+from me2e_compress.cli.console import show
+from me2e_compress.targets.tensorrt.tensorrt_engine import (
+    EngineSettings,
+    TensorRTEngine,
+)
+from me2e_compress.workflows import build as workflow
+from me2e_compress.workflows.export import ExportResult
+from me2e_compress.workflows.frames import FramesOptions, FramesResult
+from me2e_compress.workflows.listing import KINDS, REGISTRIES
+from me2e_compress.zoo.weights_record import WeightsRecord
+from tests.cli.conftest import Cli, strict
 from tests.docs.documents import faults
-from tests.nets import conv_attention
+from tests.installed import install
+from tests.targets.onnxruntime.lowered import MATMUL_RELU
 
 NAMES = sorted(COMMANDS)
+TWIST = (
+    '<ir_version: 9, opset_import: ["" : 17, "own" : 1]>'
+    "m (float[2] x) => (float[2] y) { a = own.Twist(x) b = own.Twist(a)"
+    " y = own.Twist(b) }"
+)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_command_explains_itself(
-    command: Command, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
-    assert command(name, "--help") == 0
-    assert name in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_list_of_commands_says_what_the_command_says(name: str) -> None:
+def test_every_command_explains_itself(cli: Cli, name: str) -> None:
+    assert name in cli.done(f"{name} --help").out
     full = COMMANDS[name].load().help
     assert COMMANDS[name].help == full.partition("\n")[0]
 
@@ -37,153 +46,137 @@ def test_every_command_is_documented(name: str) -> None:
     assert f"`{name}`" in (root / "README.md").read_text(encoding="utf-8")
 
 
-def test_a_wrong_word_is_a_usage_error(command: Command) -> None:
-    assert command("compres") == 2
-
-
-def test_inspect_counts_by_module(
-    command: Command, files: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ("inspect", files / "in.onnx", "--map", files / "map.toml", "--json")
-    assert command(*words) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert faults("inspect", found) == []
-    counts = {item["module"]: item["nodes"] for item in found["modules"]}
-    assert counts == {"backbone": 1, "occ": 1, "planner": 1}
-    assert found["inputs"] == [{"name": "camera", "type": "FLOAT", "shape": "[1,4]"}]
-
-
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ('{"file": "vad.pth", "sha256": "ab", "epoch": 60}', "weights: vad.pth, epoch"),
-        ('{"file": 1}', "metadata me2e.weights is malformed"),
-        ("", "metadata me2e.weights is malformed"),
-    ],
-)
-def test_inspect_names_the_checkpoint(
-    command: Command,
-    files: Path,
-    capsys: pytest.CaptureFixture[str],
-    text: str,
-    line: str,
-) -> None:
-    model = graph.load(files / "in.onnx")
-    model.metadata_props["me2e.weights"] = text
-    graph.save(model, files / "in.onnx")
-    assert command("inspect", files / "in.onnx", "--map", files / "map.toml") == 0
-    assert line in capsys.readouterr().out
-
-
-def test_inspect_for_people(
-    command: Command, files: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command("inspect", files / "in.onnx", "--map", files / "map.toml") == 0
-    assert "3 by scope" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("metadata", "said"),
-    [
-        (None, "fed back: memory_out as memory"),
-        ('{"memory": "nowhere"}', "me2e.recurrent pairs memory with nowhere"),
-    ],
-)
-def test_inspect_says_which_outputs_are_fed_back(
-    command: Command,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    metadata: str | None,
-    said: str,
-) -> None:
-    model = conv_attention()
-    if metadata is not None:
-        model.metadata_props["me2e.recurrent"] = metadata
-    graph.save(model, tmp_path / "m.onnx")
-
-    assert command("inspect", tmp_path / "m.onnx") == 0
-    assert said in " ".join(capsys.readouterr().out.split())
-
-
-@pytest.fixture
-def plugin(files: Path) -> Path:
-    """A graph in which a plugin reads a product of 2e9 MACs."""
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
-        "m (float[1000,1000] camera, float[1000,2000] w) => (float[1000,2000] y)"
-        ' { ["/backbone/MatMul"] a = MatMul(camera, w)'
-        ' ["/plan_head/Rotate"] y = trt.Rotate(a) }'
-    )
-    graph.save(model, files / "plugin.onnx")
-    return files / "plugin.onnx"
-
-
-def test_inspect_counts_a_plugin_s_macs_as_unknown(
-    command: Command, plugin: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ("--map", plugin.with_name("map.toml"), "--json")
-    assert command("inspect", plugin, *words) == 0
-    found = json.loads(capsys.readouterr().out)
-    costs = {
-        item["module"]: (item["macs"], item["unknown_macs_nodes"])
-        for item in found["modules"]
-    }
-    assert costs == {
-        "backbone": (2_000_000_000, 0),
-        "occ": (0, 0),
-        "planner": (None, 1),
-    }
-    assert (found["macs"], found["unknown_macs_nodes"]) == (2_000_000_000, 1)
-
-
-def test_inspect_says_that_a_sum_is_a_lower_bound(
-    command: Command, plugin: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command("inspect", plugin, "--map", plugin.with_name("map.toml")) == 0
-    assert "at least 2.000, 1 node not counted" in capsys.readouterr().out
-
-
-def test_a_graph_compared_with_itself_is_equal(
-    command: Command, files: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = (files / "in.onnx", files / "in.onnx", files / "frames", "--json")
-    assert command("compare", *words) == 0
-    found = strict(capsys.readouterr().out)
-    assert faults("compare", found) == []
-    assert [item["error"] for item in found["outputs"]] == [0.0]
-    assert [item["sqnr_db"] for item in found["outputs"]] == [None]
-    assert found["frames"] == 2
-
-
-def test_a_reference_shows_what_the_runtime_makes_of_a_graph(
-    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
-        "pool (float[1,1,2,2] camera) => (float[1,1,2,2] plan)\n"
-        "<int64[8] around = {0, 0, 1, 1, 0, 0, 1, 1}>\n"
-        "{ q = Pad(camera, around) plan = MaxPool<kernel_shape=[3,3]>(q) }"
-    )
-    graph.save(model, tmp_path / "m.onnx")
-    write_frames(tmp_path / "frames", camera=np.full((1, 1, 2, 2), -9, np.float32))
-    words = ("compare", tmp_path / "m.onnx", tmp_path / "m.onnx", tmp_path / "frames")
-
-    assert command(*words, "--json") == 0
-    (same,) = strict(capsys.readouterr().out)["outputs"]
-    assert command(*words, "--json", "--reference") == 0
-    (wrong,) = strict(capsys.readouterr().out)["outputs"]
-
-    assert (same["sqnr_db"], wrong["sqnr_db"]) == (None, None)
-    assert same["error"] == 0.0
-    assert wrong["error"] is None  # infinite: zeros became negative
-
-
-def test_doctor_names_the_versions(
-    command: Command, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command("doctor", "--json") == 0
-    document = json.loads(capsys.readouterr().out)
-    assert faults("doctor", document) == []
+def test_doctor_names_the_versions(cli: Cli) -> None:
+    document = cli.document("doctor")
     found = {item["what"]: item["found"] for item in document["checkups"]}
     assert found["onnxruntime"]
     assert found["cv2"]
+
+
+def test_every_kind_is_listed_with_its_options(cli: Cli) -> None:
+    found = cli.document("list")
+
+    assert set(found) >= set(KINDS)
+    for kind, registry in REGISTRIES.items():
+        assert [entry["name"] for entry in found[kind]] == list(registry.names())
+    assert [entry["name"] for entry in found["recipes"]] == recipe.shipped()
+    maps = [entry["name"] for entry in found["module-maps"]]
+    assert maps == [*modules.presets(), "whole"]
+    blind = next(each for each in found["policies"] if each["name"] == "blind")
+    assert [option["name"] for option in blind["options"]] == ["speed_mps"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_ours_can_all_be_used_and_say_what_they_are(kind: str) -> None:
+    for entry in KINDS[kind]():
+        assert not entry.error
+        assert entry.doc
+        for option in entry.options:
+            assert option.doc, f"{entry.name}: {option.name}"
+
+
+def test_one_kind_shows_what_its_options_mean(cli: Cli) -> None:
+    text = cli.done("list observers").words
+
+    assert "\\n" not in text
+    assert "percent: float = 99.99 above 0 and at most 100" in text
+    assert "quantize-int8" not in text
+
+
+def test_a_broken_entry_is_named_and_the_rest_is_shown(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = {"bad": "no_such_module:Bad"}
+    install(monkeypatch, tmp_path, "bad-package", "me2e_compress.targets", entry)
+
+    text = cli.done("list targets").words
+
+    assert "target 'bad' of bad-package 1.0" in text
+    assert "onnxruntime" in text
+
+
+@pytest.mark.parametrize("target", ["tensorrt", "onnxruntime"])
+def test_a_clean_graph_passes_the_lint(cli: Cli, dense: Path, target: str) -> None:
+    said = cli.done(f"lint dense.onnx --target {target}").out
+    assert f"for {target}: 0 errors, 0 warnings" in said
+
+
+def test_what_would_be_refused_is_listed_and_fails(cli: Cli, tmp_path: Path) -> None:
+    graph.save(ir.from_onnx_text(TWIST), tmp_path / "twist.onnx")
+
+    said = cli("lint twist.onnx --shown 1")
+    assert said.code == 1
+    assert "error plugin: 2 more" in said.out
+    (line,) = said.err.strip().splitlines()
+    assert "tensorrt refuses it, 3 errors; plugin 'a': own::Twist is neither" in line
+    assert "more" not in cli("lint twist.onnx --shown 1 -v").out
+    found = cli.document("lint twist.onnx", code=1)
+    assert found["status"] == "refused"
+    assert [each["rule"] for each in found["findings"]] == ["plugin"] * 3
+    assert found["tensorrt_rtx"] is None
+
+
+def test_int8_that_onnxruntime_runs_in_float_is_named(cli: Cli, tmp_path: Path) -> None:
+    graph.save(ir.from_onnx_text(MATMUL_RELU), tmp_path / "m.onnx")
+
+    (found,) = cli.document("lint m.onnx --target onnxruntime")["findings"]
+    assert (found["rule"], found["node"]) == ("float-kernel", "/head/fc")
+
+
+def test_trt_check_says_what_was_asked_and_of_whom(cli: Cli, dense: Path) -> None:
+    pytest.importorskip("tensorrt_rtx")
+
+    said = cli.done("lint dense.onnx --trt-check").out
+
+    assert "TensorRT-RTX 1" in said
+    assert "parsed, built for SM86" in said
+
+
+def test_an_engine_is_written_once_and_not_over_a_file_of_the_users(
+    cli: Cli, dense: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[EngineSettings]()
+
+    def build_engine(path: Path, settings: EngineSettings) -> TensorRTEngine:
+        asked.append(settings)
+        return TensorRTEngine(b"engine", "10.4.0", 3, 1.5)
+
+    monkeypatch.setattr(workflow, "build_engine", build_engine)
+    (dense / "mine.engine").write_text("mine")
+
+    cli.document("build dense.onnx -o d.engine --precision fp16 --tactic-source CUBLAS")
+    cli.refused("build dense.onnx -o mine.engine")
+
+    assert (dense / "d.engine").read_bytes() == b"engine"
+    assert asked == [EngineSettings("fp16", ("CUBLAS",))]
+
+
+def test_an_exported_stack_is_a_document(cli: Cli, tmp_path: Path) -> None:
+    found = cli.document("export highway -o m.onnx")
+
+    assert found["bytes"] == (tmp_path / "m.onnx").stat().st_size
+
+
+def test_a_stack_of_a_checkpoint_names_it(cli: Cli, tmp_path: Path) -> None:
+    output = tmp_path / "m.onnx"
+    output.write_bytes(b"1234")
+    record = WeightsRecord("a.pth", "0" * 64, epoch=3, converted={"float16": 9})
+
+    show(ExportResult("tcp", output, 17, record), as_json=True)
+
+    found = strict(cli.capsys.readouterr().out)
+    assert faults("export", found) == []
+    assert found["weights"]["epoch"] == 3
+
+
+def test_frames_that_there_are_count_not_those_asked_for(
+    cli: Cli, tmp_path: Path
+) -> None:
+    for name in ("000000.npz", "000001.npz"):
+        (tmp_path / name).touch()
+
+    show(FramesResult("vad-tiny", tmp_path, FramesOptions(count=3)), as_json=True)
+
+    found = strict(cli.capsys.readouterr().out)
+    assert faults("frames", found) == []
+    assert found["frames"] == 2

@@ -1,5 +1,7 @@
-"""No command writes over what it reads, and none works before it can write."""
+"""No command writes over what it reads, or through links; none works before it can."""
 
+import contextlib
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -8,9 +10,12 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph, rewrite
-from tests.cli.conftest import Command
-
-Refused = Callable[[str], str]
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.recording import write_recording
+from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.zoo.state_dict import read_state_dict
+from tests.cli.conftest import Cli
 
 M, F = "dense.onnx", "dense.onnx frames"
 INT8 = f"{M} --scheme full --frames frames"
@@ -23,143 +28,62 @@ WRITERS = [
     f"search {F} --max-mb 1",
     f"profile {F}",
 ]
-INPUTS = {
-    f"calibrate {F} -r r.toml": "r.toml",
-    f"calibrate {F} --map map.toml": "map.toml",
-    f"calibrate {M} --merge s.npz": "s.npz",
-    f"calibrate {M} --import trt.cache": "trt.cache",
-    f"compress {INT8} --ranges ranges.json": "ranges.json",
-    f"compress {INT8} --overrides o.toml": "o.toml",
-    f"compress {M} -r r.toml": "r.toml",
-    f"plan {M} --overrides o.toml": "o.toml",
-    f"plan {M} --against other.onnx": "other.onnx",
-    f"search {F} --max-mb 1 --ranges ranges.json": "ranges.json",
-    f"sensitivity {F} --drive 1 --adapter a.toml": "a.toml",
-}
-FOLDERS = [f"frames {M}", f"evaluate {M}", "study study.toml"]
-
-
-@pytest.fixture
-def refused(
-    command: Command,
-    dense: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> Refused:
-    """Run a line that must be refused before any work; give what it says."""
-    monkeypatch.chdir(dense)
-    for _, name in INPUTS.items():
-        if not (dense / name).exists():
-            (dense / name).write_text("the user's\n")
-    (dense / "r.toml").write_text('[[pass]]\nname = "fold-constants"\n')
-
-    def run(line: str) -> str:
-        before = {p: p.read_bytes() for p in dense.rglob("*") if p.is_file()}
-        assert command(*line.split()) == 1
-        assert {p: p.read_bytes() for p in dense.rglob("*") if p.is_file()} == before
-        error = capsys.readouterr().err
-        assert error.count("\n") == 1
-        return error
-
-    return run
-
-
-@pytest.mark.parametrize("line", WRITERS)
-def test_the_model_is_not_written_over(refused: Refused, line: str) -> None:
-    assert "dense.onnx is the input" in refused(f"{line} -o dense.onnx")
-
-
-@pytest.mark.parametrize("line", WRITERS)
-def test_a_link_to_the_model_is_the_model(
-    refused: Refused, dense: Path, line: str
-) -> None:
-    (dense / "link.onnx").symlink_to(dense / "dense.onnx")
-
-    assert "link.onnx is the input" in refused(f"{line} -o link.onnx")
-
-
-@pytest.mark.parametrize(("line", "name"), INPUTS.items())
-def test_no_other_input_is_written_over(refused: Refused, line: str, name: str) -> None:
-    assert f"{name} is the input" in refused(f"{line} -o {name}")
-
-
-@pytest.mark.parametrize("line", WRITERS)
-def test_the_weights_beside_a_model_are_not_written_over(
-    refused: Refused, dense: Path, line: str
-) -> None:
-    model = graph.load(dense / M)
-    big = np.random.default_rng(0).normal(size=(1, 4096)).astype(np.float32)
-    rewrite.add_constant(model.graph, big, "more")
-    graph.save(model, dense / "dense.onnx", external=True)
-
-    line = refused(f"{line} -o dense.onnx.data")
-    assert "dense.onnx.data holds the weights of dense.onnx" in line
-
-
-@pytest.mark.parametrize("name", ["000001.npz", "000002.npz", "scenes.json"])
-@pytest.mark.parametrize("line", [w for w in WRITERS if "frames" in w])
-def test_a_recording_stays_as_it_is(refused: Refused, line: str, name: str) -> None:
-    said = refused(f"{line} -o frames/{name}")
-    assert f"frames/{name} would be a frame of the input" in said
-
-
-@pytest.mark.parametrize("line", [*WRITERS, "routes"])
-def test_a_folder_that_is_not_there_is_said_before_any_work(
-    refused: Refused, line: str
-) -> None:
-    assert "no/o.x: no such folder no" in refused(f"{line} -o no/o.x")
-
-
-@pytest.mark.parametrize("line", [*WRITERS, "routes", "export vad-tiny"])
-def test_a_folder_is_no_file(refused: Refused, line: str) -> None:
-    assert "frames is a folder" in refused(f"{line} -o frames")
-
-
-@pytest.mark.parametrize("line", FOLDERS)
-def test_a_file_is_no_folder(refused: Refused, dense: Path, line: str) -> None:
-    (dense / "study.toml").write_text(STUDY)
-
-    assert "dense.onnx is a file: name a folder" in refused(f"{line} -o dense.onnx")
-
-
-def test_a_study_does_not_write_among_its_frames(refused: Refused, dense: Path) -> None:
-    (dense / "study.toml").write_text(f'held_out = "frames"\n{STUDY}')
-
-    line = refused("study study.toml -o frames")
-    assert "frames is the input: choose another folder" in line
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--tensorrt-cache dense.onnx", "dense.onnx is the input"),
-        ("--tensorrt-cache no/c", "no/c: no such folder no"),
-        ("--tensorrt-cache ranges.json", "ranges.json is named for two outputs"),
-        ("--onnxruntime-table dense.onnx", "dense.onnx is a file"),
-        ("--onnxruntime-table frames", "frames is the input: choose another folder"),
-    ],
-)
-def test_caches_for_other_tools_do_no_harm(
-    refused: Refused, words: str, message: str
-) -> None:
-    assert message in refused(f"calibrate {F} -o ranges.json {words}")
-
-
-def test_a_table_is_not_written_over_the_one_that_is_read(
-    refused: Refused, dense: Path
-) -> None:
-    (dense / "table").mkdir()
-    shutil.move(dense / "trt.cache", dense / "table" / "calibration.cache")
-
-    words = "--import table/calibration.cache --onnxruntime-table table"
-    line = refused(f"calibrate {M} {words} -o new.json")
-    assert "table/calibration.cache is the input" in line
-
-
+READERS = [
+    f"calibrate {F} -r r.toml",
+    f"calibrate {F} --map map.toml",
+    f"calibrate {M} --merge s.npz",
+    f"calibrate {M} --import trt.cache",
+    f"compress {INT8} --ranges ranges.json",
+    f"compress {INT8} --overrides o.toml",
+    f"compress {M} -r r.toml",
+    f"plan {M} --overrides o.toml",
+    f"plan {M} --against other.onnx",
+    f"search {F} --max-mb 1 --ranges ranges.json",
+    f"sensitivity {F} --drive 1 --adapter a.toml",
+]
+"""Commands whose last word is a file that they read."""
+RECORDED = [
+    (line, f"frames/{name}")
+    for line in WRITERS
+    if "frames" in line
+    for name in ("000001.npz", "000002.npz", "scenes.json")
+]
+REFUSED = {
+    **{f"{line} -o dense.onnx": "dense.onnx is the input" for line in WRITERS},
+    **{f"{line} -o link.onnx": "link.onnx is the input" for line in WRITERS},
+    **{
+        f"{line} -o apart.onnx.data": "apart.onnx.data holds the weights of apart.onnx"
+        for line in (each.replace("dense", "apart") for each in WRITERS)
+    },
+    **{f"{line} -o {name}": f"{name} is the input"
+       for line in READERS for name in line.split()[-1:]},
+    **{f"{line} -o {name}": f"{name} would be a frame of the input"
+       for line, name in RECORDED},
+    **{f"{line} -o no/o.x": "no/o.x: no such folder no"
+       for line in (*WRITERS, "routes")},
+    **{f"{line} -o frames": "frames is a folder"
+       for line in (*WRITERS, "routes", "export vad-tiny")},
+    **{f"{line} -o dense.onnx": "dense.onnx is a file: name a folder"
+       for line in (f"frames {M}", f"evaluate {M}", "study study.toml")},
+    "study study.toml -o frames": "frames is the input: choose another folder",
+    **{
+        f"calibrate {F} -o ranges.json {words}": said
+        for words, said in {
+            "--tensorrt-cache dense.onnx": "dense.onnx is the input",
+            "--tensorrt-cache no/c": "no/c: no such folder no",
+            "--tensorrt-cache ranges.json": "ranges.json is named for two outputs",
+            "--onnxruntime-table dense.onnx": "dense.onnx is a file",
+            "--onnxruntime-table frames": "frames is the input: choose another folder",
+        }.items()
+    },
+    f"calibrate {M} --import table/calibration.cache --onnxruntime-table table -o n":
+        "table/calibration.cache is the input",
+}  # fmt: skip
 STUDY = """
 title = "one"
 baseline = "blind"
 routes = 1
+held_out = "frames"
 [[scheme]]
 name = "blind"
 policy = "blind"
@@ -167,3 +91,126 @@ policy = "blind"
 name = "ideal"
 latency = "none"
 """
+
+
+@pytest.fixture
+def folder(dense: Path) -> Path:
+    """Files of every kind that a command reads."""
+    for name in (line.split()[-1] for line in READERS):
+        if not (dense / name).exists():
+            (dense / name).write_text("the user's\n")
+    (dense / "r.toml").write_text('[[pass]]\nname = "fold-constants"\n')
+    (dense / "study.toml").write_text(STUDY)
+    (dense / "table").mkdir()
+    (dense / "table" / "calibration.cache").write_text("the user's\n")
+    (dense / "link.onnx").symlink_to(dense / "dense.onnx")
+    model = graph.load(dense / M)
+    big = np.random.default_rng(0).normal(size=(1, 4096)).astype(np.float32)
+    rewrite.add_constant(model.graph, big, "more")
+    graph.save(model, dense / "apart.onnx", external=True)
+    return dense
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("line", REFUSED)
+def test_what_would_do_harm_is_refused_before_any_work(cli: Cli, line: str) -> None:
+    assert REFUSED[line] in cli.refused(line)
+
+
+EXACT = "--passes import-normalize -o out.onnx"
+ONE = Frame(0, True, {"camera": np.zeros((1, 4), np.float32)})
+
+
+@pytest.mark.parametrize("name", [".out.partial", ".out.partial.before"])
+def test_recording_leaves_folders_that_it_did_not_make(
+    tmp_path: Path, name: str
+) -> None:
+    mine = tmp_path / name
+    mine.mkdir()
+    (mine / "notes.txt").write_text("mine")
+    (tmp_path / "out").mkdir()
+
+    with contextlib.suppress(FramesError):
+        write_recording(tmp_path / "out", lambda begin: [ONE], {})
+
+    assert (mine / "notes.txt").read_text() == "mine"
+
+
+def test_unfinished_frames_do_not_go_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / ".out.partial").symlink_to("mine")
+    with pytest.raises(FramesError, match="partial is a link"):
+        write_recording(tmp_path / "out", lambda begin: [ONE], {})
+    assert list((tmp_path / "mine").iterdir()) == []
+
+
+@pytest.mark.parametrize("step", ["replace", "unlink", "mkdir", "touch"])
+def test_a_recording_goes_on_after_a_kill_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    frames = [Frame(at, True, ONE.arrays, place=at) for at in range(3)]
+    left = list[Path]()
+
+    def first(real: Callable[..., object]) -> Callable[..., object]:
+        def call(*given: object, **options: object) -> object:
+            copy = shutil.copytree(tmp_path / "here", tmp_path / str(len(left)))
+            left.append(copy / "out")
+            return real(*given, **options)
+
+        return call
+
+    def make(out: Path) -> None:
+        write_recording(out, lambda begin: frames[begin.frame :], {})
+
+    (tmp_path / "here").mkdir()
+    with monkeypatch.context() as patch:
+        place = os if step == "replace" else Path
+        step_of = getattr(place, step)
+        patch.setattr(place, step, first(step_of))
+        make(tmp_path / "here" / "out")
+    for out in left:
+        make(out)
+        assert len(CalibrationSet(out)) == 3
+        assert not [each for each in out.iterdir() if "progress" in each.name]
+        assert not (out.parent / ".out.partial").exists()
+
+
+def test_a_pipe_among_frames_is_one_line(files: Path) -> None:
+    os.mkfifo(files / "frames" / "000002.npz")
+    with pytest.raises(FramesError, match=r"000002\.npz: not a regular file"):
+        CalibrationSet(files / "frames")
+
+
+@pytest.mark.parametrize("name", ["pipe", "/dev/zero"])
+def test_weights_that_never_end_are_one_line(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(GraphError, match="not a regular file"):
+        read_state_dict(tmp_path / name)
+
+
+def test_links_in_a_circle_are_one_line(cli: Cli, files: Path) -> None:
+    (files / "out.onnx").symlink_to("other.onnx")
+    (files / "other.onnx").symlink_to("out.onnx")
+
+    said = cli.refused(f"compress in.onnx {EXACT}")
+
+    assert said.startswith("me2e-compress: out.onnx is there")
+
+
+def test_a_name_that_is_not_utf8_is_one_line(cli: Cli, files: Path) -> None:
+    name = os.fsdecode(b"\xff.onnx")
+    said = cli.refused(f"compress in.onnx {EXACT.replace('out.onnx', name)}")
+
+    assert said == "me2e-compress: '\\udcff.onnx' is not UTF-8: rename the file"
+
+
+def test_a_current_folder_that_is_gone_is_one_line(
+    cli: Cli, files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (files / "gone").mkdir()
+    monkeypatch.chdir(files / "gone")
+    (files / "gone").rmdir()
+
+    said = cli.refused(f"compress {files}/in.onnx {EXACT}")
+
+    assert said == "me2e-compress: the current folder: No such file or directory"

@@ -8,12 +8,8 @@ import pytest
 import me2e_compress as me2e
 from me2e_compress.cli import commands
 from me2e_compress.runtime.providers import CpuProvider
-from tests.cli.conftest import Command
+from tests.cli.conftest import Cli
 
-COMMANDS = (
-    *("calibrate", "compare", "compress", "demo", "evaluate", "frames", "lint"),
-    *("profile", "search", "sensitivity", "study"),
-)
 STUDY = """
 title = "Try"
 baseline = "dense"
@@ -27,67 +23,39 @@ policy = "dense.onnx"
 name = "ideal"
 latency = "none"
 """
+LINES = (
+    "calibrate dense.onnx frames -o out.json",
+    "compare dense.onnx dense.onnx frames",
+    "compress dense.onnx -r full --frames frames -o s.onnx",
+    "demo -o out",
+    "evaluate dense.onnx -o out.json",
+    "frames dense.onnx -o out.json",
+    "lint dense.onnx --target onnxruntime",
+    "profile dense.onnx frames -o out.json",
+    "search dense.onnx frames --max-mb 9 -o r.toml",
+    "sensitivity dense.onnx frames -o out.json",
+    "study study.toml -o out",
+)
 
 
-def words(folder: Path, name: str) -> list[str | Path]:
-    """Return a command that opens a session, and its arguments."""
-    model, frames = folder / "dense.onnx", folder / "frames"
-    if name == "compress":
-        return [name, model, "-r", "full", "--frames", frames, "-o", folder / "s.onnx"]
-    if name == "search":
-        return [name, model, frames, "--max-mb", "9", "-o", folder / "r.toml"]
-    if name == "compare":
-        return [name, model, model, frames]
-    if name == "lint":
-        return [name, model, "--target", "onnxruntime"]
-    if name == "demo":
-        return [name, "-o", folder / "out"]
-    if name == "study":
-        (folder / "study.toml").write_text(STUDY)
-        return [name, folder / "study.toml", "-o", folder / "out"]
-    recording = [] if name in ("evaluate", "frames") else [frames]
-    return [name, model, *recording, "-o", folder / "out.json"]
+@pytest.fixture(autouse=True)
+def folder(dense: Path) -> Path:
+    (dense / "study.toml").write_text(STUDY)
+    (dense / "text.so").write_text("not a library")
+    return dense
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_library_that_is_missing_is_one_line(
-    name: str, command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("line", LINES)
+def test_what_is_missing_is_one_line_of_every_command(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, line: str
 ) -> None:
-    library = dense / "none.so"
-
-    assert command(*words(dense, name), "--plugins", library) == 1
-
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.endswith(f"plugins library {library}: no such file")
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_provider_that_is_missing_is_one_line(
-    name: str,
-    command: Command,
-    dense: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    said = cli.refused(f"{line} --plugins none.so")
+    assert said.endswith("plugins library none.so: no such file")
+    assert "plugins library text.so: " in cli(f"{line} --plugins text.so").err
     monkeypatch.setattr(ort, "get_available_providers", lambda: [CpuProvider.native])
-
-    assert command(*words(dense, name), "--provider", "cuda") == 1
-
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "provider cuda: onnxruntime" in line
-    assert line.endswith("pip install onnxruntime-gpu")
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_the_first_session_of_a_command_has_the_library(
-    name: str, command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    library = dense / "text.so"
-    library.write_text("not a library")
-
-    assert command(*words(dense, name), "--plugins", library) == 1
-
-    assert f"plugins library {library}: " in capsys.readouterr().err
+    said = cli.refused(f"{line} --provider cuda")
+    assert "provider cuda: onnxruntime" in said
+    assert said.endswith("pip install onnxruntime-gpu")
 
 
 def test_every_command_that_takes_a_provider_is_here() -> None:
@@ -97,18 +65,7 @@ def test_every_command_that_takes_a_provider_is_here() -> None:
         if "provider" in file.read_text("utf-8")
     }
 
-    assert taking == set(COMMANDS)
-
-
-def test_a_lint_for_tensorrt_opens_no_session(
-    command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    library = dense / "lib.so"
-    library.touch()
-
-    assert command("lint", dense / "dense.onnx", "--plugins", library) == 1
-
-    assert "lint for tensorrt opens no session" in capsys.readouterr().err
+    assert taking == {line.split()[0] for line in LINES}
 
 
 def test_compress_runs_every_graph_on_the_provider(

@@ -13,20 +13,16 @@ from tests.conftest import DRIVER
 
 HEAVY = frozenset(
     {
-        "gymnasium",
-        "highway_env",
-        "matplotlib",
-        "numba",
-        "numpy",
-        "onnx",
-        "onnx_ir",
-        "onnxruntime",
-        "onnxsim",
-        "pandas",
-        "pydantic",
-        "ray",
-        "scipy",
-        "sympy",
+        *(
+            "gymnasium",
+            "highway_env",
+            "matplotlib",
+            "numba",
+            "numpy",
+            "onnx",
+            "onnx_ir",
+        ),
+        *("onnxruntime", "onnxsim", "pandas", "pydantic", "ray", "scipy", "sympy"),
         "torch",
     }
 )

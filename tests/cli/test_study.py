@@ -1,3 +1,5 @@
+"""``study``: a report, the paper's tables, and code that nobody trusted."""
+
 import json
 from pathlib import Path
 
@@ -10,10 +12,9 @@ from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway import evaluator
 from me2e_compress.marks import IN_JSON
 from me2e_compress.simulator.routes import save_routes
-from me2e_compress.study import Study
+from me2e_compress.study import Study, load_study
 from me2e_compress.zoo.shipped import shipped
-from tests.cli.conftest import Command, write_frames
-from tests.docs.documents import faults
+from tests.cli.conftest import Cli, write_frames
 from tests.evaluators.highway.drivers import CROSSING, straight_on
 from tests.study.conftest import Here
 
@@ -40,6 +41,15 @@ recipe = "exact"
 name = "device"
 latency = "trace"
 """
+PAPER = (
+    STUDY.replace('"Try"', '"Again"\nreport = "paper"')
+    + """
+[[block]]
+name = "table-3"
+variants = ["float"]
+conditions = ["device"]
+"""
+)
 
 
 @pytest.fixture(autouse=True)
@@ -60,31 +70,26 @@ def toml(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("toml")
 def test_a_study_leaves_a_report_and_prints_its_tables(
-    command: Command, toml: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    cli: Cli, tmp_path: Path
 ) -> None:
-    assert command("study", toml, "-o", tmp_path / "out") == 0
+    shown = cli.done("study study.toml -o out").out
 
-    shown = capsys.readouterr().out
     assert "Scoreboard, device" in shown
     assert "Difference to float" in shown
     files = {path.name for path in (tmp_path / "out").iterdir()}
     assert files >= {"study.json", "tables.md", "report.html", "results", "traces"}
     text = (tmp_path / "out" / "report.html").read_text()
-    assert f"me2e-compress study {toml} -o" in text
+    assert "me2e-compress study study.toml -o" in text
 
 
-def test_json_is_the_file(
-    command: Command, toml: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    assert command("study", toml, "-o", out, "--json") == 0
+@pytest.mark.usefixtures("toml")
+def test_json_is_the_file(cli: Cli, tmp_path: Path) -> None:
+    shown = cli.document("study study.toml -o out")
 
-    shown = json.loads(capsys.readouterr().out)
-    saved = json.loads((out / "study.json").read_text())
-    known = {key: shown[key] for key in saved if key in shown}
-    assert saved == IN_JSON | known
-    assert faults("study", shown) == []
+    saved = json.loads((tmp_path / "out" / "study.json").read_text())
+    assert saved == IN_JSON | {key: shown[key] for key in saved if key in shown}
     assert [each["scheme"] for each in shown["drives"]] == ["float", "exact"]
 
 
@@ -103,22 +108,12 @@ def test_json_is_the_file(
     ],
 )
 def test_what_is_wrong_is_one_line(
-    command: Command,
-    toml: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    old: str,
-    new: str,
-    message: str,
+    cli: Cli, toml: Path, old: str, new: str, message: str
 ) -> None:
     assert old in STUDY
     toml.write_text(STUDY.replace(old, new))
 
-    assert command("study", toml, "-o", tmp_path / "out") == 1
-
-    line = capsys.readouterr().err
-    assert message in line
-    assert line.count("\n") == 1
+    assert message in cli.refused("study study.toml -o out")
 
 
 def test_a_model_that_ships_is_not_one_where_you_are(
@@ -142,73 +137,94 @@ def test_a_model_that_ships_is_not_one_where_you_are(
     assert asked[0].variants[0].policy == str(shipped("highway"))
 
 
-def test_an_engine_nobody_knows(
-    command: Command,
-    toml: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+@pytest.mark.usefixtures("toml")
+def test_an_engine_nobody_knows(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
+    monkeypatch.chdir(cli.folder)
 
-    assert command("study", toml, "-o", tmp_path / "out", "--engine", "cloud") == 1
-    assert "engine 'cloud'" in capsys.readouterr().err
-
-
-PAPER = (
-    STUDY.replace('"Try"', '"Again"\nreport = "paper"')
-    + """
-[[block]]
-name = "table-3"
-variants = ["float"]
-conditions = ["device"]
-"""
-)
+    said = cli("study study.toml -o out --engine cloud")
+    assert said.code == 1
+    assert "engine 'cloud'" in said.err
 
 
 def test_the_papers_tables_are_written_and_read_again(
-    command: Command,
-    toml: Path,
-    tmp_path: Path,
-    here: Here,
-    capsys: pytest.CaptureFixture[str],
+    cli: Cli, toml: Path, tmp_path: Path, here: Here
 ) -> None:
     toml.write_text(PAPER)
-    out, again = tmp_path / "out", tmp_path / "again"
-    assert command("study", toml, "-o", out, "--json") == 0
-    shown = json.loads(capsys.readouterr().out)
+    shown = cli.document("study study.toml -o out")
     driven = list(here.driven)
 
-    assert command("study", toml, "-o", again, "--records", out / "records") == 0
+    cli.done("study study.toml -o again --records out/records")
 
-    assert faults("study", shown) == []
     assert [each["scheme"] for each in shown["drives"]] == ["float"]
     assert here.driven == driven
+    out, again = tmp_path / "out", tmp_path / "again"
     assert (again / "tables.md").read_bytes() == (out / "tables.md").read_bytes()
 
 
-def test_a_dry_run_drives_nothing(
-    command: Command,
-    toml: Path,
-    tmp_path: Path,
-    here: Here,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    out = tmp_path / "out"
-    assert command("study", toml, "-o", out, "--dry-run", "--json") == 0
+@pytest.mark.usefixtures("toml")
+def test_a_dry_run_drives_nothing(cli: Cli, tmp_path: Path, here: Here) -> None:
+    shown = cli.document("study study.toml -o out --dry-run")
 
-    shown = json.loads(capsys.readouterr().out)
-    assert faults("study", shown) == []
     assert len(shown["drives"]) == 2
     assert here.driven == []
-    assert not out.exists()
+    assert not (tmp_path / "out").exists()
 
 
-def test_the_study_that_ships_is_found_by_its_name(
-    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ("study", "paper", "-o", tmp_path / "out", "--routes", "44", "--dry-run")
-    assert command(*words) == 0
+def test_the_study_that_ships_is_found_by_its_name(cli: Cli) -> None:
+    shown = cli.done("study paper -o out --routes 44 --dry-run").out
 
-    shown = capsys.readouterr().out
     assert "The paper, re-tested: 36 drives, 1,584 routes, 0 of them driven" in shown
+
+
+THEIRS = """
+title = "Look"
+baseline = "theirs"
+routes = 1
+{}
+
+[[variant]]
+name = "theirs"
+policy = "{}"
+
+[[condition]]
+name = "ideal"
+latency = "none"
+"""
+TRAP = """
+from pathlib import Path
+Path(__file__).with_suffix(".sprung").touch()
+"""
+
+
+@pytest.mark.parametrize(
+    ("plugins", "policy"),
+    [
+        ("", "their_code:make"),
+        ("", "python{factory=their_code:make}"),
+        ('plugins = ["their.so"]', "blind"),
+    ],
+)
+def test_a_study_that_names_code_is_refused_until_it_is_trusted(
+    cli: Cli, tmp_path: Path, plugins: str, policy: str
+) -> None:
+    (tmp_path / "their_code.py").write_text(TRAP)
+    (tmp_path / "study.toml").write_text(THEIRS.format(plugins, policy))
+
+    said = cli.refused("study study.toml -o out")
+
+    assert said.startswith("me2e-compress: study.toml runs code: ")
+    assert said.endswith("look at it first, then say --trust-code")
+    if not plugins:
+        trusted = load_study(tmp_path / "study.toml", trust_code=True)
+        assert trusted.variants[0].policy == policy
+    assert not (tmp_path / "their_code.sprung").exists()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_study_that_names_no_code_needs_no_trust(tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(THEIRS.format("plugins = []", "blind"))
+    (tmp_path / "mine.so").touch()
+
+    assert load_study(tmp_path / "study.toml")
+    assert load_study(tmp_path / "study.toml", plugins=[tmp_path / "mine.so"])

@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 from driver.checkpoint import TrainingCheckpoint
-from driver.course import CourseProgress, claim, frames_in, run
+from driver.course import frames_in, run
 from driver.curriculum import (
     FULL,
     SMALL,
@@ -30,6 +30,7 @@ from driver.process import Training
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import TrainingError
 from me2e_compress.simulator.routes import load_routes
+from me2e_compress.workflows.listener import Listener
 from tests.driver.made import arrays_of, write
 from tests.driver.small import WORKERS
 
@@ -50,30 +51,17 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_every_round_leaves_a_driver(small: Path) -> None:
+def test_every_round_leaves_a_driver_and_a_log(small: Path) -> None:
     for number in range(2):
         policy = OnnxPolicy.open(small / f"round-{number}" / "driver.onnx")
         assert policy.image_size == (96, 160)
-
-
-@pytest.mark.slow
-def test_the_log_tells_losses_and_closed_loop_scores(small: Path) -> None:
     rows = Log(small / "round-1" / "training-1" / "log.jsonl").rows()
     assert [row["what"] for row in rows] == ["losses", "closed_loop"]
     mean, low, high = rows[1]["driving_score_percent"]
     assert 0 <= low <= mean <= high <= 100
     assert (rows[1]["routes"], len(rows[1]["success_rate_percent"])) == (2, 3)
-
-
-@pytest.mark.slow
-def test_the_log_tells_how_much_was_learned_from(small: Path) -> None:
-    rows = Log(small / "round-1" / "training-1" / "log.jsonl").rows()
-    files = [
-        file
-        for number in range(2)
-        for file in (small / f"round-{number}" / "episodes").glob("*.npz")
-    ]
-    held_out = held_out_files(sorted((small / "round-0" / "episodes").glob("*.npz")))
+    files = list(small.glob("round-*/episodes/*.npz"))
+    held_out = held_out_files(sorted(small.glob("round-0/episodes/*.npz")))
     assert rows[1]["learned_frames"] == frames_in(files) - frames_in(held_out)
 
 
@@ -114,11 +102,13 @@ def test_a_finished_course_is_not_gone_again(small: Path) -> None:
             if file.is_file() and file.name != "log.jsonl"
         }
 
-    before, news = times(), list[CourseProgress]()
-    rounds = run(SMALL, small, WORKERS, news.append, SMALL_LATENCY)
+    before, news = times(), list[tuple[str, int, int, str]]()
+    listener = Listener(lambda *told: news.append(told))
+    rounds = run(SMALL, small, WORKERS, listener, SMALL_LATENCY)
     assert [each.driver.parent.name for each in rounds] == ["round-0", "round-1"]
     assert times() == before
-    assert all(each.done == each.total for each in news if "training" not in each.what)
+    told = [(done, total) for what, done, total, _ in news if "training" not in what]
+    assert all(done == total for done, total in told)
 
 
 @pytest.mark.slow
@@ -202,46 +192,10 @@ def test_killed_in_every_part_it_comes_to_the_same_driver(
     assert drivers[0].read_bytes() == drivers[1].read_bytes()
 
 
-def test_a_foreign_folder_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(TrainingError, match=r"not empty, and holds no course\.json"):
-        claim(tmp_path, SMALL)
-
-
-def test_a_draft_that_a_kill_left_does_not_matter(tmp_path: Path) -> None:
-    (tmp_path / ".course.json.x1").write_text("{")
-    claim(tmp_path, SMALL)
-    assert (tmp_path / "course.json").exists()
-
-
-@pytest.mark.parametrize(("content", "words"), [("{", "not JSON"), ("1", "not a cou")])
-def test_a_broken_manifest_is_named(tmp_path: Path, content: str, words: str) -> None:
-    (tmp_path / "course.json").write_text(content)
-    with pytest.raises(TrainingError, match=rf"course\.json: {words}"):
-        claim(tmp_path, SMALL)
-
-
-def test_other_workers_are_another_course(tmp_path: Path) -> None:
-    claim(tmp_path, FULL.on(4))
-    words = r"its rounds\.0\.trainings\.0\.workers is 4, this one's 2"
-    with pytest.raises(TrainingError, match=words):
-        claim(tmp_path, FULL.on(2))
-
-
-def test_more_workers_than_it_trains_with_do_not_matter(tmp_path: Path) -> None:
-    claim(tmp_path, FULL.on(4))
-    manifest = tmp_path / "course.json"
-    before = manifest.read_bytes()
-
-    claim(tmp_path, FULL.on(8))
-
-    workers = {
-        training["workers"]
-        for each in json.loads(before)["rounds"]
-        for training in each["trainings"]
-    }
-    assert max(workers) == 4
-    assert manifest.read_bytes() == before
+def test_more_workers_than_it_trains_with_do_not_matter() -> None:
+    assert FULL.on(8) == FULL.on(4) != FULL.on(2)
+    trainings = [one for each in FULL.on(8).rounds for one in each.trainings]
+    assert max(each.workers for each in trainings) == 4
 
 
 def test_frames_of_an_episode_named_twice_count_once(tmp_path: Path) -> None:

@@ -95,27 +95,18 @@ def test_without_noise_the_expert_drives_as_ever(
     calm: Arrays, witness: Witness
 ) -> None:
     poses = [(s.ego.x, s.ego.y, s.ego.heading) for s in scenes(witness)]
+    told = np.array([seen.can_bus for seen in witness.seen[::20]])
+    moved = [0, 1, 2, 17]  # what depends on the spacing
 
     assert np.array_equal(calm["pose"], poses[::20])
     assert np.array_equal(calm["plan"], np.array(witness.plans[::20], np.float32))
     assert np.array_equal(calm["time_us"], [s.time_us for s in scenes(witness)[::20]])
     assert np.array_equal(calm["command"], [o.command for o in witness.seen[::20]])
-
-
-def test_a_crash_is_told(calm: Arrays) -> None:
-    assert not calm["crashed"]
-
-
-def test_the_can_bus_lacks_what_depends_on_the_spacing(
-    calm: Arrays, witness: Witness
-) -> None:
-    told = np.array([seen.can_bus for seen in witness.seen[::20]])
-    moved = [0, 1, 2, 17]
-
     assert np.all(calm["can_bus"][:, moved] == 0.0)
     assert np.array_equal(
         np.delete(calm["can_bus"], moved, 1), np.delete(told, moved, 1)
     )
+    assert not calm["crashed"]
 
 
 def test_seconds_since_the_ego_stood(calm: Arrays, witness: Witness) -> None:
@@ -159,11 +150,8 @@ def test_the_path_is_the_route_in_the_ego_frame(
             assert at == pytest.approx(s + 2.0 * k, abs=0.35)
             assert away == pytest.approx(0.0, abs=0.05)
         assert calm["lateral_m"][row] == pytest.approx(lateral, abs=1e-4)
-
-
-def test_the_path_goes_on_beyond_the_route(calm: Arrays) -> None:
+    # straight on, beyond its end
     steps = np.diff(calm["path"][-1], axis=0)
-
     assert np.hypot(steps[:, 0], steps[:, 1]) == pytest.approx(2.0, abs=0.1)
 
 

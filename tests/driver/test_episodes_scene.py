@@ -109,18 +109,13 @@ def test_a_future_is_seen_from_the_ego_of_now() -> None:
     assert np.isnan(ways[2:]).all()
 
 
-def test_who_is_gone_has_no_future() -> None:
+def test_who_is_gone_has_no_future_and_after_the_end_nothing_is_occupied() -> None:
     car = actor(1, 10.0, 0.0)
 
     arrays = agents(scene(car), [scene(car), scene(), scene(), None, None, None])
 
     assert np.isnan(arrays["futures"][0, 1:]).all()
     assert arrays["known_steps"] == 3
-
-
-def test_after_the_end_nothing_is_occupied() -> None:
-    arrays = agents(scene(), [scene(actor(1, 10.0, 0.0)), *[None] * 5])
-
     filled = occupied(arrays).any(axis=(1, 2))
     assert filled.tolist() == [True, *[False] * 5]
 
@@ -172,29 +167,20 @@ def test_a_signal_is_told_in_the_ego_frame() -> None:
     assert rows[0] == pytest.approx([0, 1, 12, -4, 0, 1, 12, 0], abs=1e-5)
 
 
-def test_no_signal_is_no_red_light() -> None:
-    rows = signals(frame(phases=()), 0.0)
-
-    assert np.all(rows[:, :2] == -1)
-    assert np.isnan(rows[:, 6]).all()
-
-
-def test_signals_of_the_route_come_first() -> None:
+def test_four_signals_at_most_those_of_the_route_first() -> None:
     far, near, nearer = signal(1, 40.0), signal(2, 9.0), signal(3, 5.0)
-
-    rows = signals(frame(near, nearer, far, phases=(Phase(1, 60.0, None),)), 0.0)
-
-    assert rows[:3, 2] == pytest.approx([40.0, 5.0, 9.0])
-    assert np.isnan(rows[:, 6]).tolist() == [False, True, True, True]
-
-
-def test_only_four_signals() -> None:
     crowd = [signal(k, 10.0 * k, SignalKind.GIVE_WAY, None) for k in range(6)]
 
-    rows = signals(frame(*crowd, phases=()), 0.0)
+    none = signals(frame(phases=()), 0.0)
+    some = signals(frame(near, nearer, far, phases=(Phase(1, 60.0, None),)), 0.0)
+    many = signals(frame(*crowd, phases=()), 0.0)
 
-    assert rows[:, 2] == pytest.approx([0.0, 10.0, 20.0, 30.0])
-    assert np.all(rows[:, :2] == [2, -1])
+    assert np.all(none[:, :2] == -1)
+    assert np.isnan(none[:, 6]).all()
+    assert some[:3, 2] == pytest.approx([40.0, 5.0, 9.0])
+    assert np.isnan(some[:, 6]).tolist() == [False, True, True, True]
+    assert many[:, 2] == pytest.approx([0.0, 10.0, 20.0, 30.0])
+    assert np.all(many[:, :2] == [2, -1])
 
 
 def test_a_served_stop_is_told() -> None:

@@ -95,16 +95,12 @@ def test_travel_is_from_where_the_agent_is_now() -> None:
     assert targets.travel[0, 1, 5].tolist() == pytest.approx([0, -6])
 
 
-def test_travel_that_nobody_saw_is_unknown_and_zero() -> None:
+def test_travel_that_nobody_saw_and_places_without_agents_are_unknown() -> None:
     arrays = batch()
     arrays["futures"][0, 0, 3:] = np.nan
     targets = labels_of(arrays, AREA)
     assert targets.travel_known[0, 0].tolist() == [True] * 3 + [False] * 3
     assert targets.travel[0, 0, 3:].abs().max() == 0
-
-
-def test_places_without_an_agent_are_empty() -> None:
-    targets = labels_of(batch(), AREA)
     assert targets.there[0].tolist() == [True, True] + [False] * 22
     assert not targets.travel_known[0, 2:].any()
 

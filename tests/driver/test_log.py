@@ -1,4 +1,4 @@
-"""The log of training, and options compared by name."""
+"""The log of training, options compared by name, and the folder that is theirs."""
 
 from pathlib import Path
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from driver.log import Log
-from driver.options import difference
+from driver.options import claim, difference
 from me2e_compress.errors import TrainingError
 
 
@@ -84,3 +84,33 @@ def test_the_first_difference_has_a_name(
 
 def test_what_may_change_does_not_matter() -> None:
     assert difference(OPTIONS, {**OPTIONS, "rate": 1.0}, but=("rate",)) is None
+
+
+def test_a_folder_is_claimed_once_and_a_draft_of_a_kill_does_not_matter(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / ".a.json.x1").write_text("{")
+    claim(tmp_path / "a.json", "course", OPTIONS)
+    before = (tmp_path / "a.json").read_bytes()
+    claim(tmp_path / "a.json", "course", OPTIONS)
+    assert (tmp_path / "a.json").read_bytes() == before
+    words = r"holds another course: its rounds\.1\.seed is 2, this one's 3; choose"
+    rounds = [OPTIONS["rounds"][0], {"seed": 3, "how": {"light": 0.5}}]
+    with pytest.raises(TrainingError, match=words):
+        claim(tmp_path / "a.json", "course", {**OPTIONS, "rounds": rounds})
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("thesis.tex", "years of work", r"not empty, and holds no a\.json"),
+        ("a.json", "{", r"a\.json: not JSON"),
+        ("a.json", "1", r"a\.json: not a course"),
+    ],
+)
+def test_a_folder_of_something_else_is_refused(
+    tmp_path: Path, name: str, content: str, words: str
+) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(TrainingError, match=words):
+        claim(tmp_path / "a.json", "course", OPTIONS)

@@ -44,12 +44,7 @@ def test_a_step_goes_on_from_it(tmp_path: Path) -> None:
         ONE_STEP, config, (files[0],), (files[1],), start, tmp_path / "training"
     )
     task.folder.mkdir()
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        TrainingProcess(0, ProcessGroup.of(1, config), task).run()
-    finally:
-        torch.set_num_threads(threads)
+    TrainingProcess(0, ProcessGroup.of(1, config), task).run()
     before, after = Start.load(start), TrainingCheckpoint.load(task.folder / "last.pt")
     gaps = [
         (after.model[name] - value).abs().max()

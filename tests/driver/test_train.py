@@ -6,12 +6,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
-from driver.course import RoundResult, claim
+from driver.course import MANIFEST, RoundResult
 from driver.curriculum import FULL
+from driver.options import claim
 from driver.train import main
 from driver.workflow import TrainResult
 from me2e_compress.cli.console import show
@@ -37,22 +39,12 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
 def test_a_folder_of_another_course(
     command: Command, tmp_path: Path, capsys: Capture
 ) -> None:
-    claim(tmp_path, FULL.on(4))
+    claim(tmp_path / MANIFEST, "course", asdict(FULL.on(4)))
 
     assert command("--small", "-o", tmp_path) == 1
     words = "holds another course: its config.anchors is 64, this one's 16;"
     assert words in (said := capsys.readouterr().err)
     assert said.count("\n") == 1
-
-
-def test_a_folder_of_something_else(
-    command: Command, tmp_path: Path, capsys: Capture
-) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
-
-    assert command("--small", "-o", tmp_path) == 1
-    assert "not empty, and holds no course.json" in capsys.readouterr().err
-    assert [file.name for file in tmp_path.iterdir()] == ["notes.txt"]
 
 
 def test_a_file_in_the_place_of_the_folder(

@@ -26,57 +26,35 @@ class Case:
 
 MODEL, FRAMES = "../good/model.onnx", "../good/frames"
 
-MAPPED = ("--map", "../good/map.toml")
 OPENERS: Mapping[str, tuple[str, ...]] = {
     "inspect": ("inspect", "bad.onnx"),
-    "inspect-mapped": ("inspect", "bad.onnx", *MAPPED, "--json"),
+    "inspect-mapped": (
+        *("inspect", "bad.onnx", "--map", "../good/map.toml", "--json"),
+    ),
     "plan": ("plan", "bad.onnx", "--all"),
-    "plan-against": ("plan", MODEL, "--against", "bad.onnx"),
     "lint": ("lint", "bad.onnx"),
-    "lint-onnxruntime": ("lint", "bad.onnx", "--target", "onnxruntime"),
-    "exact": ("compress", "bad.onnx", "-r", "exact", "-o", "out.onnx"),
     "unchecked": (
-        "compress", "bad.onnx", "-r", "exact", "-o", "out.onnx",
-        "--verify-frames", "0",
+        *("compress", "bad.onnx", "-r", "exact", "-o", "out.onnx"),
+        *("--verify-frames", "0"),
     ),
-    "int8": (
-        "compress", "bad.onnx", "--scheme", "full", "--frames", FRAMES, "-o",
-        "out.onnx", "--rules", "paper", *MAPPED,
-    ),
-    "lower": (
-        "compress", "bad.onnx", "--passes",
-        "quantize-int8{target=onnxruntime, rules=paper}",
-        "--frames", FRAMES, "-o", "out.onnx",
-    ),
-    "ablate": (
-        "compress", "bad.onnx", "--passes", "ablate-modules{drop=[backbone]}", "-o",
-        "out.onnx", *MAPPED,
-    ),
+}
+"""Commands that open a graph, and no session of onnxruntime with it."""
+
+RUNNERS: Mapping[str, tuple[str, ...]] = {
     "calibrate": ("calibrate", "bad.onnx", FRAMES, "-o", "out.json"),
     "compare": ("compare", MODEL, "bad.onnx", FRAMES),
     "profile": ("profile", "bad.onnx", FRAMES, "-o", "out.json", "--samples", "2"),
     "evaluate": ("evaluate", "bad.onnx", "-o", "out", "--routes", "1"),
-    "frames": ("frames", "bad.onnx", "-o", "out", "-n", "1"),
-    "sensitivity": (
-        "sensitivity", "bad.onnx", FRAMES, "-o", "out.toml", "--node-trials", "1",
-    ),
-    "search": ("search", "bad.onnx", FRAMES, "-o", "out.toml", "--max-mb", "1"),
-}  # fmt: skip
-"""Every command that opens a graph."""
-
-STRUCTURAL = ("inspect", "inspect-mapped", "plan", "lint", "unchecked")
-"""Those that start no session of onnxruntime with it."""
+}
 
 
-def graph_cases(
-    drawn: int, openers: tuple[str, ...] = STRUCTURAL, first: int = 0
-) -> Iterator[Case]:
+def graph_cases(drawn: int) -> Iterator[Case]:
     """Yield every broken graph and file, and drawn ones; the commands take turns."""
-    turn = itertools.cycle(openers)
+    turn = itertools.cycle(OPENERS)
     found = itertools.chain(
         graphs.broken_graphs(),
         graphs.broken_files(),
-        map(graphs.drawn_graph, range(first, first + drawn)),
+        map(graphs.drawn_graph, range(drawn)),
     )
     for name, content in found:
         opener = next(turn)
@@ -97,7 +75,7 @@ def frame_cases() -> Iterator[Case]:
     for name, content in frames.broken_frames():
         files = {"bad/000000.npz": content, "bad/scenes.json": index}
         yield Case(f"frame-{name}", next(turn), files)
-    drawn = texts.broken_json('{"scenes": [0, 1]}', 0, 20)
+    drawn = texts.broken_json('{"scenes": [0, 1]}', 20)
     for name, content in itertools.chain(texts.neither(), drawn):
         files = {f"bad/{each:06d}.npz": good for each in range(2)}
         files["bad/scenes.json"] = content
@@ -126,16 +104,16 @@ def _json_words(good: Path) -> dict[str, tuple[str, tuple[str, ...]]]:
     }  # fmt: skip
 
 
-def json_cases(good: Path, count: int, seed: int = 0) -> Iterator[Case]:
+def json_cases(good: Path, count: int) -> Iterator[Case]:
     """Yield broken JSON files of every kind."""
     for turn, (kind, (name, words)) in enumerate(_json_words(good).items()):
-        drawn = texts.broken_json((good / name).read_text(), seed, count)
+        drawn = texts.broken_json((good / name).read_text(), count)
         none = itertools.islice(texts.neither(), turn % 3, None, 3)
         for which, content in itertools.chain(none, drawn):
             yield Case(f"{kind}-{which}", words, {"bad.json": content})
 
 
-def toml_cases(count: int, seed: int = 0) -> Iterator[Case]:
+def toml_cases(count: int) -> Iterator[Case]:
     """Yield broken TOML files of every kind."""
     compress = ("compress", MODEL, "-o", "out.onnx", "--verify-frames", "0")
     kinds = {
@@ -149,20 +127,20 @@ def toml_cases(count: int, seed: int = 0) -> Iterator[Case]:
         ),
     }
     for turn, (kind, (text, words)) in enumerate(kinds.items()):
-        drawn = texts.broken_toml(text, seed, count)
+        drawn = texts.broken_toml(text, count)
         none = itertools.islice(texts.neither(), turn % 2, None, 2)
         beside = {"overrides.toml": OVERRIDES.encode()} if kind == "recipe" else {}
         for which, content in itertools.chain(none, drawn):
             yield Case(f"{kind}-{which}", words, {**beside, "bad.toml": content})
 
 
-def result_cases(good: Path, count: int, seed: int = 0) -> Iterator[Case]:
+def result_cases(good: Path, count: int) -> Iterator[Case]:
     """Yield folders of results with a broken manifest or route."""
     files = {"evaluation.json": "evaluation.json", "routes/r1.json": "routes/r1.json"}
     whole = {f"bad/{name}": (good / "results" / name).read_bytes() for name in files}
     for name in files:
         text = whole[f"bad/{name}"].decode()
-        drawn = texts.broken_json(text, seed, count)
+        drawn = texts.broken_json(text, count)
         for which, content in itertools.chain(texts.neither(), drawn):
             changed = {**whole, f"bad/{name}": content}
             yield Case(f"results-{name}-{which}", ("score", "bad"), changed)
@@ -190,18 +168,14 @@ def session_cases() -> Iterator[Case]:
     """Yield names that are not UTF-8, which onnxruntime repeats in its messages."""
     content = graphs.seed_graph().SerializeToString()
     broken = content.replace(b"memory_out", b"memo\xb7y_out")
-    for opener in ("evaluate", "compare", "profile", "calibrate"):
-        yield Case(f"{opener}-utf-8", OPENERS[opener], {"bad.onnx": broken})
+    for runner, words in RUNNERS.items():
+        yield Case(f"{runner}-utf-8", words, {"bad.onnx": broken})
 
 
 def output_cases() -> Iterator[Case]:
     """Yield every command that writes, its output no name of a file."""
-    for name in ("", ".", "..", "/", "../good", "no/such/x", "a" * 300):
-        yield from _outputs(name)
-
-
-def _outputs(name: str) -> Iterator[Case]:
-    for words in (
+    names = ("", ".", "..", "/", "../good", "no/such/x", "a" * 300)
+    commands = (
         ("compress", MODEL, "-r", "exact"),
         ("calibrate", MODEL, FRAMES),
         ("plan", MODEL),
@@ -211,5 +185,6 @@ def _outputs(name: str) -> Iterator[Case]:
         ("frames", MODEL),
         ("evaluate", MODEL, "--routes", "1"),
         ("study", "../good/map.toml"),
-    ):
+    )
+    for name, words in itertools.product(names, commands):
         yield Case(f"output-{words[0]}-{name[:20]}", (*words, "-o", name), {})

@@ -7,9 +7,9 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from tests.fuzz.texts import HUGE, MARKUP
+
 Fault = Callable[[onnx.ModelProto], object]
-HUGE = "9" * 5000
-MARKUP = "[red]a[/]b\x1b[31m[/nope]\n<b>|\u202e"
 
 
 def _node(*words: Any, **attributes: Any) -> onnx.NodeProto:
@@ -120,6 +120,23 @@ def _type(name: str, change: Callable[[onnx.TypeProto], object]) -> Fault:
     return fault
 
 
+def _dim(field: str, value: object) -> Fault:
+    return _type("image", lambda t: setattr(t.tensor_type.shape.dim[0], field, value))
+
+
+def _kind(value: int) -> Fault:
+    return _type("image", lambda t: setattr(t.tensor_type, "elem_type", value))
+
+
+def _tokens(*shape: int) -> Fault:
+    tensor = numpy_helper.from_array(np.array(shape), "tokens")
+    return lambda m: m.graph.initializer[0].CopyFrom(tensor)
+
+
+def _first(field: str, value: object) -> Fault:
+    return lambda m: setattr(m.graph.node[0].attribute[0], field, value)
+
+
 def _attribute(node: str, **values: Any) -> Fault:
     def fault(m: onnx.ModelProto) -> None:
         found = next(each for each in m.graph.node if each.name == node)
@@ -215,10 +232,10 @@ FAULTS: dict[str, Fault] = {
     "external-offset-negative": _external("offset", "-8"),
     "external-length-negative": _external("length", "-432"),
     "input-untyped": lambda m: m.graph.input[0].ClearField("type"),
-    "input-type-0": _type("image", lambda t: setattr(t.tensor_type, "elem_type", 0)),
-    "input-type-99": _type("image", lambda t: setattr(t.tensor_type, "elem_type", 99)),
-    "input-string": _type("image", lambda t: setattr(t.tensor_type, "elem_type", 8)),
-    "input-double": _type("image", lambda t: setattr(t.tensor_type, "elem_type", 11)),
+    "input-type-0": _kind(0),
+    "input-type-99": _kind(99),
+    "input-string": _kind(8),
+    "input-double": _kind(11),
     "input-shapeless": _type("image", lambda t: t.tensor_type.ClearField("shape")),
     "input-sequence": _type("image", lambda t: t.sequence_type.elem_type.SetInParent()),
     "input-optional": _type("image", lambda t: t.optional_type.elem_type.SetInParent()),
@@ -231,21 +248,11 @@ FAULTS: dict[str, Fault] = {
     "output-other-shape": _type(
         "y", lambda t: setattr(t.tensor_type.shape.dim[1], "dim_value", 77)
     ),
-    "dim-negative": _type(
-        "image", lambda t: setattr(t.tensor_type.shape.dim[0], "dim_value", -3)
-    ),
-    "dim-huge": _type(
-        "image", lambda t: setattr(t.tensor_type.shape.dim[0], "dim_value", 2**62)
-    ),
-    "dim-zero": _type(
-        "image", lambda t: setattr(t.tensor_type.shape.dim[0], "dim_value", 0)
-    ),
-    "dim-markup": _type(
-        "image", lambda t: setattr(t.tensor_type.shape.dim[0], "dim_param", MARKUP)
-    ),
-    "dim-open": _type(
-        "image", lambda t: setattr(t.tensor_type.shape.dim[0], "dim_param", "batch")
-    ),
+    "dim-negative": _dim("dim_value", -3),
+    "dim-huge": _dim("dim_value", 2**62),
+    "dim-zero": _dim("dim_value", 0),
+    "dim-markup": _dim("dim_param", MARKUP),
+    "dim-open": _dim("dim_param", "batch"),
     "perm-wrong": _attribute("/head/Transpose", perm=[0, 7, -9]),
     "perm-short": _attribute("/head/Transpose", perm=[0]),
     "perm-word": _attribute("/head/Transpose", perm="word"),
@@ -261,18 +268,12 @@ FAULTS: dict[str, Fault] = {
     "attribute-twice": lambda m: m.graph.node[0].attribute.append(
         m.graph.node[0].attribute[0]
     ),
-    "attribute-untyped": lambda m: setattr(m.graph.node[0].attribute[0], "type", 0),
-    "attribute-of-type-99": lambda m: setattr(m.graph.node[0].attribute[0], "type", 9),
-    "attribute-nameless": lambda m: setattr(m.graph.node[0].attribute[0], "name", ""),
-    "attribute-refers": lambda m: setattr(
-        m.graph.node[0].attribute[0], "ref_attr_name", "outer"
-    ),
-    "reshape-impossible": lambda m: m.graph.initializer[0].CopyFrom(
-        numpy_helper.from_array(np.array([7, -1, -1]), "tokens")
-    ),
-    "reshape-huge": lambda m: m.graph.initializer[0].CopyFrom(
-        numpy_helper.from_array(np.array([2**40, 2**40, 1]), "tokens")
-    ),
+    "attribute-untyped": _first("type", 0),
+    "attribute-of-type-99": _first("type", 9),
+    "attribute-nameless": _first("name", ""),
+    "attribute-refers": _first("ref_attr_name", "outer"),
+    "reshape-impossible": _tokens(7, -1, -1),
+    "reshape-huge": _tokens(2**40, 2**40, 1),
     "domain-unknown": _each_node(lambda n: setattr(n, "domain", "nobody.knows")),
     "domain-markup": _each_node(lambda n: setattr(n, "domain", MARKUP)),
     "op-markup": lambda m: setattr(m.graph.node[1], "op_type", MARKUP),

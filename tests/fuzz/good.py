@@ -7,6 +7,7 @@ from pathlib import Path
 
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import load_routes, save_routes
+from tests.frames import record
 from tests.fuzz import frames, graphs
 from tests.metrics.drives import cruise, drive
 
@@ -86,7 +87,7 @@ def write_good(folder: Path, command: Command) -> None:
     folder.mkdir()
     model = folder / "model.onnx"
     model.write_bytes(graphs.seed_graph().SerializeToString())
-    write_recording(folder / "frames", frames.npz(**frames.GOOD))
+    record(folder / "frames", [frames.GOOD] * 2)
     for name, text in {"map": MAP, "overrides": OVERRIDES, "adapter": ADAPTER}.items():
         (folder / f"{name}.toml").write_text(text)
     recorded = (model, folder / "frames", "-o")
@@ -101,19 +102,11 @@ def write_good(folder: Path, command: Command) -> None:
     write_results(folder / "results", drive(driven=cruise()))
 
 
-def write_recording(folder: Path, first: bytes) -> None:
-    """Write a recording of two frames, the first as it is given."""
-    folder.mkdir()
-    (folder / "000000.npz").write_bytes(first)
-    (folder / "000001.npz").write_bytes(frames.npz(**frames.GOOD))
-    (folder / "scenes.json").write_text('{"scenes": [0]}')
-
-
 def write_results(folder: Path, episode: Episode) -> None:
     """Write a folder of results of one route."""
     (folder / "routes").mkdir(parents=True)
     made_by = {"routes": [episode.route], "set_size": 1, "version": "1"}
     (folder / "evaluation.json").write_text(json.dumps(made_by))
-    seal = hashlib.sha256(json.dumps(made_by, sort_keys=True).encode()).hexdigest()
-    record = {"fingerprint": seal, "episode": episode.to_json()}
+    digest = hashlib.sha256(json.dumps(made_by, sort_keys=True).encode()).hexdigest()
+    record = {"fingerprint": digest, "episode": episode.to_json()}
     (folder / "routes" / f"{episode.route}.json").write_text(json.dumps(record))

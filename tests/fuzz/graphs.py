@@ -10,7 +10,8 @@ import onnx.parser
 from google.protobuf.message import Message
 from onnx import numpy_helper
 
-from tests.fuzz.faults import FAULTS, MARKUP
+from tests.fuzz.faults import FAULTS
+from tests.fuzz.texts import MARKUP
 
 SEED_TEXT = """
 <ir_version: 9, opset_import: ["" : 17, "own" : 1]>
@@ -57,12 +58,6 @@ def seed_graph() -> onnx.ModelProto:
 def branch_graph() -> onnx.ModelProto:
     """An If whose branches read a value of the graph around them."""
     return onnx.parser.parse_model(BRANCH_TEXT)
-
-
-def relu_graph() -> onnx.ModelProto:
-    """One node."""
-    text = '<ir_version: 9, opset_import: ["" : 17]> m (float[1,4] camera) => '
-    return onnx.parser.parse_model(text + "(float[1,4] plan) { plan = Relu(camera) }")
 
 
 def broken_graphs() -> Iterator[tuple[str, bytes]]:

@@ -27,7 +27,7 @@ PLACE = "\ue000"
 """Stands in a text where a value is to be written."""
 
 
-def neither(opening: str = "[") -> Iterator[tuple[str, bytes]]:
+def neither() -> Iterator[tuple[str, bytes]]:
     """Yield files that are no text of any format."""
     yield from {
         "empty": b"",
@@ -70,21 +70,21 @@ def _holes(value: Any) -> Iterator[Any]:
         yield [*value, value[0]]
 
 
-def broken_json(text: str, seed: int, count: int) -> Iterator[tuple[str, bytes]]:
+def broken_json(text: str, count: int) -> Iterator[tuple[str, bytes]]:
     """Draw documents that differ from a good one in one value, key or byte."""
-    draw = random.Random(seed)
+    draw = random.Random(0)
     holes = [hole.replace('"\\ue000"', PLACE) for hole in places(json.loads(text))]
     for each in range(count):
         hole, bad = draw.choice(holes), draw.choice(BAD_JSON)
-        yield f"json-{seed}-{each}", _bitten(hole.replace(PLACE, bad, 1), draw)
+        yield f"json-{each}", _bitten(hole.replace(PLACE, bad, 1), draw)
 
 
 _VALUE = re.compile(r"(?<== ).+$|(?<=\[)[\w.-]+(?=\])", re.MULTILINE)
 
 
-def broken_toml(text: str, seed: int, count: int) -> Iterator[tuple[str, bytes]]:
+def broken_toml(text: str, count: int) -> Iterator[tuple[str, bytes]]:
     """Draw files that differ from a good one in one value, line or byte."""
-    draw = random.Random(seed)
+    draw = random.Random(0)
     values = list(_VALUE.finditer(text))
     changes: tuple[Callable[[], str], ...] = (
         lambda: _at(text, draw.choice(values), draw.choice(BAD_TOML)),
@@ -97,7 +97,7 @@ def broken_toml(text: str, seed: int, count: int) -> Iterator[tuple[str, bytes]]
     )
     for each in range(count):
         changed = draw.choice(changes)()
-        yield f"toml-{seed}-{each}", _bitten(changed, draw)
+        yield f"toml-{each}", _bitten(changed, draw)
 
 
 def _at(text: str, found: re.Match[str], bad: str) -> str:

@@ -12,8 +12,7 @@ import pytest
 from me2e_compress import drafts, graph
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.workflows import compress_result
-from tests.cli.conftest import Command
-from tests.cli.test_kills import contents
+from tests.cli.conftest import Command, contents
 
 COMPRESS = ("compress", "in.onnx", "-o", "out.onnx", "--passes")
 

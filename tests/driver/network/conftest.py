@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from driver.network.stack import Highway
-from driver.network.to_onnx import write
+from driver.network.stack import Highway, write_onnx
 
 
 @pytest.fixture(scope="package")
@@ -22,4 +21,4 @@ def model() -> Highway:
 
 @pytest.fixture(scope="package")
 def exported(model: Highway, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(model, tmp_path_factory.mktemp("highway") / "highway.onnx")
+    return write_onnx(model, tmp_path_factory.mktemp("highway") / "highway.onnx")

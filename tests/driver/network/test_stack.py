@@ -11,7 +11,6 @@ import torch
 from driver.network.bev_encoder import RECORD, motion_of
 from driver.network.config import HighwayConfig
 from driver.network.stack import Highway, stood_lately
-from driver.network.to_onnx import parameters
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.runtime.session import Session
 from me2e_compress.simulator.cameras import CameraRig
@@ -51,17 +50,13 @@ def test_onnx_answers_as_torch_does(model: Highway, exported: Path, seed: int) -
         assert found[name] == pytest.approx(tensor.numpy(), abs=2e-4), name
 
 
-def test_the_file_has_standard_operators_of_opset_17(exported: Path) -> None:
+def test_the_file_is_small_and_standard_and_keeps_the_policy_contract(
+    model: Highway, exported: Path
+) -> None:
     graph = onnx.load(exported)
     assert [(e.domain, e.version) for e in graph.opset_import] == [("", 17)]
     assert exported.stat().st_size < 20e6
-
-
-def test_it_has_one_to_three_million_parameters(model: Highway) -> None:
-    assert 1e6 < parameters(model) < 3e6
-
-
-def test_it_keeps_the_policy_contract(exported: Path) -> None:
+    assert 1e6 < sum(p.numel() for p in model.parameters()) < 3e6
     policy = OnnxPolicy.open(exported)
     assert policy.image_size == (96, 160)
     assert policy.recurrent == {
@@ -98,27 +93,28 @@ def test_memory_knows_how_old_it_is(model: Highway, elapsed_s: float) -> None:
     assert torch.allclose(age, torch.full_like(age, elapsed_s), atol=1e-5)
 
 
-def test_memory_follows_the_ground_when_the_ego_moves(model: Highway) -> None:
-    encoder = model.bev_encoder
+@pytest.mark.parametrize(
+    ("seen", "turned_deg", "moved_m", "found"),
+    [
+        ((10, 12), 0.0, 4.0, (12, 12)),  # 26 to 28 m ahead, then 4 m nearer
+        ((18, 12), 90.0, 0.0, (24, 17)),  # straight ahead, then to the right
+    ],
+)
+def test_memory_follows_the_ground_when_the_ego_moves_or_turns(
+    model: Highway,
+    seen: tuple[int, int],
+    turned_deg: float,
+    moved_m: float,
+    found: tuple[int, int],
+) -> None:
     memory = torch.zeros(1, 32, 24, CELL)
-    memory[0, 10, 12] = 1.0  # 26 to 28 m ahead
+    memory[0, *seen] = 1.0
     bus = torch.zeros(1, 18)
-    bus[0, 1] = 4.0  # 4 m north
-    bus[0, 16] = torch.pi / 2  # heading north, so 4 m forward
-    recalled = encoder.recall(memory.flatten(1, 2), motion_of(bus, torch.ones(1)))
-    assert recalled[0, 0].argmax() == 12 * 24 + 12
-
-
-def test_memory_turns_with_the_ego(model: Highway) -> None:
-    encoder = model.bev_encoder
-    memory = torch.zeros(1, 32, 24, CELL)
-    memory[0, 18, 12] = 1.0  # x 10 to 12, y -2 to 0: straight ahead
-    bus = torch.zeros(1, 18)
-    bus[0, 17] = 90.0
+    bus[0, 1], bus[0, 17] = moved_m, turned_deg  # north, where it is heading now
     bus[0, 16] = torch.pi / 2
-    recalled = encoder.recall(memory.flatten(1, 2), motion_of(bus, torch.ones(1)))
-    row, column = divmod(int(recalled[0, 0].argmax()), 24)
-    assert (48 - 2 * row - 1, 24 - 2 * column - 1) == (-1, -11)
+    motion = motion_of(bus, torch.ones(1))
+    recalled = model.bev_encoder.recall(memory.flatten(1, 2), motion)
+    assert divmod(int(recalled[0, 0].argmax()), 24) == found
 
 
 def test_standing_is_remembered_and_fades() -> None:

@@ -1,57 +1,51 @@
-"""``python -m tests.fuzz.exact``: judge many drawn graphs and print a table."""
+"""``python -m tests.fuzz.exact``: judge many drawn graphs, and print what is bad."""
 
 import argparse
+import concurrent.futures
+import multiprocessing
 import sys
-from pathlib import Path
-from typing import get_args
 
-from tests.fuzz.exact.judging import Kind
-from tests.fuzz.exact.nightly import Tally, run
+from tests.fuzz.exact import int8
+from tests.fuzz.exact.drawing import drawing
+from tests.fuzz.exact.judging import judged, report
+from tests.fuzz.exact.pipelines import LONG, SLOW, some_for
 
-KINDS: tuple[str, ...] = get_args(Kind)
+INT8_EVERY, SLOW_EVERY = 10, 200
+"""One graph of so many is quantized too, or given to passes that start a process."""
+TOLD_EVERY = 1000
+
+
+def findings(seed: int) -> list[str]:
+    """Judge one graph; tell what no pass may do to it."""
+    model = drawing(seed).model
+    found = list(judged(seed, model, some_for(model, seed, LONG)))
+    if seed % SLOW_EVERY == 0:
+        found += judged(seed, model, SLOW)
+    if seed % INT8_EVERY == 0:
+        found += int8.judged(seed, model)
+    return [report(seed, each) for each in found if each.is_bad]
 
 
 def main() -> int:
-    """Run, print; 1 if a pass was found to do what no pass may."""
+    """Judge a range of seeds on some processes; 1 if something is bad."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.exact")
     parser.add_argument("--graphs", type=int, default=20000)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("out/nightly"))
     given = parser.parse_args()
-    path = given.out / "exact.jsonl"
-    total = run(path, given.first, given.graphs, given.jobs, show_chunk)
-    show(total)
-    return int(total.bad > 0)
-
-
-def show_chunk(chunk: Tally, total: Tally) -> None:
-    """Print the findings of a chunk as they come."""
-    for each in chunk.findings:
-        head = f"{each['kind']}: seed {each['seed']}, {each['label']}: {each['detail']}"
-        print(head[:300])  # noqa: T201
-        if each["text"]:
-            print(each["text"])  # noqa: T201
-    line = f"{total.graphs} graphs, {total.bad} bad"
-    print(line, file=sys.stderr)  # noqa: T201
-
-
-def show(total: Tally) -> None:
-    """Print how each pipeline ended, and on how many graphs each pass acted."""
-    widest = 60
-    lines = [f"{total.graphs} graphs", _row("", widest, ["runs", *KINDS])]
-    for label, row in total.kinds.items():
-        counts = [sum(row.values()), *(row.get(kind, 0) for kind in KINDS)]
-        lines.append(_row(label, widest, [str(each) for each in counts]))
-    lines.append("graphs on which each pass changed something:")
-    lines += [f"  {name}: {count}" for name, count in sorted(total.changed.items())]
-    lines.append("refusals:")
-    lines += [f"  {count} x {said}" for said, count in sorted(total.refusals.items())]
-    print("\n".join(lines))  # noqa: T201
-
-
-def _row(label: str, widest: int, cells: list[str]) -> str:
-    return f"{label[:widest]:{widest}} " + " ".join(f"{cell:>14}" for cell in cells)
+    seeds, bad = range(given.first, given.first + given.graphs), 0
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(given.jobs, context) as pool:
+        for seed, told in zip(
+            seeds, pool.map(findings, seeds, chunksize=25), strict=True
+        ):
+            bad += len(told)
+            for text in told:
+                print(text, flush=True)  # noqa: T201
+            if (seed + 1) % TOLD_EVERY == 0:
+                line = f"up to seed {seed}: {bad} bad"
+                print(line, file=sys.stderr, flush=True)  # noqa: T201
+    return int(bad > 0)
 
 
 if __name__ == "__main__":

@@ -8,14 +8,16 @@ import numpy.typing as npt
 import onnx
 from onnx import helper, numpy_helper
 
-from tests.fuzz.exact.dims import Dim, elements, is_static
 from tests.fuzz.exact.values import (
     LARGEST,
     Array,
     Attributes,
+    Dim,
     Shared,
     TooLargeError,
     Val,
+    elements,
+    is_static,
     port,
 )
 

@@ -10,7 +10,9 @@ close the numbers are is a matter of fidelity, not of this test.
 
 import dataclasses
 import random
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,15 +22,13 @@ import onnx_ir as ir
 from onnx import numpy_helper
 
 from me2e_compress import recipe
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import Me2eError, PassError, VerificationError
 from me2e_compress.manager.pass_manager import PassManager
 from me2e_compress.passes import Context
-from me2e_compress.runtime.frames import Frame
-from tests.fuzz.exact.findings import Judged
-from tests.fuzz.exact.judging import Case, Verdict
-from tests.fuzz.exact.module_map import MODULES, modules_of
-from tests.fuzz.exact.running import Arrays, RefusedError, Runner, drawn_inputs
-from tests.fuzz.exact.stripping import StrippingError, stripped
+from tests.frames import record
+from tests.fuzz.exact.judging import MODULES, Case, Verdict, modules_of
+from tests.fuzz.exact.running import RefusedError, Runner, drawn_inputs
 
 METHODS = ("max-min", "moving-average:0.5", "percentile:99.9", "mse", "entropy")
 SCHEMES = ("full", "full", "feature-ext", "prediction")
@@ -39,33 +39,8 @@ EACH = 2
 FRAMES = 2
 
 
-@dataclasses.dataclass(frozen=True)
-class Held:
-    """A recording in memory."""
-
-    arrays: Sequence[Arrays]
-    fingerprint: str
-
-    @property
-    def scenes(self) -> Sequence[int]:
-        return (0,)
-
-    @property
-    def places(self) -> Sequence[int]:
-        return range(len(self.arrays))
-
-    def __len__(self) -> int:
-        return len(self.arrays)
-
-    def __getitem__(self, index: int) -> Frame:
-        return Frame(index, index == 0, dict(self.arrays[index]))
-
-    def __iter__(self) -> Iterator[Frame]:
-        return (self[index] for index in range(len(self)))
-
-
-def ways(seed: int, *, named: bool) -> Iterator[tuple[str, str]]:
-    """Draw how a graph is quantized: a label and a pipeline, one for each target.
+def ways(seed: int, *, named: bool) -> Iterator[str]:
+    """Draw how a graph is quantized: pipelines for each target.
 
     Args:
         seed: of the drawing.
@@ -85,18 +60,18 @@ def ways(seed: int, *, named: bool) -> Iterator[tuple[str, str]]:
             text = f"quantize-int8{{{given}}}"
             if target == "lowered":
                 text += ", lower-int8"
-            yield f"int8 {target}", text
+            yield text
 
 
-def judged(seed: int, model: onnx.ModelProto) -> Iterator[Judged]:
+def judged(seed: int, model: onnx.ModelProto) -> Iterator[Verdict]:
     """Judge a drawn graph by all of these."""
     try:
         case = Case(model, seed)
     except RefusedError:
         return
     named = modules_of(model) is MODULES
-    for label, text in ways(seed, named=named):
-        yield Judged(label, judge_int8(case, text, seed))
+    for text in ways(seed, named=named):
+        yield judge_int8(case, text, seed)
 
 
 def judge_int8(case: Case, pipeline: str, seed: int) -> Verdict:
@@ -104,12 +79,12 @@ def judge_int8(case: Case, pipeline: str, seed: int) -> Verdict:
     runner = case.answers.runner
     size = case.sizes[0]
     fed = [drawn_inputs(runner, seed + turn, size) for turn in range(FRAMES)]
-    context = dataclasses.replace(
-        case.context, frames=Held(fed, f"drawn-{seed}-{size}"), measured={}
-    )
     try:
-        base = _run("fold-constants", case.imported, context)
-        after = _run(pipeline, base, context)
+        with tempfile.TemporaryDirectory(prefix="int8-") as folder:
+            frames = CalibrationSet(record(Path(folder, "frames"), fed))
+            context = dataclasses.replace(case.context, frames=frames, measured={})
+            base = _run("fold-constants", case.imported, context)
+            after = _run(pipeline, base, context)
     except (PassError, VerificationError) as error:
         return Verdict("crash", pipeline, str(error))
     except Me2eError as error:
@@ -191,3 +166,85 @@ def _unlike(
         if whole and not np.isfinite(other).all():
             return f"{name} is no longer finite"
     return ""
+
+
+HALF = 0.5 * (1 + 1e-4)
+"""How many steps a weight may be off; its scale is a rounded number itself."""
+
+
+class StrippingError(Exception):
+    """A weight is none of the float graph's, to half a step."""
+
+
+def stripped(
+    model: onnx.ModelProto, weights: Sequence[npt.NDArray[Any]]
+) -> onnx.ModelProto:
+    """Take every QuantizeLinear and DequantizeLinear out.
+
+    Args:
+        model: quantized for TensorRT.
+        weights: those of the float graph.
+
+    Raises:
+        StrippingError: a weight is none of these.
+    """
+    copy = onnx.ModelProto.FromString(model.SerializeToString())
+    held = {each.name: numpy_helper.to_array(each) for each in copy.graph.initializer}
+    source = {
+        node.output[0]: node.input[0]
+        for node in copy.graph.node
+        if node.op_type == "QuantizeLinear"
+    }
+    for node in copy.graph.node:
+        if node.op_type != "DequantizeLinear":
+            continue
+        if node.input[0] in source:
+            _become(node, "Identity", [source[node.input[0]]])
+            continue
+        name = f"{node.output[0]}__float"
+        original = _original(node, held, weights)
+        copy.graph.initializer.append(numpy_helper.from_array(original, name))
+        _become(node, "Identity", [name])
+    kept = [node for node in copy.graph.node if node.op_type != "QuantizeLinear"]
+    del copy.graph.node[:]
+    copy.graph.node.extend(kept)
+    return copy
+
+
+def _become(node: onnx.NodeProto, kind: str, inputs: Sequence[str]) -> None:
+    node.op_type = kind
+    del node.input[:]
+    node.input.extend(inputs)
+    del node.attribute[:]
+
+
+def _original(
+    node: onnx.NodeProto,
+    held: Mapping[str, npt.NDArray[Any]],
+    weights: Sequence[npt.NDArray[Any]],
+) -> npt.NDArray[Any]:
+    """Find the float weight that an integer one stands for."""
+    if node.input[0] not in held:
+        raise StrippingError(f"{node.output[0]} dequantizes what nobody quantized")
+    integers, scale = held[node.input[0]], held[node.input[1]]
+    axis = next((each.i for each in node.attribute if each.name == "axis"), 1)
+    if scale.ndim == 1 and integers.ndim:
+        shape = [1] * integers.ndim
+        shape[axis] = -1
+        scale = scale.reshape(shape)
+    found = integers.astype(np.float64) * scale.astype(np.float64)
+    best = np.inf
+    for weight in weights:
+        for each in (weight, weight.T):
+            if each.dtype.kind != "f" or each.size != found.size:
+                continue
+            if each.squeeze().shape != found.squeeze().shape:
+                continue
+            array = each.reshape(found.shape)
+            off = np.abs(array - found) / scale
+            if off.size == 0 or off.max() <= HALF:
+                return np.asarray(array, scale.dtype)
+            best = min(best, float(off.max()))
+    raise StrippingError(
+        f"{node.output[0]}: a weight {list(integers.shape)} is {best:.3g} steps off"
+    )

@@ -9,22 +9,25 @@ import dataclasses
 import functools
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
 import onnx
+import onnx.printer
 import onnx_ir as ir
 
 from me2e_compress import graph, recipe
 from me2e_compress.errors import Me2eError, PassError, VerificationError
 from me2e_compress.manager.pass_manager import PassManager
 from me2e_compress.manager.report import Report
+from me2e_compress.manager.reproducer import shrink
+from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context, Pass
-from tests.fuzz.exact.comparing import Answers
-from tests.fuzz.exact.module_map import modules_of
-from tests.fuzz.exact.prices import PREFIX, dear_work
+from tests.fuzz.exact.drawing import drawing
+from tests.fuzz.exact.pipelines import PREFIX, dear_work
 from tests.fuzz.exact.running import (
+    Answers,
     RefusedError,
     Runner,
     drawn_inputs,
@@ -38,6 +41,37 @@ Kind = Literal[
 
 BAD: tuple[Kind, ...] = ("wrong", "crash", "does-not-load", "changes-again")
 """What a pass must never be found to do."""
+
+
+MODULES = ModuleMap.parse(
+    """
+    [modules.backbone]
+    role = "feature"
+    optional = ["img_backbone"]
+    [modules.neck]
+    role = "feature"
+    optional = ["img_neck"]
+    [modules.bev_encoder]
+    role = "feature"
+    optional = ["pts_bbox_head.transformer.encoder"]
+    [modules.map]
+    role = "prediction"
+    optional = ["pts_bbox_head.map_decoder"]
+    [modules.motion]
+    role = "prediction"
+    optional = ["motion_head"]
+    [modules.planner]
+    role = "prediction"
+    optional = ["planning_head", "**"]
+    """,
+    "drawn",
+)
+
+
+def modules_of(model: onnx.ModelProto) -> ModuleMap:
+    """Return the map that fits a graph, of one module where nodes have no paths."""
+    named = any(node.name.startswith("/") for node in model.graph.node)
+    return MODULES if named else ModuleMap.whole()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,3 +228,33 @@ def judge(model: onnx.ModelProto, pipeline: str, seed: int = 0) -> Verdict:
     except RefusedError as error:
         return Verdict("invalid-draw", pipeline, str(error))
     return case.judge(pipeline)
+
+
+def judged(
+    seed: int, model: onnx.ModelProto, pipelines: Sequence[str]
+) -> Iterator[Verdict]:
+    """Judge a drawn graph by some pipelines."""
+    try:
+        case = Case(model, seed)
+    except RefusedError as error:
+        yield Verdict("invalid-draw", "", str(error))
+        return
+    yield from map(case.judge, pipelines)
+
+
+def shrunk(model: onnx.ModelProto, kind_of: Callable[[onnx.ModelProto], Kind]) -> str:
+    """Write, in ONNX's syntax, a part of a graph of which the verdict is the same."""
+    kind, whole = kind_of(model), ir.from_proto(model)
+    graph.infer_shapes(whole)
+    small = shrink(whole, lambda part: kind_of(ir.to_proto(part)) == kind)
+    return onnx.printer.to_text(ir.to_proto(small))
+
+
+def report(seed: int, found: Verdict) -> str:
+    """Tell a finding, with a part of the graph that shows it."""
+    whole = drawing(seed)
+    text = shrunk(whole.model, lambda part: judge(part, found.pipeline, seed).kind)
+    return (
+        f"seed {seed} ({', '.join(whole.motifs)}), pipeline {found.pipeline}\n"
+        f"{found.kind}: {found.detail}\n{text}"
+    )

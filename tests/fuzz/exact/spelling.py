@@ -5,8 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.dims import Dim, Open, Shape, broadcast, is_static, product
-from tests.fuzz.exact.values import INT64, Attributes, Val
+from tests.fuzz.exact.values import (
+    INT64,
+    Attributes,
+    Dim,
+    Open,
+    Shape,
+    Val,
+    broadcast,
+    is_static,
+    product,
+)
 
 UNARY: dict[str, tuple[int, bool]] = {
     "Abs": (11, True), "Cos": (11, True), "Elu": (11, False), "Erf": (11, False),
@@ -31,6 +40,13 @@ def unary(b: Builder, x: Val, kind: str | None = None) -> Val:
 
 def binary(b: Builder, kind: str, left: Val, right: Val) -> Val:
     return b.op(kind, [left, right], broadcast(left.shape, right.shape))
+
+
+def either_way(b: Builder, kind: str, left: Val, right: Val) -> Val:
+    """Apply an operator of two operands, at times the other way round."""
+    if kind != "Div" and b.chance(0.4):
+        left, right = right, left
+    return binary(b, kind, left, right)
 
 
 def scalar(b: Builder, value: float, rank: int | None = None) -> Val:

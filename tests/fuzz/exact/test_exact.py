@@ -2,18 +2,13 @@
 
 import collections
 
-import onnx.parser
 import pytest
 
 from me2e_compress.passes import PASSES
 from tests.fuzz.exact import int8
-from tests.fuzz.exact.drawing import draw, drawing
-from tests.fuzz.exact.findings import judged, report
-from tests.fuzz.exact.judging import Case
-from tests.fuzz.exact.pipelines import SLOW
-from tests.fuzz.exact.registry_of_motifs import MOTIFS
-from tests.fuzz.exact.rotation import some_for
-from tests.fuzz.exact.texts import as_text
+from tests.fuzz.exact.drawing import MOTIFS, draw, drawing
+from tests.fuzz.exact.judging import Case, judged, report
+from tests.fuzz.exact.pipelines import SLOW, some_for
 
 FIRST, GRAPHS, PARTS = 1000, 300, 4
 LEAST_MOTIF, LEAST_PASS = 3, 3
@@ -28,11 +23,11 @@ def test_exact_passes_keep_what_drawn_graphs_compute(part: int) -> None:
     seen = collections.Counter[str]()
     size = GRAPHS // PARTS
     for seed in range(FIRST + part * size, FIRST + (part + 1) * size):
-        drawn = drawing(seed)
-        for each in judged(seed, drawn, some_for(drawn.model, seed)):
-            seen[each.verdict.kind] += 1
-            if each.verdict.is_bad:
-                pytest.fail(report(seed, each.verdict))
+        model = draw(seed)
+        for each in judged(seed, model, some_for(model, seed)):
+            seen[each.kind] += 1
+            if each.is_bad:
+                pytest.fail(report(seed, each))
     assert seen["invalid-draw"] <= INVALID * size
     assert seen["right"] > size
     assert seen["unstable"] <= 0.01 * seen.total()
@@ -59,11 +54,11 @@ def test_every_exact_pass_finds_something_to_do() -> None:
         missing = {name for name in wanted if seen[name] < LEAST_PASS}
         if not missing:
             break
-        drawn = drawing(seed)
-        case = Case(drawn.model, seed)
-        for each in some_for(drawn.model, seed):
-            if missing & {word.partition("{")[0] for word in each.text.split(", ")}:
-                changes = case.judge(each.text).changes
+        model = draw(seed)
+        case = Case(model, seed)
+        for text in some_for(model, seed):
+            if missing & {word.partition("{")[0] for word in text.split(", ")}:
+                changes = case.judge(text).changes
                 seen.update({name for name, count in changes if count})
     assert not missing, seen
 
@@ -73,15 +68,8 @@ def test_a_seed_gives_the_same_bytes() -> None:
         assert draw(seed).SerializeToString() == draw(seed).SerializeToString()
 
 
-def test_findings_are_text_that_can_be_read_again() -> None:
-    for seed in range(0, 120, 3):
-        model = draw(seed)
-        again = onnx.parser.parse_model(as_text(model))
-        kinds = [[node.op_type for node in each.graph.node] for each in (model, again)]
-        assert kinds[0] == kinds[1]
-
-
-@pytest.mark.parametrize("seed", [0, 7, 14, 21])
+@pytest.mark.parametrize("seed", [17, 58, 85, 154])
 def test_int8_keeps_the_graph(seed: int) -> None:
+    """Of graphs that have something to quantize, each way."""
     for found in int8.judged(seed, draw(seed)):
-        assert not found.verdict.is_bad, found.verdict
+        assert found.kind == "right", found

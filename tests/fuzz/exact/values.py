@@ -1,17 +1,16 @@
-"""Values of a drawn graph, and what holds for all of it."""
+"""Values of a drawn graph and their shapes, one dimension of which may be open."""
 
 import dataclasses
 import itertools
+import math
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import onnx
 from onnx import helper
-
-from tests.fuzz.exact.dims import Dim, Open, Shape
 
 Array: TypeAlias = npt.NDArray[Any]
 Attributes: TypeAlias = Mapping[str, Any]
@@ -33,6 +32,63 @@ LARGEST = 1 << 18
 
 class TooLargeError(Exception):
     """A motif would make a value that is too large; what it made so far stays."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Open:
+    """A multiple of the batch, whose size only the inputs tell."""
+
+    times: int = 1
+
+
+Dim: TypeAlias = int | Open
+Shape: TypeAlias = tuple[Dim, ...]
+
+
+def product(dims: Iterable[Dim]) -> Dim:
+    """Multiply dimensions, of which at most one is open."""
+    listed = list(dims)
+    factor = math.prod(each for each in listed if isinstance(each, int))
+    opened = [each for each in listed if isinstance(each, Open)]
+    if not opened:
+        return factor
+    (one,) = opened
+    return Open(one.times * factor)
+
+
+def is_static(shape: Iterable[Dim]) -> bool:
+    return all(isinstance(each, int) for each in shape)
+
+
+def sizes(shape: Iterable[Dim]) -> tuple[int, ...]:
+    """Return a shape that has no open dimension."""
+    found = [each for each in shape if isinstance(each, int)]
+    assert is_static(shape)
+    return tuple(found)
+
+
+def elements(shape: Sequence[Dim], batch: int = 3) -> int:
+    """Count the elements at some size of the batch."""
+    return math.prod(concrete(shape, batch))
+
+
+def concrete(shape: Iterable[Dim], batch: int) -> tuple[int, ...]:
+    """Put a size in the place of the batch."""
+    return tuple(
+        each if isinstance(each, int) else each.times * batch for each in shape
+    )
+
+
+def broadcast(*shapes: Sequence[Dim]) -> Shape:
+    """Return the shape that these are broadcast to."""
+    rank = max(map(len, shapes))
+    result: list[Dim] = []
+    for axis in range(-rank, 0):
+        found = {shape[axis] for shape in shapes if len(shape) >= -axis} - {1}
+        if len(found) > 1:
+            raise ValueError(f"{shapes} are not broadcast")
+        result.append(next(iter(found), 1))
+    return tuple(result)
 
 
 @dataclasses.dataclass(frozen=True)

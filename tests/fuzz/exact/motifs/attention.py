@@ -7,9 +7,8 @@ import numpy as np
 
 from tests.fuzz.exact import spelling as sp
 from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.dims import Dim, product
 from tests.fuzz.exact.motifs.linear import layer
-from tests.fuzz.exact.values import BOOL, Val
+from tests.fuzz.exact.values import BOOL, Dim, Val, product
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,8 +60,7 @@ def _scale(b: Builder, x: Val, s: _Sizes) -> Val:
     kind = b.rng.choice(("Mul", "Div"))
     root = math.sqrt(s.depth) if kind == "Div" else 1 / math.sqrt(s.depth)
     factor = sp.scalar(b, root)
-    flip = kind == "Mul" and b.chance(0.3)
-    return sp.binary(b, kind, *([factor, x] if flip else [x, factor]))
+    return sp.either_way(b, kind, x, factor)
 
 
 def _source(b: Builder, s: _Sizes, count: int, width: int) -> Val:
@@ -164,8 +162,8 @@ def shared_operand(b: Builder) -> None:
         own = sp.expand(b, shared, (*whole, s.wide))
     both = own
     if own.name != shared.name and b.chance(0.85):
-        sides = [shared, own] if b.chance(0.5) else [own, shared]
-        both = sp.binary(b, b.rng.choice(("Add", "Add", "Sub")), *sides)
+        kind = b.rng.choice(("Add", "Add", "Sub"))
+        both = sp.either_way(b, kind, shared, own)
     cut = _merged_heads if s.merged else _heads
     last = b.chance(0.5)
     right = cut(b, both, s, last=last)

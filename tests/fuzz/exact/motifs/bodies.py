@@ -8,9 +8,8 @@ from onnx import helper
 
 from tests.fuzz.exact import spelling as sp
 from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.dims import is_static
 from tests.fuzz.exact.motifs import linear, norms, oddities, rows, shape_arithmetic
-from tests.fuzz.exact.values import BOOL, INT64, Val
+from tests.fuzz.exact.values import BOOL, INT64, Val, is_static
 
 INNER: tuple[Callable[[Builder], None], ...] = (
     linear.one_layer, linear.layers_in_a_row, linear.same_source, rows.repeated_rows,
@@ -110,26 +109,6 @@ def loop(b: Builder) -> None:
     trips = b.const(np.asarray(count, np.int64))
     keep = b.const(np.asarray(True)) if b.chance(0.7) else None
     b.emit("Loop", [trips, keep, x], results, {"body": graph})
-
-
-def scan(b: Builder) -> None:
-    """A Scan over the first axis, with a state that adds up."""
-    x = b.rows(3, 3)
-    if not is_static(x.shape):
-        x = b.input((b.rng.randint(1, 4), 3, 8))
-    inner = x.shape[1:]
-    body = b.inner()
-    body.outer = tuple(each for each in body.outer if _is_plain(each))
-    state = Val(b.fresh("state"), inner, x.dtype)
-    row = Val(b.fresh("row"), inner, x.dtype)
-    body.inputs += [state, row]
-    total = sp.binary(body, "Add", state, _same_shape(body, row))
-    total = body.op("Tanh", [total], inner)
-    given = sp.unary(body, total) if b.chance(0.7) else body.op("Neg", [row], inner)
-    graph = body.graph([total, given], b.fresh("body"))
-    start = b.const(np.zeros([d for d in inner if isinstance(d, int)], b.dtype))
-    results = [Val(b.fresh("v"), inner, x.dtype), Val(b.fresh("v"), x.shape, x.dtype)]
-    b.emit("Scan", [start, x], results, {"body": graph, "num_scan_inputs": 1})
 
 
 def called(b: Builder) -> None:

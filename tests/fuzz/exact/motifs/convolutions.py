@@ -6,9 +6,8 @@ import numpy as np
 
 from tests.fuzz.exact import spelling as sp
 from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.dims import is_static, sizes
 from tests.fuzz.exact.motifs.linear import gemm
-from tests.fuzz.exact.values import Val
+from tests.fuzz.exact.values import Val, is_static, sizes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,8 +88,7 @@ def follow(b: Builder, x: Val, shared: list[Val] | None = None) -> Val:
         array = np.asarray(array * 0 + b.rng.choice((0.0, 1.0, -0.0)))
         kind = "Mul" if kind == "Div" else kind
     other = b.const(np.asarray(array, b.dtype))
-    flip = kind != "Div" and b.chance(0.3)
-    return sp.binary(b, kind, *([other, x] if flip else [x, other]))
+    return sp.either_way(b, kind, x, other)
 
 
 def _bias(b: Builder, channels: int) -> Val | None:
@@ -157,25 +155,6 @@ def shared_square(b: Builder) -> None:
         made.append(y)
 
 
-def network_head(b: Builder) -> None:
-    """Convolution, norm, activation, pooling and a classifier, as in any backbone."""
-    if b.is_double:
-        return
-    x = b.image()
-    used = kernel(b, sizes(x.shape[1:2])[0])
-    y = convolve(b, x, used, _bias(b, used.channels))
-    y = follow(b, y)
-    y = b.op("Relu", [y], y.shape)
-    if y.shape == x.shape and b.chance(0.5):
-        y = b.op("Relu", [sp.binary(b, "Add", y, x)], y.shape)
-    if b.chance(0.5):
-        y = b.op("GlobalAveragePool", [y], (*y.shape[:2], 1, 1))
-    else:
-        y = sp.reduce(b, "ReduceMean", y, [2, 3], keep=True)
-    flat = sp.flatten(b, y, 1)
-    gemm(b, flat, 5)
-
-
 def alias_of_a_weight(b: Builder) -> None:
     """A weight that an Identity gives a second name, as torch exports shared ones."""
     x = b.rows(2, 3)
@@ -186,39 +165,3 @@ def alias_of_a_weight(b: Builder) -> None:
         y = sp.binary(b, "Mul", y, sp.scalar(b, 0.5, 1))
     if b.chance(0.5):
         sp.matmul(b, y, sp.transpose(b, other, (1, 0)))
-
-
-def follow_a_layer(b: Builder) -> None:
-    """A Gemm or MatMul with channels scaled behind it."""
-    x = b.rows(2, 2)
-    y = gemm(b, x, b.rng.choice((4, 6, 8)))
-    for _ in range(b.rng.randint(1, 3)):
-        y = follow(b, y)
-
-
-def pooled(b: Builder) -> None:
-    """Pooling, padding, resizing and depth to space."""
-    if b.is_double:
-        return
-    x = b.image()
-    height, width = sizes(x.shape[2:])
-    kind = b.rng.random()
-    if kind < 0.3:
-        name = b.rng.choice(("MaxPool", "AveragePool"))
-        shape = (*x.shape[:2], height - 1, width - 1)
-        if height > 1 and width > 1:
-            b.op(name, [x], shape, {"kernel_shape": [2, 2]})
-    elif kind < 0.5:
-        b.op("GlobalAveragePool", [x], (*x.shape[:2], 1, 1))
-    elif kind < 0.75:
-        scales = b.const(np.array([1, 1, 2, 2], np.float32))
-        roi = None
-        attributes = {"mode": b.rng.choice(("nearest", "linear"))}
-        shape = (*x.shape[:2], height * 2, width * 2)
-        roi = b.const(np.zeros(0, np.float32)) if b.opset < 13 else None
-        b.op("Resize", [x, roi, scales], shape, attributes)
-    else:
-        pads = b.ints(0, 0, 1, 0, 0, 0, 0, 1)
-        value = sp.scalar(b, 0.5, 0) if b.chance(0.5) else None
-        given = [x, pads, value]
-        b.op("Pad", given, (*x.shape[:2], height + 1, width + 1))

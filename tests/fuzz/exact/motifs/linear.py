@@ -2,8 +2,7 @@
 
 from tests.fuzz.exact import spelling as sp
 from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.dims import is_static, product
-from tests.fuzz.exact.values import Val
+from tests.fuzz.exact.values import Val, is_static, product
 
 
 def layer(b: Builder, x: Val, width: int | None = None) -> Val:
@@ -26,8 +25,8 @@ def _biased(b: Builder, product_: Val) -> Val:
         return product_
     shape = b.rng.choice([(product_.width,)] * 6 + [(1, product_.width), (1,), ()])
     bias = b.weight(shape, 0.5)
-    sides = [product_, bias] if b.chance(0.6) else [bias, product_]
-    return sp.binary(b, b.rng.choice(("Add", "Add", "Add", "Sub")), *sides)
+    kind = b.rng.choice(("Add", "Add", "Add", "Sub"))
+    return sp.either_way(b, kind, product_, bias)
 
 
 def _matmul(b: Builder, x: Val, columns: int) -> Val:
@@ -118,8 +117,7 @@ def on_positions(b: Builder) -> None:
     if b.chance(0.7):
         wide = sp.binary(b, "Add", wide, b.weight((x.width,), 0.5))
     kind = b.rng.choice(("Add", "Add", "Sub"))
-    sides = [x, wide] if b.chance(0.6) else [wide, x]
-    both = sp.binary(b, kind, *sides)
+    both = sp.either_way(b, kind, x, wide)
     layer(b, both)
     if b.chance(0.3):
         layer(b, both)

@@ -36,8 +36,8 @@ def _rooted(b: Builder, x: Val, variance: Val) -> Val:
     epsilon = sp.scalar(b, b.rng.choice((1e-5, 1e-3, 1e-1)))
     if epsilon.rank > variance.rank:
         epsilon = sp.scalar(b, 1e-4, 0)
-    sides = [variance, epsilon] if b.chance(0.7) else [epsilon, variance]
-    root = b.op("Sqrt", [sp.binary(b, "Add", *sides)], variance.shape)
+    total = sp.either_way(b, "Add", variance, epsilon)
+    root = b.op("Sqrt", [total], variance.shape)
     way = b.rng.random()
     if way < 0.6:
         return sp.binary(b, "Div", x, root)
@@ -50,13 +50,7 @@ def _rooted(b: Builder, x: Val, variance: Val) -> Val:
 def _scaled(b: Builder, x: Val, kind: str) -> Val:
     shape = b.rng.choice([(x.width,)] * 5 + [(1, x.width), ()])
     gamma = b.weight(shape, 0.7)
-    return sp.binary(b, kind, *([x, gamma] if b.chance(0.6) else [gamma, x]))
-
-
-def rms_norm(b: Builder) -> None:
-    x = b.rows(2, 4)
-    mean = sp.reduce(b, "ReduceMean", _square(b, x), [-1], keep=True)
-    _scaled(b, _rooted(b, x, mean), "Mul")
+    return sp.either_way(b, kind, x, gamma)
 
 
 def gelu(b: Builder) -> None:
@@ -85,7 +79,7 @@ def gelu(b: Builder) -> None:
 def swish(b: Builder) -> None:
     x = b.rows(1, 4)
     gate = b.op("Sigmoid", [x], x.shape)
-    sp.binary(b, "Mul", *([x, gate] if b.chance(0.5) else [gate, x]))
+    sp.either_way(b, "Mul", x, gate)
 
 
 def hard_swish(b: Builder) -> None:
@@ -116,7 +110,7 @@ def mish(b: Builder) -> None:
         one = sp.binary(b, "Add", plus, sp.scalar(b, 1.0, 0))
         plus = b.op("Log", [one], x.shape)
     wave = b.op("Tanh", [plus], x.shape)
-    sp.binary(b, "Mul", *([x, wave] if b.chance(0.5) else [wave, x]))
+    sp.either_way(b, "Mul", x, wave)
 
 
 def constant_chain(b: Builder) -> None:
@@ -132,23 +126,4 @@ def constant_chain(b: Builder) -> None:
             other = b.const(b.uniform(0.5, 2, (x.width,)))
         if other.rank > x.rank:
             continue
-        flip = kind != "Div" and b.chance(0.3)
-        x = sp.binary(b, kind, *([other, x] if flip else [x, other]))
-
-
-def powers(b: Builder) -> None:
-    """Squares, roots and reciprocals of what is positive."""
-    x = b.rows(1, 4)
-    y = sp.binary(b, "Add", _square(b, x), sp.scalar(b, 0.5, 0))
-    for _ in range(b.rng.randint(1, 3)):
-        kind = b.rng.choice(("Sqrt", "Reciprocal", "Log", "Pow", "Exp"))
-        if kind == "Pow":
-            power = b.rng.choice((0.5, 1.0, 2.0, -1.0, -0.5, 0.0))
-            y = b.op("Pow", [y, sp.scalar(b, power, 0)], y.shape)
-        elif kind == "Exp":
-            y = b.op("Exp", [b.op("Tanh", [y], y.shape)], y.shape)
-        elif kind == "Log":
-            y = b.op("Abs", [b.op("Log", [y], y.shape)], y.shape)
-            y = sp.binary(b, "Add", y, sp.scalar(b, 0.5, 0))
-        else:
-            y = b.op(kind, [y], y.shape)
+        x = sp.either_way(b, kind, x, other)

@@ -1,4 +1,4 @@
-"""What ONNX allows and passes forget: twins, views, empty inputs, odd constants."""
+"""What ONNX allows and passes forget: twins, views, odd constants, rare spellings."""
 
 import math
 
@@ -6,8 +6,7 @@ import numpy as np
 
 from tests.fuzz.exact import spelling as sp
 from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.dims import is_static, sizes
-from tests.fuzz.exact.values import BOOL, INT64, Val
+from tests.fuzz.exact.values import BOOL, INT64, Val, is_static, sizes
 
 
 def no_ops(b: Builder) -> None:
@@ -67,8 +66,7 @@ def twins(b: Builder) -> None:
     made = []
     for _ in range(b.rng.randint(2, 3)):
         other = b.const(number)
-        pair = [x, other] if b.chance(0.5) else [other, x]
-        y = sp.binary(b, b.rng.choice(("Add", "Mul", "Max", "Sub")), *pair)
+        y = sp.either_way(b, b.rng.choice(("Add", "Mul", "Max", "Sub")), x, other)
         made.append(b.op("Tanh", [y], y.shape) if b.chance(0.7) else y)
     if b.chance(0.6):
         sp.binary(b, "Sub", made[0], made[1])
@@ -118,32 +116,6 @@ def odd_constants(b: Builder) -> None:
         b.op("Where", [least, x, other], x.shape, dtype=b.dtype)
 
 
-def nothing_at_all(b: Builder) -> None:
-    """A value with no elements, joined to one that has some."""
-    x = b.rows(2, 3)
-    if not is_static(x.shape):
-        return
-    shape = list(sizes(x.shape))
-    shape[-1] = 0
-    empty = b.const(np.zeros(shape, b.dtype))
-    if b.chance(0.5):
-        empty = sp.slice_(b, x, x.rank - 1, 0, 0)
-    both = sp.concat(b, [x, empty], x.rank - 1)
-    sp.unary(b, both)
-
-
-def indices(b: Builder) -> None:
-    """The largest of every row, and a choice of some by it."""
-    x = b.rows(2, 3)
-    keep = b.rng.randint(0, 1)
-    attributes = {"axis": -1, "keepdims": keep}
-    shape = (*x.shape[:-1], 1) if keep else x.shape[:-1]
-    best = b.op("ArgMax", [x], shape, attributes, dtype=INT64)
-    if keep:
-        attributes = {"axis": -1}
-        b.op("GatherElements", [x, best], best.shape, attributes, dtype=b.dtype)
-
-
 def branches(b: Builder) -> None:
     """A split whose parts are joined in another order, or one of them unread."""
     x = b.rows(2, 4)
@@ -153,3 +125,101 @@ def branches(b: Builder) -> None:
         first = sp.unary(b, first)
     if b.chance(0.7):
         sp.concat(b, [second, first] if b.chance(0.5) else [first, second], x.rank - 1)
+
+
+def grown_by_a_constant(b: Builder) -> None:
+    """A constant with more axes, or larger ones, than the value it is added to."""
+    x = b.rows(1, 3)
+    shape = [1 if b.chance(0.5) else d for d in x.shape if isinstance(d, int)]
+    if len(shape) < x.rank:
+        shape = [1] * x.rank
+    ones = [axis for axis, dim in enumerate(x.shape) if dim == 1]
+    if ones and b.chance(0.5):
+        shape[b.rng.choice(ones)] = 3
+    else:
+        shape = [b.rng.choice((1, 2)), *shape]
+    for _ in range(b.rng.randint(1, 2)):
+        other = b.const(b.uniform(0.5, 2, shape))
+        x = sp.binary(b, b.rng.choice(("Add", "Mul", "Sub", "Div")), x, other)
+    if x.rank >= 2 and b.chance(0.5):
+        sp.matmul(b, x, b.weight((x.width, 4)))
+
+
+def odd_products(b: Builder) -> None:
+    """Products by a vector, by a batch of matrices, of a value with itself."""
+    x = b.rows(2, 3)
+    kind = b.rng.randint(0, 4)
+    if kind == 0:
+        y = b.op("MatMul", [x, b.weight((x.width,))], x.shape[:-1])
+    elif kind == 1:
+        lead = b.rng.choice(((1,), (2, 1), (1, 1, 1)))
+        y = sp.matmul(b, x, b.weight((*lead, x.width, 6)))
+        if b.chance(0.6):
+            y = sp.binary(b, "Mul", y, sp.scalar(b, 0.5, 1))
+    elif kind == 2:
+        turned = sp.transpose(b, x, [*range(x.rank - 2), x.rank - 1, x.rank - 2])
+        if isinstance(x.shape[-2], int):
+            sp.matmul(b, x, turned)
+        return
+    elif kind == 3 and x.rank == 2 and is_static(x.shape):
+        rows = sizes(x.shape)[0]
+        inputs = [x, b.weight((rows, 5)), b.weight((x.width, 1))]
+        y = b.op("Gemm", inputs, (x.width, 5), {"transA": 1})
+    else:
+        y = sp.binary(b, b.rng.choice(("Add", "Mul", "Sub", "Max")), x, x)
+    sp.unary(b, y)
+
+
+def full_bias(b: Builder) -> None:
+    """A Gemm whose bias is a column, or differs for every row."""
+    x = b.rows(2, 2)
+    rows = x.shape[0]
+    shapes: list[tuple[int, ...]] = [(1, 1), (1,)]
+    if isinstance(rows, int):
+        shapes += [(rows, 1), (rows, 6)]
+    inputs = [x, b.weight((x.width, 6)), b.weight(b.rng.choice(shapes), 1)]
+    y = b.op("Gemm", inputs, (rows, 6), {"beta": 0.5} if b.chance(0.3) else {})
+    other = b.const(b.uniform(0.5, 2, b.rng.choice(((6,), (1, 6), (1,), ()))))
+    y = sp.binary(b, b.rng.choice(("Mul", "Add", "Div", "Sub")), y, other)
+    if b.chance(0.4):
+        sp.matmul(b, y, b.weight((6, 3)))
+
+
+def cast_about(b: Builder) -> None:
+    """A value that becomes float64, or whole, and what it was again."""
+    x = b.rows(1, 3)
+    here = 11 if b.is_double else 1
+    if b.chance(0.6):
+        there, kind = (1, np.float32) if b.is_double else (11, np.float64)
+        y = b.op("Cast", [x], x.shape, {"to": there}, dtype=np.dtype(kind))
+        other = b.const(np.full((), 1.5, kind))
+        y = b.op(b.rng.choice(("Mul", "Add")), [y, other], x.shape)
+        if b.chance(0.5):
+            y = b.op("Tanh", [y], y.shape)
+        b.op("Cast", [y], y.shape, {"to": here}, dtype=b.dtype)
+    else:
+        y = b.op("Cast", [x], x.shape, {"to": 7}, dtype=INT64)
+        y = b.op("Add", [y, b.ints(1)], y.shape)
+        y = b.op("Cast", [y], y.shape, {"to": here}, dtype=b.dtype)
+        sp.binary(b, "Mul", y, sp.scalar(b, 0.5, 0))
+
+
+def defaults(b: Builder) -> None:
+    """Attributes left out: of Transpose, Squeeze, Softmax, Flatten, Concat of one."""
+    x = b.rows(2, 3)
+    kind = b.rng.randint(0, 3)
+    if kind == 0:
+        y = b.op("Transpose", [x], tuple(reversed(x.shape)))
+        y = b.op("Transpose", [y], x.shape)
+    elif kind == 1:
+        wide = sp.unsqueeze(b, sp.unsqueeze(b, x, 0), 0)
+        if 1 not in x.shape and is_static(x.shape):
+            y = b.op("Squeeze", [wide], x.shape)
+        else:
+            y = sp.squeeze(b, sp.squeeze(b, wide, 0), 0)
+    elif kind == 2:
+        y = b.op(b.rng.choice(("Softmax", "LogSoftmax")), [x], x.shape)
+    else:
+        y = b.op("Sum", [x] * b.rng.randint(1, 3), x.shape)
+        y = b.op(b.rng.choice(("Max", "Min")), [y], x.shape)
+    sp.unary(b, y)

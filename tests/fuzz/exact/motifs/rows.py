@@ -6,9 +6,8 @@ import numpy as np
 
 from tests.fuzz.exact import spelling as sp
 from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.dims import Dim, Open, elements, is_static, product, sizes
 from tests.fuzz.exact.motifs.linear import layer
-from tests.fuzz.exact.values import Val
+from tests.fuzz.exact.values import Dim, Open, Val, elements, is_static, product, sizes
 
 LARGEST = 1 << 15
 """Elements that a repetition may make."""
@@ -155,8 +154,7 @@ def row_wise(b: Builder, x: Val) -> Val:
         name = b.rng.choice(("Add", "Sub", "Mul", "Div", "Max", "Min"))
         if name == "Div" and not np.all(other.array):
             name = "Mul"
-        flip = name != "Div" and b.chance(0.3)
-        return sp.binary(b, name, *([other, x] if flip else [x, other]))
+        return sp.either_way(b, name, x, other)
     if kind < 0.65:
         name = b.rng.choice(("Softmax", "Softmax", "LogSoftmax"))
         if b.chance(0.2) and b.opset >= 13:

@@ -4,8 +4,7 @@ import numpy as np
 
 from tests.fuzz.exact import spelling as sp
 from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.dims import Dim, is_static, product, sizes
-from tests.fuzz.exact.values import BOOL, INT64, Val
+from tests.fuzz.exact.values import BOOL, INT64, Dim, Val, is_static, product, sizes
 
 
 def _dim(b: Builder, x: Val, axis: int, *, flat: bool = False) -> Val:
@@ -62,18 +61,6 @@ def computed_reshape(b: Builder) -> None:
     made = b.op("Reshape", [x, _joined(b, parts)], dims)
     if b.chance(0.5):
         sp.unary(b, made)
-
-
-def split_heads(b: Builder) -> None:
-    """Divide the last axis by a number of heads, the quotient computed."""
-    x = b.rows(2, 3)
-    heads = 2 if x.width % 2 == 0 else 1
-    width = _dim(b, x, x.rank - 1)
-    each = b.op("Div", [width, b.const(np.asarray(heads, np.int64))], ())
-    parts = [_dim(b, x, axis, flat=True) for axis in range(x.rank - 1)]
-    parts += [b.ints(heads), sp.unsqueeze(b, each, 0)]
-    dims = (*x.shape[:-1], heads, x.width // heads)
-    b.op("Reshape", [x, _joined(b, parts)], dims)
 
 
 def filled(b: Builder) -> None:

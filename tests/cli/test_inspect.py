@@ -1,0 +1,214 @@
+"""``inspect``: modules, costs, shares of time, and what a file says of itself."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.runtime.latency_trace import LatencyTrace
+from tests.cli.conftest import Cli, write_frames
+from tests.graph.test_opset import written
+from tests.nets import conv_attention, save_text
+
+IN = "inspect in.onnx --map map.toml"
+
+
+def modules(cli: Cli, line: str = IN) -> dict[str, dict[str, object]]:
+    return {each["module"]: each for each in cli.document(line)["modules"]}
+
+
+def test_nodes_are_counted_by_module(cli: Cli, files: Path) -> None:
+    found = cli.document(IN)
+    counts = {item["module"]: item["nodes"] for item in found["modules"]}
+    assert counts == {"backbone": 1, "occ": 1, "planner": 1}
+    assert found["inputs"] == [{"name": "camera", "type": "FLOAT", "shape": "[1,4]"}]
+    assert "3 by scope" in cli.done(IN).out
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ('{"file": "vad.pth", "sha256": "ab", "epoch": 60}', "weights: vad.pth, epoch"),
+        ('{"file": 1}', "metadata me2e.weights is malformed"),
+        ("", "metadata me2e.weights is malformed"),
+    ],
+)
+def test_the_checkpoint_is_named(cli: Cli, files: Path, text: str, line: str) -> None:
+    model = graph.load(files / "in.onnx")
+    model.metadata_props["me2e.weights"] = text
+    graph.save(model, files / "in.onnx")
+    assert line in cli.done(IN).out
+
+
+@pytest.mark.parametrize(
+    ("metadata", "said"),
+    [
+        (None, "fed back: memory_out as memory"),
+        ('{"memory": "nowhere"}', "me2e.recurrent pairs memory with nowhere"),
+    ],
+)
+def test_outputs_that_are_fed_back_are_told(
+    cli: Cli, tmp_path: Path, metadata: str | None, said: str
+) -> None:
+    model = conv_attention()
+    if metadata is not None:
+        model.metadata_props["me2e.recurrent"] = metadata
+    graph.save(model, tmp_path / "m.onnx")
+
+    assert said in cli.done("inspect m.onnx").words
+
+
+def test_a_plugin_s_macs_are_unknown_and_a_sum_is_a_lower_bound(
+    cli: Cli, files: Path
+) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
+        "m (float[1000,1000] camera, float[1000,2000] w) => (float[1000,2000] y)"
+        ' { ["/backbone/MatMul"] a = MatMul(camera, w)'
+        ' ["/plan_head/Rotate"] y = trt.Rotate(a) }'
+    )
+    graph.save(model, files / "in.onnx")
+
+    found = cli.document(IN)
+    costs = {
+        item["module"]: (item["macs"], item["unknown_macs_nodes"])
+        for item in found["modules"]
+    }
+    known = {"backbone": (2_000_000_000, 0), "occ": (0, 0), "planner": (None, 1)}
+    assert costs == known
+    assert (found["macs"], found["unknown_macs_nodes"]) == (2_000_000_000, 1)
+    assert "at least 2.000, 1 node not counted" in cli.done(IN).out
+
+
+def test_modelled_energy_has_a_key_of_its_own_and_is_not_called_measured(
+    cli: Cli, dense: Path
+) -> None:
+    shown = cli.document("inspect dense.onnx --modelled-energy 7nm")["modelled_energy"]
+    assert shown["macs"] == {"float32": 4 * 16 * 32}
+    assert shown["modelled_j_per_frame"] > 0
+    words = cli.done("inspect dense.onnx --modelled-energy 45nm").words
+    assert "Modelled energy (45nm), not measured" in words
+    assert "Horowitz, ISSCC 2014" in words
+
+
+@pytest.fixture
+def trace(files: Path) -> LatencyTrace:
+    """One of in.onnx, which is saved as t.json."""
+    made = LatencyTrace(
+        graph.sha256_of(files / "in.onnx"),
+        "a machine",
+        (40, 60),
+        modules_us={"backbone": (30, 30), "occ": (20, 10), "(between nodes)": (5, 5)},
+    )
+    made.save(files / "t.json")
+    return made
+
+
+def test_activations_are_weighed_and_time_is_not_made_up(cli: Cli, files: Path) -> None:
+    found = modules(cli)
+
+    assert found["backbone"]["activation_bytes"] == 16
+    assert found["backbone"]["unknown_activation_nodes"] == 0
+    assert {each["latency_share"] for each in found.values()} == {None}
+
+
+@pytest.mark.usefixtures("trace")
+def test_shares_of_the_time_come_from_a_trace(cli: Cli, files: Path) -> None:
+    found = modules(cli, f"{IN} --trace t.json")
+
+    assert found["backbone"]["latency_share"] == pytest.approx(0.6)
+    assert found["occ"]["latency_share"] == pytest.approx(0.3)
+    assert found["planner"]["latency_share"] is None
+    shown = cli.done(f"{IN} --trace t.json").words
+    assert "60.0%" in shown
+    assert "share of a frame's time: 2 inferences on a machine" in shown
+
+
+def test_shares_are_measured_on_frames(cli: Cli, files: Path) -> None:
+    found = modules(cli, f"{IN} --frames frames")
+
+    shares = [each["latency_share"] for each in found.values()]
+    measured = [share for share in shares if isinstance(share, float)]
+    assert len(measured) == len(shares) == 3
+    assert min(measured) > 0
+    assert sum(measured) <= 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"model_sha256": "0"}, "a trace of another model than in.onnx"),
+        ({"modules_us": {}}, "no times by module: profile in.onnx with --by-module"),
+    ],
+)
+def test_a_trace_that_does_not_fit_is_one_line(
+    cli: Cli, files: Path, trace: LatencyTrace, change: dict[str, object], said: str
+) -> None:
+    dataclasses.replace(trace, **change).save(files / "t.json")  # type: ignore[arg-type]
+
+    assert said in cli.refused("inspect in.onnx --trace t.json")
+
+
+def test_open_dimensions_are_shown_with_what_they_cost_until_they_have_a_size(
+    cli: Cli, tmp_path: Path
+) -> None:
+    save_text(
+        tmp_path / "m.onnx",
+        "m (float[batch,16,8,8] image, float[32,16,3,3] w, float[64,32] l)"
+        " => (float[batch,64] y) <int64[2] flat = {-1, 32}>"
+        " { a = Conv(image, w) p = GlobalAveragePool(a)"
+        " f = Reshape(p, flat) y = Gemm<transB=1>(f, l) }",
+    )
+
+    shown = cli.done("inspect m.onnx").words
+    assert "[batch,16,8,8]" in shown
+    assert "2 nodes not counted: 1 Conv (open shape), 1 Gemm (open shape)" in shown
+    assert "--set-dim NAME=SIZE for batch" in shown
+    found = cli.document("inspect m.onnx --set-dim batch=2")
+    assert found["macs"] == 2 * 6 * 6 * 32 * 16 * 9 + 2 * 64 * 32
+    assert found["inputs"][0]["shape"] == "[2,16,8,8]"
+
+
+def test_a_model_newer_than_onnxruntime_says_what_was_changed(
+    cli: Cli, tmp_path: Path
+) -> None:
+    path = written(tmp_path, "y = Relu(x)")
+    model = ir.load(path)
+    del model.graph.inputs[1:]
+    path.write_bytes(ir.to_proto(model).SerializeToString())
+    changed = "IR version 14 became 13, opset 28 became 26"
+
+    assert f"opset 26 and trt ({changed})" in cli.done("inspect", path).words
+    done = cli.done("compress -r exact -o small.onnx", path)
+    assert f"{changed}: onnxruntime reads no" in " ".join(done.err.split())
+    report = (tmp_path / "small.report.json").read_text()
+    assert "opset 28 became 26" in report
+
+
+def test_a_graph_compared_with_itself_is_equal(cli: Cli, files: Path) -> None:
+    found = cli.document("compare in.onnx in.onnx frames")
+    assert [item["error"] for item in found["outputs"]] == [0.0]
+    assert [item["sqnr_db"] for item in found["outputs"]] == [None]
+    assert found["frames"] == 2
+
+
+def test_a_reference_shows_what_the_runtime_makes_of_a_graph(
+    cli: Cli, tmp_path: Path
+) -> None:
+    save_text(
+        tmp_path / "m.onnx",
+        "pool (float[1,1,2,2] camera) => (float[1,1,2,2] plan)\n"
+        "<int64[8] around = {0, 0, 1, 1, 0, 0, 1, 1}>\n"
+        "{ q = Pad(camera, around) plan = MaxPool<kernel_shape=[3,3]>(q) }",
+    )
+    write_frames(tmp_path / "frames", camera=np.full((1, 1, 2, 2), -9, np.float32))
+
+    (same,) = cli.document("compare m.onnx m.onnx frames")["outputs"]
+    (wrong,) = cli.document("compare m.onnx m.onnx frames --reference")["outputs"]
+
+    assert (same["sqnr_db"], wrong["sqnr_db"]) == (None, None)
+    assert same["error"] == 0.0
+    assert wrong["error"] is None  # infinite: zeros became negative

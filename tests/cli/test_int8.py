@@ -1,0 +1,259 @@
+"""``calibrate`` and ``plan``: ranges that are saved, decisions that are explained."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.marks import IN_JSON
+from me2e_compress.quantization.plan import KeptFloat, load_plan, plan_of, save_plan
+from tests.cli.conftest import Cli
+from tests.frames import record
+from tests.nets import conv_attention, image, net
+
+MAP = "--map map.toml"
+RANGES = f"calibrate dense.onnx scenes {MAP}"
+MADE = f"compress dense.onnx --scheme prediction --frames frames {MAP} -o out.onnx"
+
+
+@pytest.fixture
+def folder(dense: Path) -> Path:
+    """The dense model, with three scenes of two frames."""
+    draws = np.random.default_rng(1)
+    frames = [
+        {"camera": draws.normal(size=(4, 16)).astype(np.float32)} for _ in range(6)
+    ]
+    record(dense / "scenes", frames, (0, 2, 4))
+    return dense
+
+
+def digests(*files: Path) -> set[str]:
+    return {graph.digest(graph.load(each)) for each in files}
+
+
+@pytest.mark.parametrize("method", ["max-min", "mse"])
+def test_saved_ranges_make_the_file_that_frames_make(
+    cli: Cli, folder: Path, method: str
+) -> None:
+    cli.done(f"{RANGES} --method {method} -o r.json")
+    how = f"--scheme prediction --method {method} --measure-frames 0 {MAP}"
+    cli.done(f"compress dense.onnx {how} --ranges r.json -o a.onnx")
+    cli.done(f"compress dense.onnx {how} --frames scenes -o b.onnx")
+
+    made = graph.load(folder / "a.onnx").graph
+    assert "QuantizeLinear" in [node.op_type for node in made]
+    assert len(digests(folder / "a.onnx", folder / "b.onnx")) == 1
+
+
+def test_merged_shards_give_the_ranges_of_one_run(cli: Cli, folder: Path) -> None:
+    cli.done(f"{RANGES} --method mse -o whole.json")
+    for part in "12":
+        cli.done(f"{RANGES} --method mse --shard {part}/2 -o {part}.npz")
+    merge = "--merge 1.npz --merge 2.npz --method mse"
+    cli.done(f"calibrate dense.onnx {merge} {MAP} -o merged.json")
+
+    merged = (folder / "merged.json").read_bytes()
+    assert merged == (folder / "whole.json").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (["1/3"], "shard 2 of 3 is missing, and 1 more"),
+        (["1/3", "3/3"], "shard 2 of 3 is missing, and 0 more"),
+        (["1/2", "3/3"], "shard 3 of 3, shard 1 of 2"),
+        (["1/2 -n 4", "2/2 -n 6"], r"1 and 2 are of different draws \(4 and 6 frames"),
+        (["1/2 -n 4", "2/2 -n 4 --seed 1"], "are of different draws"),
+        (["1/2", "2/2", "2/2"], "frame 4 is in two of the shards"),
+    ],
+)
+@pytest.mark.usefixtures("folder")
+def test_shards_that_are_no_whole_are_one_line(
+    cli: Cli, parts: list[str], message: str
+) -> None:
+    for at, part in enumerate(parts):
+        cli.done(f"{RANGES} --shard {part} -o {at}.npz")
+    merged = " ".join(f"--merge {at}.npz" for at in range(len(parts)))
+
+    said = cli.refused(f"calibrate dense.onnx {merged} {MAP} -o r.json")
+
+    assert re.search(message, said)
+
+
+def test_shards_of_another_model_are_refused(cli: Cli, folder: Path) -> None:
+    cli.done(f"{RANGES} --shard 1/1 -o s.npz")
+    model = graph.load(folder / "dense.onnx")
+    model.graph[1].name = "/plan_head/Other"
+    graph.save(model, folder / "other.onnx")
+
+    line = f"calibrate other.onnx -r exact --merge s.npz {MAP} -o r.json"
+    assert "stale: of graph" in cli.refused(line)
+
+
+def test_another_tools_cache_comes_and_goes(cli: Cli, folder: Path) -> None:
+    cli.done(f"{RANGES} --tensorrt-cache c --onnxruntime-table table -o r.json")
+    ours = json.loads((folder / "r.json").read_text())
+
+    for foreign in ("c", "table/calibration.cache"):
+        cli.done(f"calibrate dense.onnx --import {foreign} {MAP} -o back.json")
+        back = json.loads((folder / "back.json").read_text())
+        assert back["method"] == "imported"
+        for name, (low, high) in ours["tensors"].items():
+            reach = max(-low, high)
+            assert back["tensors"][name] == pytest.approx((-reach, reach))
+    for line in ("sensitivity", "search --max-mb 1"):
+        cli.done(f"{line} dense.onnx frames --ranges back.json {MAP} -o r.toml")
+
+
+def test_fewer_frames_are_drawn_by_seed(cli: Cli, folder: Path) -> None:
+    found = list[bytes]()
+    for seed in (0, 0, 1, 2, 3):
+        cli.done(f"{RANGES} -n 2 --seed {seed} -o r.json")
+        found.append((folder / "r.json").read_bytes())
+
+    assert found[0] == found[1]
+    assert any(each != found[0] for each in found[2:])
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("shard", ["", "--shard 1/2"])
+def test_programs_get_json(cli: Cli, shard: str) -> None:
+    cli.document(f"{RANGES} {shard} -o r.npz")
+
+
+def test_a_graph_that_is_lowered_takes_saved_ranges(cli: Cli, tmp_path: Path) -> None:
+    graph.save(conv_attention(), tmp_path / "m.onnx")
+    record(tmp_path / "frames", [image(seed) for seed in range(2)], (0,))
+    (tmp_path / "map.toml").write_text(
+        '[modules.backbone]\nrole = "feature"\npatterns = ["backbone"]\n'
+        '[modules.head]\nrole = "prediction"\npatterns = ["head"]\n'
+    )
+    (tmp_path / "lower.toml").write_text('[[pass]]\nname = "lower-int8"\n')
+    cli.done(f"compress m.onnx --scheme full --frames frames {MAP} -o int8.onnx")
+
+    lower = f"compress int8.onnx -r lower.toml {MAP} --verify-frames 0"
+    cli.done(f"calibrate int8.onnx frames -r lower.toml {MAP} -o r.json")
+    cli.done(f"{lower} --ranges r.json -o a.onnx")
+    cli.done(f"{lower} --frames frames -o b.onnx")
+
+    assert len(digests(tmp_path / "a.onnx", tmp_path / "b.onnx")) == 1
+    assert "--rules is for int8" in cli.refused(f"{lower} --rules paper -o c.onnx")
+
+
+def test_the_plan_that_is_shown_is_the_one_beside_the_file_and_inside(
+    cli: Cli, dense: Path
+) -> None:
+    cli.done(MADE)
+    saved = load_plan(dense / "out.plan.json")
+    assert saved == plan_of(graph.load(dense / "out.onnx"))
+    assert [each.node for each in saved.chosen] == ["/plan_head/MatMul"]
+
+    shown = cli.document(f"plan dense.onnx --scheme prediction {MAP}")
+
+    written = json.loads((dense / "out.plan.json").read_text())
+    assert written == IN_JSON | {k: shown[k] for k in written if k in shown}
+
+
+def test_plans_are_compared(cli: Cli, dense: Path) -> None:
+    cli.done(MADE)
+    line = f"plan dense.onnx --scheme feature-ext --rules paper {MAP} --against"
+
+    said = cli.done(f"{line} out.onnx").out
+    assert "/plan_head/MatMul: int8 (layer) -> float (module)" in said
+    assert "1 differences" in said
+    (found,) = cli.document(f"{line} out.onnx")["differences"]
+    assert [found[side]["rule"] for side in ("old", "new")] == ["layer", "module"]
+
+
+OVERRIDE = '[[override]]\nop = "MatMul"\ndtype = "float"\n'
+
+
+def test_overrides_are_told_against_the_model_and_reach_the_pass(
+    cli: Cli, dense: Path
+) -> None:
+    (dense / "o.toml").write_text(OVERRIDE)
+
+    said = cli.done(f"plan dense.onnx {MAP} --overrides o.toml --against dense.onnx")
+    assert "/plan_head/MatMul: int8 (layer) -> float (override)" in said.out
+    more = "--overrides o.toml --rules paper --allow-empty"
+    step = cli.document(f"{MADE} {more}")["steps"][-1]
+    assert 'rules="paper"' in step["text"]
+    assert "0 of 2 nodes int8; by rule: override 1" in step["notes"]
+
+
+@pytest.mark.usefixtures("dense")
+@pytest.mark.parametrize("file", ["out.onnx", "out.plan.json"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--scheme full",
+        "--rules paper",
+        "--overrides none.toml",
+        "--overrides none.toml --against dense.onnx",
+        "--scheme full --against out.plan.json",
+    ],
+)
+def test_options_are_not_for_a_plan_that_is_made(
+    cli: Cli, file: str, words: str
+) -> None:
+    cli.done(MADE)
+
+    said = cli.refused(f"plan {file} {words}")
+
+    option = words.split()[0]
+    assert f"{option} is for a plan that is yet to be made, and {file} has" in said
+
+
+@pytest.mark.usefixtures("dense")
+def test_a_plan_is_shown_with_reasons(cli: Cli) -> None:
+    said = cli.done(f"plan dense.onnx --scheme feature-ext {MAP} --all").out
+
+    assert "0 of 2 nodes int8; module 1" in said
+    assert "/backbone/Relu" in said
+
+
+def test_what_is_decided_together_is_listed(cli: Cli, tmp_path: Path) -> None:
+    model = net(
+        '<ir_version: 9, opset_import: ["" : 17]>'
+        "two (float[4,32] x, float[32,32] v, float[32,32] w)"
+        " => (float[4,32] k, float[4,32] q) { k = MatMul(x, v) q = MatMul(x, w) }",
+        {"v": np.eye(32), "w": np.ones((32, 32))},
+    )
+    graph.save(model, tmp_path / "two.onnx")
+    (tmp_path / "map.toml").write_text(
+        '[modules.head]\nrole = "prediction"\noptional = ["**"]\n'
+    )
+
+    assert "shared-input" in cli.done(f"plan two.onnx {MAP} --all").out
+
+
+def test_what_a_target_kept_and_what_is_close_is_told(cli: Cli, dense: Path) -> None:
+    cli.done(MADE)
+    made = load_plan(dense / "out.plan.json")
+    kept = tuple(KeptFloat(each.node, each.output, "slow") for each in made.chosen)
+    close = tuple(
+        dataclasses.replace(each, reason="[8,8]", borderline="near 512")
+        for each in made.decisions
+    )
+    changed = dataclasses.replace(made, kept_float=kept, decisions=close)
+    save_plan(changed, dense / "kept.plan.json")
+
+    said = cli.done("plan kept.plan.json --all").words
+
+    assert "1 of them stay float on their target" in said
+    assert "[8,8]" in said
+    assert "(near" in said
+    assert "bold" not in said
+
+
+@pytest.mark.usefixtures("dense")
+@pytest.mark.parametrize("words", ["", "-v", "--nodes", "--nodes -v"])
+def test_nodes_are_listed_once_and_only_when_asked_for(cli: Cli, words: str) -> None:
+    said = cli.done(f"plan dense.onnx {MAP} --scheme full {words}").out
+
+    assert "Decisions by module and rule" in said
+    assert said.count("/plan_head/MatMul") == bool(words)

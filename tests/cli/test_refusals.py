@@ -1,0 +1,294 @@
+"""What users get wrong: one line that names the culprit, exit 1, nothing changed."""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from me2e_compress import graph, rewrite
+from tests.cli.conftest import Cli, contents, write_frames
+from tests.nets import save_text
+
+F = "dense.onnx frames --map map.toml"
+EXACT = "in.onnx --map map.toml -o out.onnx --passes fold-constants"
+SPLIT = "in.onnx --map map.toml -o out.onnx --passes"
+BARE = "dense.onnx --map map.toml -o out.onnx"
+INT8 = f"{BARE} --scheme full --frames frames"
+ROAD = f"search {F} -o out --max-mb 1 --on-road"
+TIMED = "profile dense.onnx frames -o out.json --samples 2"
+
+COMPRESS = {
+    EXACT.replace("in.", "junk."): r"junk\.onnx: not an ONNX",
+    EXACT.replace("in.", "cut."): r"cut\.onnx",
+    EXACT.replace("in.", "none."): r"none\.onnx: no such file",
+    EXACT.replace("in.", "apart."): r"apart\.onnx\.data is missing",
+    EXACT.replace("map.", "none."): r"none\.toml: no such file",
+    EXACT.replace("map.", "radar."): "'radar_net' of module radar matches no",
+    f"{EXACT} --frames wrong-name": r"000000\.npz.*camera",
+    f"{EXACT} --frames wrong-shape": r"000000\.npz.*5",
+    f"{EXACT} --frames wrong-dtype": r"000000\.npz.*float64",
+    f"{EXACT} --frames nan": r"000000\.npz.*(?i:nan)",
+    f"{EXACT} --frames inf": r"000000\.npz.*(?i:inf)",
+    f"{EXACT} --frames cut": r"000000\.npz: not a readable \.npz \(",
+    f"{EXACT} --frames empty": r"empty: holds no \.npz frames",
+    f"{SPLIT} fold": "no pass 'fold'",
+    f"{SPLIT} fold-constants{{speed=9}}": "fold-constants has no option 'speed'",
+    f"{SPLIT} ablate-modules{{drop=[occ": r"a comma or \] is expected",
+    f"{SPLIT} ablate-modules{{drop=7}}": "ablate-modules: drop",
+    f"{SPLIT} ablate-modules{{drop=[radar]}}": "radar: no such module",
+    f"{SPLIT} ablate-modules{{drop=[planner]}}": "planner cannot be dropped: it makes",
+    f"{SPLIT.replace('in.', 'open.')} ablate-modules{{drop=[occ]}}": "zeros or a mean",
+    "in.onnx -o out.onnx": "say what to do",
+    "in.onnx -o out.onnx -r nothing": "no recipe nothing",
+    "in.onnx -o out.onnx -r latin.toml": r"latin\.toml is not TOML",
+    f"{BARE} -r exact --target tensorrt": "--target is for int8, and the",
+    f"{BARE} --scheme full": r"--frames\) or saved ranges.*never made up",
+    f"{BARE} --scheme full --frames wrong-name": "camera is missing",
+    f"{BARE} --scheme full --frames wrong-shape": r"\[1, ?5\]|\(1, ?5\)",
+    f"{BARE} --scheme int4 --frames frames": "no scheme int4; there are feature-ext",
+    f"{BARE} -r full --scheme full --frames frames": "twice.*leave out --scheme",
+    f"{BARE} --passes quantize-int8 --scheme full": "twice.*leave out --scheme",
+    f"{BARE} --passes quantize-int8,quantize-int8": "twice.*leave out one of them",
+    f"{BARE} --scheme full --ranges none.json": r"none\.json",
+    f"{BARE} --scheme full --ranges latin.toml": r"latin\.toml: not ranges",
+    f"{BARE} --scheme full --ranges other-graph.json": "stale: of graph",
+    f"{INT8} --ranges other-frames.json": "stale: of frames",
+    f"{BARE} --scheme full --ranges nan.json": r"nan\.json: not ranges: a has nan to 1",
+    f"{BARE} --scheme full --ranges inf.json": r"inf\.json: .*: a has -1 to inf; ",
+    f"{BARE} --scheme full --ranges large.json": r"large\.json: .*: a has -1e\+39 to 1",
+    f"{BARE} --scheme full --ranges turned.json": r"turned\.json: .*: a has 2 to 1; ",
+    f"{INT8} --rules int4": "no rule set 'int4'; there are safe",
+    f"{INT8} --target npu": "no target 'npu'; there are tensorrt",
+    f"{INT8} --method int4": "no calibration method 'int4'; ",
+    f"{INT8} --map latin.toml": r"latin\.toml: not TOML",
+    f"{INT8} --overrides latin.toml": r"latin\.toml: not TOML",
+    f"{INT8} --overrides none.toml": r"none\.toml: no such file",
+    f"{INT8} --overrides int4.toml": "dtype int4: only int8 and float are supported",
+    f"{INT8} --overrides node.toml": r"/radar/\*'? matches none of 2 nodes",
+    f"{INT8} --overrides module.toml": "radar'? matches none of 2 nodes",
+    f"{INT8} --overrides reads.toml": "radar'? matches none of 2 nodes",
+    f"{INT8} --overrides concat.toml": r"/radar/\*'? matches none of 2 nodes",
+}
+CALIBRATE = {
+    "": "ranges are never made up",
+    "frames --import x": "one of the three",
+    "nowhere": "nowhere: no such folder",
+    "--import nowhere": "no such calibration cache",
+    "--merge nowhere": "no such statistics",
+    "--merge cut/000000.npz": r"000000\.npz: not saved statistics \(",
+    "frames --shard half": "write 2/4",
+    "frames --shard 2/2": "1 scenes? cannot be shared by 2",
+    "frames --shard 1/1 --tensorrt-cache c": "no ranges yet",
+    "frames --shard 1/1 --onnxruntime-table t": "no ranges yet",
+    "frames --method fp8": "no calibration method 'fp8'; there",
+    "frames -n 0": "at least 1 is needed",
+    "frames -r nothing": "no recipe nothing",
+}
+SEARCH = {
+    f"search {F} -o out": "give a budget",
+    f"search {F} -o out --on-road": "give a budget: --max-mb, --max-ms or --max-joules",
+    f"search {F} -o out --max-mb 1 --max-joules 0": "--max-joules is 0",
+    f"search {F} -o out --max-mb 1 --max-ms 1e-9": r"nothing fits .* 0\.000000000001 s",
+    f"search {F} -o out --max-ms 1 --target tensorrt": "use --target onnxruntime",
+    f"search {F} -o out --max-mb 0.0000001": "nothing fits",
+    f"search {F} -o out --max-mb 1 --scheme int4": "no scheme int4; there are .*int8",
+    f"search {F} -o out --max-mb 1 --routes 4": "--routes says how.*add --on-road",
+    f"search {F} -o out --max-mb 1 --workers 2": "--workers says how.*add --on-road",
+    f"search {F} -o out --max-ms 1 --on-road --target tensorrt": "--target onnxruntime",
+    f"{ROAD} --scheme prediction": "--modules",
+    f"{ROAD} --modules radar": "radar: no such module in the graph",
+    f"{ROAD} --ablate planner": "cannot do without it",
+    f"{ROAD} --latency trace:t.json": "a file is a variant's",
+    f"{ROAD} --routes 221": "221 routes were asked for",
+    f"{ROAD} --baseline-median-s 0": r"a median of 0\.0 s",
+    f"sensitivity {F} -o out --drive 1": "camera",
+}
+OTHERS = {
+    "export vad-huge -o out.onnx": "vad-huge",
+    "export vad-tiny -o out.onnx --opset 99": "opset 99",
+    "export tcp -o out.onnx --weights in.onnx": r"in\.onnx: not read as weights",
+    "export highway -o out.onnx --opset 16": "--opset.*cannot be chosen",
+    "export highway -o out.onnx --seed 0": "--seed.*cannot be chosen",
+    "export highway -o out.onnx --heads nuscenes": "--heads.*cannot be chosen",
+    "export highway -o out.onnx --weights a.pth": "--weights.*cannot be chosen",
+    "compare dense.onnx path.onnx frames": "no output in common",
+    "frames vad-huge -o out": "no stack 'vad-huge' in the zoo",
+    "plan latin.json": r"latin\.json: not a plan",
+    "plan dense.onnx --against none.onnx": "none.onnx: no such file; models",
+    "inspect dense.onnx --modelled-energy 1nm": "no process '1nm'; there are 45nm, 7nm",
+    "inspect dense.onnx --trace t.json --frames frames": "--trace and --frames",
+    "inspect open.onnx --set-dim n": "write NAME=SIZE, e.g. batch=1",
+    "inspect open.onnx --set-dim n=x": "write NAME=SIZE, e.g. batch=1",
+    "inspect open.onnx --set-dim n=0": "n=0 must be 1 or more",
+    "inspect open.onnx --set-dim rows=1": "is called 'rows'; there is n",
+    "lint open.onnx --set-dim rows=1": "no open dimension is called 'rows'",
+    "lint dense.onnx --target npu": "no target 'npu'; there are tensorrt",
+    "lint dense.onnx --target onnxruntime --trt-check": "--trt-check is for tensorrt",
+    "lint dense.onnx --plugins in.onnx": "lint for tensorrt opens no session",
+    "list wheels": "no kind 'wheels'; there are passes, rules",
+    "demo -o out --routes 0": "0 routes were asked for",
+    "demo -o out --recipe half": "no recipe half",
+    f"{TIMED} --figure tail.gif": r"tail\.gif: a figure ends in \.png",
+    f"{TIMED} --energy sun": "no energy counter 'sun'; there are auto, nvml",
+    f"{TIMED} --energy recorded:no.csv": r"no\.csv: No such file",
+    f"{TIMED} --energy-out j.json": "there is no --energy to write",
+}
+DRIVE = {
+    "--routes nowhere": "no route 'nowhere'",
+    "--routes 1 --render nowhere": "no route 'nowhere'",
+    "--routes 1 --engine cloud": "engine 'cloud'",
+    "--routes 1 --engine local --address a:1": "engine 'local' with address a:1",
+    "--routes 1 --weather snow=1": "weather option 'snow'",
+    "--routes 1 --weather night=dark": "weather option night",
+    "--routes 1 --latency fast": "no latency source 'fast'",
+    "--routes 1 --dt-ms 30": "a step of 30 ms",
+}
+SCORE = {
+    "score nodir": "nodir: no such folder$",
+    "score frames": "not a results folder",
+    "score results --penalties 2.0": "no results of a real run, which --metr",
+    "routes -o out.json --scenarios Flying": "no scenario 'Flying'; there are",
+}
+LINES = {
+    **{f"compress {words}": said for words, said in COMPRESS.items()},
+    **{f"calibrate dense.onnx {w} -o out.json": said for w, said in CALIBRATE.items()},
+    **{f"evaluate blind {w} -o out": said for w, said in DRIVE.items()},
+    **SEARCH,
+    **OTHERS,
+    **SCORE,
+}
+OVERRIDES = {
+    "int4": '[[override]]\nop = "MatMul"\ndtype = "int4"',
+    "node": '[[override]]\nnodes = "/radar/*"\ndtype = "float"',
+    "module": '[[override]]\nmodule = "radar"\ndtype = "float"',
+    "reads": '[[override]]\nreads = "radar"\ndtype = "float"',
+    "concat": '[[concat]]\nnodes = "/radar/*"\nscale = "own"',
+    "radar": '[modules.radar]\nrole = "feature"\npatterns = ["radar_net"]\n',
+}
+RANGES: Mapping[str, Mapping[str, Any]] = {
+    "nan": {"tensors": {"a": [float("nan"), 1]}},
+    "inf": {"tensors": {"a": [-1, float("inf")]}},
+    "large": {"tensors": {"a": [-1e39, 1]}},
+    "turned": {"tensors": {"a": [2, 1]}},
+    "other-graph": {"model": "another"},
+    "other-frames": {"source": "others"},
+}
+FRAMES: Mapping[str, Mapping[str, np.ndarray]] = {
+    "wrong-name": {"radar": np.zeros((1, 4), np.float32)},
+    "wrong-shape": {"camera": np.zeros((1, 5), np.float32)},
+    "wrong-dtype": {"camera": np.zeros((1, 4), np.float64)},
+    "nan": {"camera": np.full((1, 4), np.nan, np.float32)},
+    "inf": {"camera": np.full((1, 4), np.inf, np.float32)},
+    "cut": {"camera": np.zeros((1, 4), np.float32)},
+}
+OPEN = """m (float[n,4] camera) => (float[n,4] plan) {
+    ["/backbone/Relu"] f = Relu(camera)
+    ["/occ_head/NonZero"] i = NonZero(f)
+    ["/occ_head/Cast"] c = Cast<to=1>(i)
+    ["/occ_head/Sum"] s = ReduceMax<keepdims=0, axes=[0]>(c)
+    ["/plan_head/Sum"] t = ReduceSum(s)
+    ["/plan_head/Add"] plan = Add(f, t) }"""
+
+
+@pytest.fixture
+def folder(dense: Path, cli: Cli) -> Path:
+    """The folder of a dense model, and all that can be wrong beside it."""
+    whole = (dense / "in.onnx").read_bytes()
+    (dense / "cut.onnx").write_bytes(whole[:-40])
+    (dense / "junk.onnx").write_text("this is no graph")
+    for name in ("latin.toml", "latin.json"):
+        (dense / name).write_bytes("caf\u00e9".encode("latin-1"))
+    for name, text in OVERRIDES.items():
+        (dense / f"{name}.toml").write_text(text)
+    for name, arrays in FRAMES.items():
+        write_frames(dense / name, **arrays)
+    first = dense / "cut" / "000000.npz"
+    first.write_bytes(first.read_bytes()[:-40])
+    for name in ("empty", "results"):
+        (dense / name).mkdir()
+    (dense / "results" / "evaluation.json").write_text('{"routes": ["a"]}')
+    save_text(dense / "open.onnx", OPEN)
+    save_text(dense / "path.onnx", "m (float[4,16] camera) => (float[4,16] path)"
+              "{ path = Relu(camera) }")  # fmt: skip
+    model = graph.load(dense / "in.onnx")
+    big = np.random.default_rng(0).normal(size=(1, 4096)).astype(np.float32)
+    rewrite.add_constant(model.graph, big, "w")
+    graph.save(model, dense / "apart.onnx", external=True)
+    (dense / "apart.onnx.data").unlink()
+    return dense
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_what_is_wrong_is_one_line(cli: Cli, folder: Path, line: str) -> None:
+    if any(name in line for name in (f"{each}.json" for each in RANGES)):
+        write_ranges(cli, folder)
+
+    assert re.search(LINES[line], cli.refused(line))
+
+
+def write_ranges(cli: Cli, folder: Path) -> None:
+    """Calibrate, and spoil the result in every way."""
+    cli.done("calibrate dense.onnx frames --map map.toml -o good.json")
+    good = json.loads((folder / "good.json").read_text())
+    for name, change in RANGES.items():
+        tensors = {**good["tensors"], **change.get("tensors", {})}
+        text = json.dumps({**good, **change, "tensors": tensors})
+        (folder / f"{name}.json").write_text(text)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-1", "1e+308"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"search {F} -o out --max-mb",
+        f"search {F} -o out --max-ms",
+        f"search {F} -o out --max-joules",
+        f"sensitivity {F} -o out --limit",
+        f"sensitivity {F} -o out --drive 1 --drive-limit",
+        "evaluate blind --routes 1 -o out --dt-ms",
+        "evaluate blind --routes 1 -o out --frame-limit",
+    ],
+)
+def test_a_number_that_is_none(cli: Cli, dense: Path, line: str, value: str) -> None:
+    option = line.split()[-1]
+
+    said = cli.refused(line, value)
+
+    assert f"{option} is {value}: it must be a finite number" in said
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"calibrate {F} -o out --seed -1",
+        f"calibrate {F} -o out --threads -1",
+        "compress dense.onnx -r exact -o out --seed -1",
+        "compress dense.onnx -r exact -o out --verify-frames -1",
+        f"sensitivity {F} -o out --node-trials -1",
+        f"search {F} --max-mb 1 -o out --threads -1",
+        "profile dense.onnx frames -o out --threads -1",
+        "frames vad-tiny -n 1 -o out --seed -1",
+        "export vad-tiny -o out --seed -1",
+        "evaluate blind --routes 1 -o out --seed -1",
+        "lint dense.onnx --shown -1",
+        "demo -o out --stack uniad",
+        "evaluate --check",
+        "evaluate blind",
+        "routes --seed 1",
+        "compres",
+    ],
+)
+def test_words_that_no_option_takes_are_a_usage_error(
+    cli: Cli, dense: Path, line: str
+) -> None:
+    before, said = contents(dense), cli(line)
+
+    assert said.code == 2
+    words = line.split()
+    option = words[-2] if words[-1] == "-1" else ""
+    assert option in said.err
+    assert contents(dense) == before

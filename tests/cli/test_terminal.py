@@ -1,0 +1,183 @@
+"""What a terminal shows: version, quiet, verbose, completion, progress, 80 columns."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.cli import console
+from me2e_compress.cli.app import COMMANDS
+from me2e_compress.cli.console import EVERY_S, ProgressLines, listening, print_table
+from me2e_compress.cli.verbosity import Verbosity, set_verbosity
+from me2e_compress.display import Cell, Table, duration, table
+from me2e_compress.version import __version__
+from tests.cli.conftest import Cli
+
+
+@pytest.fixture(autouse=True)
+def _normal() -> Iterator[None]:
+    yield
+    set_verbosity(Verbosity.NORMAL)
+
+
+def test_the_version(cli: Cli) -> None:
+    assert cli.done("--version").out == f"me2e-compress {__version__}\n"
+
+
+def test_commands_stand_in_groups(cli: Cli) -> None:
+    said = cli.done("--help").out
+    for panel in dict.fromkeys(entry.panel for entry in COMMANDS.values()):
+        assert f"─ {panel} ─" in said
+    assert re.findall(r"^│ (\w+) +\w", said, re.MULTILINE) == list(COMMANDS)
+
+
+@pytest.mark.parametrize("words", ["compress --sch", "compr"])
+def test_the_shell_completes_commands_and_their_options(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, words: str
+) -> None:
+    monkeypatch.setenv("_ME2E_COMPRESS_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", f"me2e-compress {words}")
+    monkeypatch.setenv("COMP_CWORD", str(len(words.split())))
+
+    found = "--scheme" if "--" in words else "compress"
+    assert cli.done("").out.split() == [found]
+
+
+@pytest.mark.parametrize("words", ["-v {}", "{} --verbose"])
+def test_notes_are_for_the_verbose(cli: Cli, dense: Path, words: str) -> None:
+    line = (
+        "compress dense.onnx -o out.onnx --scheme full --frames frames --map map.toml"
+        " --verify-frames 0"
+    )
+    note = "quantize-int8: scheme full: "
+
+    assert note not in cli.done(line).out
+    assert note in cli.done(words.format(line)).out
+
+
+def test_quiet_leaves_results_and_errors(cli: Cli, files: Path) -> None:
+    assert "camera" in cli.done("inspect in.onnx -q").out
+    assert "none.onnx: no such file" in cli.refused("-q inspect none.onnx")
+
+
+def test_quiet_listeners_hear_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    set_verbosity(Verbosity.QUIET)
+    with listening(stages=True) as listener:
+        listener.on_progress("collect", 0, 1, "")
+        listener.on_warning("a file is damaged")
+    assert capsys.readouterr().err == ""
+
+
+def test_a_run_is_quiet_only_once(cli: Cli) -> None:
+    cli.done("-q list targets")
+    cli.done("list targets")
+    with listening() as listener:
+        listener.on_warning("a file is damaged")
+    assert "warning: a file is damaged" in cli.capsys.readouterr().err
+
+
+STEPS = [(done * 0.3, "calibrate", done, 100, "frames") for done in range(101)]
+
+
+@pytest.mark.parametrize(
+    ("told", "stages", "said"),
+    [
+        (STEPS, False, ["calibrate: 34/100 frames, 20 s left",
+                        "calibrate: 68/100 frames, 10 s left"]),
+        ([(EVERY_S / 2, "calibrate", 1, 2, "frames")], False, []),
+        ([(0.0, stage, 0, 1, "") for stage in ("collect", "learn", "learn")],
+         True, ["collect", "learn"]),
+        ([(EVERY_S, "frames", 0, 8, ""), (2 * EVERY_S, "frames", 7, 8, "")],
+         False, ["frames: 0/8", "frames: 7/8, 1 s left"]),
+    ],
+    ids=["a line now and then", "none of a short run", "every stage", "no name"],
+)  # fmt: skip
+def test_off_a_terminal_progress_is_lines(
+    told: list[tuple[float, str, int, int, str]], stages: bool, said: list[str]
+) -> None:
+    lines, now = list[str](), [0.0]
+    progress = ProgressLines(lines.append, stages=stages, clock=lambda: now[0])
+    for now[0], *words in told:
+        progress.on_progress(*words)  # type: ignore[arg-type]
+
+    assert lines == said
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        *((0, "0 s"), (0.3, "1 s"), (40, "40 s"), (200, "3 min")),
+        *((3599, "1 h 0 min"), (7500, "2 h 5 min")),
+    ],
+)
+def test_durations(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+NODE = "/planner/agent_layer/cross_attn/value/MatMul"
+COLUMNS = ("module", "node", "op", "rule", "why")
+
+
+@pytest.fixture
+def width(monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr(console.console, "width", 80)
+    return 80
+
+
+def printed(capsys: pytest.CaptureFixture[str], *row: str) -> list[str]:
+    print_table(table("Nodes", COLUMNS, [row], words=len(row)))
+    return [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+
+
+def test_words_that_fit_stand_in_columns(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console.console, "width", 100)
+    lines = printed(capsys, "planner", NODE, "MatMul", "layer", "a product")
+
+    assert lines[1].replace("┃", "").split() == list(COLUMNS)
+    assert NODE in lines[3]
+
+
+@pytest.mark.usefixtures("width")
+def test_only_long_sentences_wrap(capsys: pytest.CaptureFixture[str]) -> None:
+    row = ("driving score", "72.22", "43.93 to 100.00", "5", "not measured: " * 4)
+    lines = printed(capsys, *row)
+
+    assert any("driving score" in each and "43.93 to 100.00" in each for each in lines)
+
+
+@pytest.mark.usefixtures("width")
+def test_words_that_do_not_fit_stand_below_each_other(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lines = printed(capsys, NODE, "planner", "MatMul", f"as_{NODE}", "")
+
+    below = ["    node: planner", "    op: MatMul", f"    rule: as_{NODE}"]
+    assert lines == ["Nodes", NODE, *below]
+
+
+def test_sentences_wrap_between_words(
+    capsys: pytest.CaptureFixture[str], width: int
+) -> None:
+    lines = printed(capsys, "planner", NODE, "MatMul", "layer", "int8 " * 20)
+
+    assert all(len(line) <= width for line in lines)
+    assert sum(line.count("int8") for line in lines) == 20
+    assert any(NODE in line for line in lines)
+
+
+@pytest.mark.usefixtures("width")
+@pytest.mark.parametrize(("count", "shown"), [(2, True), (6, False)])
+def test_intervals_stand_where_they_fit_and_are_missed_where_not(
+    capsys: pytest.CaptureFixture[str], count: int, shown: bool
+) -> None:
+    """+13.4 points stood there without the interval that the caption promises."""
+    row = (Cell("full"), *[Cell("+13.4", "-0.3 to +40.6")] * count)
+    columns = ("variant", *[f"score {at}" for at in range(count)])
+    print_table(Table("Scores", columns, (row,), "Each with its interval."))
+
+    said = capsys.readouterr().out
+    assert ("-0.3 to +40.6" in said) is shown
+    assert ("Intervals: in a terminal of 120 columns." in said) is not shown
