@@ -7,11 +7,8 @@ package says about it, besides walking nodes and values.
 from me2e_compress.graph.digest import digest
 from me2e_compress.graph.files import (
     data_names,
-    file_bytes,
     is_external,
-    load,
     save,
-    sha256_of,
 )
 from me2e_compress.graph.macs import (
     macs,
@@ -39,6 +36,14 @@ from me2e_compress.graph.shapes import (
     rank_of,
     static_shape,
 )
+from me2e_compress.graph.stack.stack import (
+    JoinedStack,
+    file_bytes,
+    load,
+    paths_of,
+    sha256_of,
+)
+from me2e_compress.graph.stack.stack_file import is_stack
 from me2e_compress.graph.summary import (
     Port,
     Size,
@@ -50,6 +55,7 @@ from me2e_compress.graph.summary import (
 __all__ = [
     "CONVOLUTIONS",
     "WEIGHTED",
+    "JoinedStack",
     "Port",
     "Provenance",
     "Size",
@@ -65,6 +71,7 @@ __all__ = [
     "input_at",
     "interface",
     "is_external",
+    "is_stack",
     "is_standard",
     "load",
     "macs",
@@ -73,6 +80,7 @@ __all__ = [
     "nodes_of",
     "open_shape",
     "opset_of",
+    "paths_of",
     "producer_of",
     "rank_of",
     "save",

@@ -8,7 +8,7 @@ from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.outputs import plan_of
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.runtime.recurrence import recurrent_inputs
+from me2e_compress.graph.recurrence import recurrent_inputs
 
 
 def adapted(model: ir.Model, adapter: str | Path | None) -> dict[str, str]:

@@ -47,6 +47,8 @@ def read_graph(
 
     An adapter's statements become metadata of the graph; see :func:`adapted`.
     """
+    if adapter is not None and graph.is_stack(path):
+        raise RecipeError(f"--adapter is for one file: {path} says state and plan")
     model = graph.load(path)
     adapted(model, adapter)
     if said := lowered(model):
@@ -156,6 +158,8 @@ def _weights(given: Path) -> Iterator[Path]:
     """Yield the external weight files of a model; none for other files."""
     try:
         model = graph.load(given)
+        if graph.is_stack(given):
+            yield from graph.paths_of(given)
     except GraphError:  # not a model, or refused before anything is written
         return
     for each in model.graphs():

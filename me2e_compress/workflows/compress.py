@@ -10,7 +10,6 @@ from typing import TypeAlias
 import onnx_ir as ir
 
 from me2e_compress import recipe as recipes
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import SQNR_FLOOR_DB, Floor
 from me2e_compress.manager import PassManager, Report
@@ -29,7 +28,6 @@ from me2e_compress.workflows.checks import (
     output_path,
     read_graph,
 )
-from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.compress_fidelity import (
     SplitFrames,
     measure_loss,
@@ -37,12 +35,17 @@ from me2e_compress.workflows.compress_fidelity import (
 from me2e_compress.workflows.compress_result import (
     CompressResult,
     write_result,
-    written_files,
 )
 from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.zoo.shipped import sample_frames
+from me2e_compress.workflows.read_frames import read_frames, split_frames
+from me2e_compress.workflows.stack_output import (
+    beside_ranges,
+    first_frames,
+    writing_model,
+    written_model,
+)
 
 Recipe: TypeAlias = str | Path | Sequence[Pass]
 """A shipped recipe's name, a TOML file, or passes."""
@@ -170,9 +173,10 @@ def compress(
 ) -> CompressResult:
     """Apply passes to a graph, check each, and write the smaller graph and a report.
 
-    The model is an ONNX file, which is not changed, or the name of one that ships.
-    Without frames exact passes are checked on seeded inputs; a model that ships has its
-    own frames.
+    The model is an ONNX file, which is not changed, the TOML of a stack, or the name of
+    a model that ships. A stack becomes a folder, with a TOML of the same name and the
+    parts' files. Without frames exact passes are checked on seeded inputs; a model that
+    ships has its own frames.
 
     Raises:
         GraphError: The model does not exist, or the output would harm an input.
@@ -191,14 +195,40 @@ def compress(
     # claim the outputs first; Python's cycle collector would walk every node
     inputs = (source, named, frames, options.module_map, options.adapter, *read)
     with (
-        writing(written_files(output), inputs, force=options.force),
+        writing_model(source, output, inputs, force=options.force) as target,
         collector_paused(),
     ):
         loaded = read_graph(source, listener, options.adapter)
         modules = load_map(options.module_map, loaded)
-        split = _split(source, loaded, frames, passes, options)
-        files = source, output, output.parent
-        return compress_graph(loaded, files, passes, modules, split, options, listener)
+        seen = read_frames(source, loaded, frames, options.provider)
+        split = split_frames(*seen, passes, options.measure_frames)
+        files = source, target, output.parent
+        first = _first_frames(files, frames, recipe, modules, options, listener)
+        found = compress_graph(loaded, files, passes, modules, split, options, listener)
+    written = written_model(source, output)
+    return dataclasses.replace(found, output=written, first_frames=first)
+
+
+def _first_frames(
+    files: tuple[Path, Path, Path],
+    frames: str | Path | None,
+    recipe: Recipe | None,
+    modules: ModuleMap,
+    options: CompressOptions,
+    listener: Listener,
+) -> dict[str, CompressResult]:
+    """Compress the files of a stack that run at first frames alone, one by one."""
+    source, target, reproducers = files
+    found = dict[str, CompressResult]()
+    for file, seen in first_frames(source, frames, options.provider):
+        ranges = options.ranges and beside_ranges(Path(options.ranges), file.label)
+        own = dataclasses.replace(options, ranges=ranges, allow_empty=True)
+        passes, draft = own.passes(recipe), target.with_name(f"{file.label}.onnx")
+        found[file.label] = compress_graph(
+            *(file.model, (file.path, draft, reproducers), passes, modules.lenient()),
+            *(split_frames(seen, None, passes, options.measure_frames), own, listener),
+        )
+    return found
 
 
 def compress_graph(
@@ -236,26 +266,6 @@ def compress_graph(
     loss = measure_loss(report, context, frames_of, Floor(options.floor), listener)
     seconds = process_time() - start
     return write_result(report, source, output, int8, loss, seconds)
-
-
-def _split(
-    source: Path,
-    loaded: ir.Model,
-    folder: str | Path | None,
-    passes: tuple[Pass, ...],
-    options: CompressOptions,
-) -> SplitFrames:
-    """Read and check the frames, and keep some for the measurement."""
-    recording = samples = None
-    if folder is not None:
-        recording = CalibrationSet(Path(folder))
-        recording.check(loaded)
-    elif (shipped := sample_frames(source)) is not None:
-        samples = CalibrationSet(shipped)
-    lossy = not all(each.exact for each in passes)
-    saved = any(each.reads_ranges and not each.needs_frames for each in passes)
-    most = options.measure_frames if lossy else 0
-    return SplitFrames.of(recording, samples, most, saved=saved)
 
 
 def _refuse_unproven(report: Report, options: CompressOptions) -> None:

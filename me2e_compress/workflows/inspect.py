@@ -12,6 +12,8 @@ from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.macs import why_uncounted
 from me2e_compress.graph.opset import lowered
+from me2e_compress.graph.recurrence import recurrent_inputs
+from me2e_compress.graph.stack.stack_file import ZEROS
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import Item, ModuleMap, assign, itemise
 from me2e_compress.passes import Context
@@ -23,10 +25,9 @@ from me2e_compress.runtime.energy.modelled import (
     modelled_energy,
 )
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.runtime.recurrence import recurrent_inputs
 from me2e_compress.workflows.adapted import adapted
 from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
-from me2e_compress.workflows.inspect_result import InspectResult
+from me2e_compress.workflows.inspect_result import FedInput, InspectResult
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.module_costs import (
     trace_of,
@@ -48,7 +49,7 @@ def inspect(
     listener: Listener = SILENT,
     adapter: str | Path | None = None,
 ) -> InspectResult:
-    """Read a graph and weigh its modules.
+    """Read a graph, or a stack of several files, and weigh its modules.
 
     `dims` are sizes that open dimensions of the inputs are given first. `process`,
     ``45nm`` or ``7nm``, is the silicon process whose figures model the energy of a
@@ -75,7 +76,23 @@ def inspect(
         taken = _timed(path, module_map, frames, listener, adapter)
     loaded = graph.load(path)
     adapted(loaded, adapter)
-    return inspected(path, loaded, load_map(module_map, loaded), dims, process, taken)
+    modules = load_map(module_map, loaded)
+    found = inspected(path, loaded, modules, dims, process, taken)
+    return _with_joints(found, path) if graph.is_stack(path) else found
+
+
+def _with_joints(found: InspectResult, path: Path) -> InspectResult:
+    """Add what feeds every file of a stack."""
+    stack = graph.JoinedStack.load(path)
+    fed = dict.fromkeys(
+        FedInput(file, name, source, form) for file, name, source, form in stack.fed()
+    )
+    firsts = {
+        name: each.first
+        for name, each in stack.content.state.items()
+        if each.first != ZEROS
+    }
+    return dataclasses.replace(found, fed=tuple(fed), first_values=firsts)
 
 
 def inspected(

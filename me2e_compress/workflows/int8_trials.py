@@ -10,6 +10,7 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import draw
+from me2e_compress.calibration.stack_frames import recording_of
 from me2e_compress.passes import Pass
 from me2e_compress.passes.fix_shapes import FixShapes, with_sizes
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
@@ -98,7 +99,7 @@ class TrialFiles:
         """Prepare the graph, calibrate once, and name the modules to try."""
         # check names and frames before anything is run
         rules, place = RULE_SETS.parse(options.rules), TARGETS.parse(target)
-        recording = CalibrationSet(self.frames)
+        recording = recording_of(self.model, self.frames, options.provider)
         loaded = graph.load(self.model)
         adapted(loaded, options.adapter)
         recording.check(loaded)
