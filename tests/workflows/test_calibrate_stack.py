@@ -47,13 +47,7 @@ def test_first_values_come_with_the_frames(tmp_path: Path) -> None:
     frames = fed(tmp_path, toml)
 
     assert seen(frames)[0] == (0, True, {"prev_bev": 1.0, "img": 1.0})
-    assert (
-        frames.fingerprint == frames.of_file(next(iter(_files(tmp_path)))).fingerprint
-    )
-
-
-def _files(folder: Path) -> list[graph.stack.part_graph.PartGraph]:
-    return list(graph.JoinedStack.load(folder / "stack.toml").files.values())
+    assert frames.fingerprint == me2e.CalibrationSet(frames.folder).fingerprint
 
 
 def test_scenes_begin_behind_the_files_for_first_frames(tmp_path: Path) -> None:
@@ -66,7 +60,8 @@ def test_scenes_begin_behind_the_files_for_first_frames(tmp_path: Path) -> None:
 
 def test_the_file_for_first_frames_sees_those_alone(tmp_path: Path) -> None:
     frames = fed(tmp_path, THREE_FILES)
-    (file,) = graph.JoinedStack.load(tmp_path / "stack.toml").first_files.values()
+    stack = graph.JoinedStack.load(tmp_path / "stack.toml")
+    (file,) = stack.first_files.values()
 
     assert seen(frames.of_file(file)) == [
         *((0, True, {"feats": 2.0}), (1, True, {"feats": 2.0}))

@@ -8,7 +8,7 @@ import onnx_ir as ir
 import pytest
 
 import me2e_compress as me2e
-from me2e_compress import graph
+from me2e_compress import graph, recipe
 from me2e_compress.errors import (
     FramesError,
     GraphError,
@@ -154,3 +154,29 @@ def test_what_is_there_is_replaced_only_if_it_is_ours(tmp_path: Path) -> None:
 
     with pytest.raises(GraphError, match="not as me2e-compress left it"):
         me2e.compress(stack, small, "exact", None, NO_CHECKS)
+
+
+def test_the_small_stack_carries_its_plan(tmp_path: Path) -> None:
+    stack, frames = write_dense(tmp_path, THREE_FILES), dense_frames(tmp_path)
+    found = me2e.compress(stack, tmp_path / "small", "full", frames, NO_CHECKS)
+
+    plan = me2e.plan(found.output).plan
+
+    assert [each.node for each in plan.decisions if each.dtype == "int8"]
+    assert {each.module for each in plan.decisions} == {"model"}
+
+
+def test_a_module_is_ablated_across_files(tmp_path: Path) -> None:
+    stack, map_file = write_dense(tmp_path), tmp_path / "map.toml"
+    map_file.write_text(
+        '[modules.a]\nrole = "feature"\npatterns = ["backbone"]\n'
+        '[modules.b]\nrole = "prediction"\npatterns = ["head"]\n'
+    )
+    options = me2e.CompressOptions(module_map=map_file, verify_frames=0)
+    passes = recipe.parse("import-normalize,ablate-modules{drop=[b],drop_outputs=true}")
+
+    found = me2e.compress(stack, tmp_path / "small", passes, None, options)
+
+    small = JoinedStack.load(found.output)
+    assert list(small.outputs) == ["feats"]
+    assert list(small.files) == ["backbone"]

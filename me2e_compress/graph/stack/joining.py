@@ -49,7 +49,10 @@ def join(content: StackFile, files: Sequence[PartGraph], folder: Path) -> Joined
     recurrent = joiner.recurrent(inputs, outputs)
     _check_joined(joiner.names.parts(), (at_next, at_first), recurrent, answers)
     first_values = joiner.first_values(inputs, at_first)
-    metadata = _merged(files) | content.said()
+    # files that run at most frames win over those for first frames
+    kept = [each.label for each in at_next.graphs.values()]
+    ranked = sorted(files, key=lambda each: each.label in kept)
+    metadata = _merged(ranked) | content.said()
     return Joined(
         *(inputs, outputs, answers, joiner.names, recurrent, first_values),
         *(at_first, at_next, metadata),

@@ -17,8 +17,9 @@ def split(
 
     A part is what computes its outputs from its inputs, both under the names that its
     file has: whoever runs the files one by one can go on. A constant that two parts
-    read stands in both. ``before`` is the metadata of the joined graph as it was read:
-    what is new in it since is written into every part.
+    read stands in both. Inputs and outputs that a pass took away are missing, and so is
+    a part without any output. ``before`` is the metadata of the joined graph as it was
+    read: what is new in it since is written into every part.
 
     Raises:
         GraphError: a part would need what another part computes and does not give.
@@ -32,16 +33,19 @@ def split(
     for part, file in joints.graphs.items():
         values = _values(model.graph)
         fed = {
-            name: values[
-                names.public(source.part, source.name) if source.part else source.name
-            ]
+            name: values[public]
             for name, source in joints.sources[part].items()
+            if (public := names.public(*source) if source.part else source.name)
+            in values
         }
         given = {
-            name: values[names.public(part, name)]
+            name: values[public]
             for name in file.outputs
-            if name not in file.inputs  # else it is passed on
+            if (public := names.public(part, name)) in values
+            and name not in file.inputs  # else it is passed on
         }
+        if not given:
+            continue
         cut = _cut(model, file, fed, given)
         cut.metadata_props.update({**file.metadata, **added})
         found[part] = cut
@@ -145,7 +149,7 @@ def _rename(
         inputs.append(value)
     graph.inputs[:] = inputs
     ends = {str(value.name): value for value in (*inputs, *graph.outputs)}
-    graph.outputs[:] = [ends[name] for name in file.outputs]
+    graph.outputs[:] = [ends[name] for name in file.outputs if name in ends]
 
 
 def _give_way(others: Mapping[str, ir.Value], name: str, value: ir.Value) -> None:

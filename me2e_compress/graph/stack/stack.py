@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from pathlib import Path
 from typing import Self
 
@@ -127,10 +127,24 @@ class JoinedStack:
         )
         for part, each in parts.items():
             single.save(each, path.with_name(f"{part}.onnx"))
-        path.write_text(self._moved(path.parent).text(), "utf-8")
+        takers = {
+            (part, str(value.name))
+            for part, each in parts.items()
+            for value in each.graph.inputs
+        }
+        takers |= {
+            (each.part, name)
+            for each in self.first_files.values()
+            for name in each.inputs
+        }
+        path.write_text(self._moved(path.parent, takers).text(), "utf-8")
 
-    def _moved(self, folder: Path) -> StackFile:
-        """Return the content for files that stand beside it under the parts' names."""
+    def _moved(self, folder: Path, takers: Set[tuple[str, str]]) -> StackFile:
+        """Return the content for files that stand beside it under the parts' names.
+
+        What is said of inputs that no part has any more is left out.
+        """
+        alive = {part for part, _ in takers}
         parts = tuple(
             each.model_copy(
                 update={
@@ -140,16 +154,28 @@ class JoinedStack:
                 }
             )
             for each in self.content.part
+            if each.name in alive
         )
-        state = dict(self.content.state)
-        for at, (name, entry) in enumerate(self.content.state.items()):
+        edges = {
+            text: output
+            for text, output in self.content.edges.items()
+            if takers & {*self.joined.names.inputs(text, "")}
+        }
+        state = {
+            text: entry
+            for text, entry in self.content.state.items()
+            if takers & {*self.joined.names.inputs(text, "")}
+        }
+        for at, (name, entry) in enumerate(list(state.items())):
             value = self.first_values.get(name.partition(".")[2])
             value = self.first_values.get(name, value)
             if value is not None:
                 file = folder / f"first_value_{at}.npy"
                 np.save(file, value, allow_pickle=False)
                 state[name] = entry.model_copy(update={"first": file.name})
-        return self.content.model_copy(update={"part": parts, "state": state})
+        return self.content.model_copy(
+            update={"part": parts, "edges": edges, "state": state}
+        )
 
 
 def load(path: str | Path) -> ir.Model:
