@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 
 import me2e_compress as me2e
+from me2e_compress import graph
 from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import Observation, Trajectory
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.errors import FramesError
+from me2e_compress.errors import FramesError, GraphError, PreconditionError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.latency_trace import LatencyTrace
+from me2e_compress.targets.tensorrt.tensorrt_engine import (
+    EngineSettings,
+    TensorRTEngine,
+)
 from tests.frames import record
 from tests.stacks import (
     HEAD,
@@ -117,3 +122,21 @@ def test_sensitivity_and_search_take_a_stack(tmp_path: Path, toml: str) -> None:
     assert rows
     me2e.search(path, frames, tmp_path / "r.toml", me2e.SearchOptions(max_mb=0.1))
     assert (tmp_path / "r.toml").is_file()
+
+
+def test_an_engine_is_built_of_the_joined_graph(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outputs = list[str | None]()
+
+    def built(file: Path, settings: EngineSettings) -> TensorRTEngine:
+        outputs.extend(value.name for value in graph.load(file).graph.outputs)
+        raise PreconditionError("far enough")
+
+    monkeypatch.setattr("me2e_compress.workflows.build.build_engine", built)
+
+    with pytest.raises(PreconditionError, match="far enough"):
+        me2e.build(write_stack(tmp_path), tmp_path / "m.engine")
+    assert outputs == ["next_bev", "plan", "feats"]
+    with pytest.raises(GraphError, match="build those of its files"):
+        me2e.build(write_stack(tmp_path, THREE_FILES), tmp_path / "m.engine")
