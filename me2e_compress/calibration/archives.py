@@ -37,6 +37,7 @@ def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared
             found = [_member(archive, each) for each in archive.infolist()]
     except UNREADABLE as error:
         raise FramesError(f"{path}: not {what} ({reason(error)})") from error
+    # A name may occur once only.
     if len(dict(found)) < len(found):
         raise FramesError(f"{path}: not {what} (an array is there twice)")
     # A header could claim any size: check before reading.
@@ -79,6 +80,7 @@ def _header(stream: IO[bytes]) -> Declared:
         shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
     else:
         raise ValueError(f"an array of version {version}")
+    # Objects would be unpickled, which runs code.
     if dtype.hasobject:
         raise ValueError("an array of Python objects")
     if any(side < 0 for side in shape):

@@ -84,7 +84,6 @@ class Calibrator:
         counting = OBSERVERS.parse(self.method).counts
         if not len(frames):
             raise FramesError("no frames to calibrate on")
-        # Without tensors, or an operator's kernel, nothing is run.
         blank = Statistics(
             graph.digest(model),
             frames.fingerprint,
@@ -92,6 +91,7 @@ class Calibrator:
             tuple(frames.places),
             np.empty((0, len(tensors), Extremes().width), np.float32),
         )
+        # Without tensors to measure, nothing is run.
         if not tensors:
             nothing = np.empty((len(frames), 0, Extremes().width), np.float32)
             return dataclasses.replace(blank, measured=nothing)
@@ -140,6 +140,7 @@ class _Job:
             settings.checkpoint, key, settings.every
         )
         self.begun = self.checkpoint.read()
+        # Continue from the checkpoint, if there is one.
         measured = self.begun.results.get("measured", blank.measured)
         counts = self.begun.results.get("counts")
         self.seen = dataclasses.replace(
@@ -174,6 +175,7 @@ class _Job:
         self, probe: Probe, before: int, take: Callable[[Readings, int], None]
     ) -> None:
         """Run the rest of a pass; ``before`` frames belong to earlier passes."""
+        # Skip what an interrupted run has done.
         begin = max(self.begun.done - before, 0)
         if begin >= len(self.frames):
             return
@@ -187,6 +189,7 @@ class _Job:
         )
         state = self.begun.state if begin else None
         readings = stream(session, self.frames, probe.width, begin, state)
+        # Store the progress from time to time.
         for at, (numbers, after) in enumerate(readings, begin):
             take(numbers, self.seen.frames[at])
             done = before + at + 1
@@ -208,6 +211,7 @@ def check_finite(readings: Readings, tensors: Sequence[str], place: int) -> None
     bad &= ~no_element(readings)
     if not bad.any():
         return
+    # Name the first tensor, and how many more there are.
     names = [tensors[at] for at in np.flatnonzero(bad).tolist()]
     kind = "NaN" if np.isnan(readings[bad][0]).any() else "infinite"
     more = f" ({', '.join(names[1:5])}{', ...' if len(names) > 5 else ''})"

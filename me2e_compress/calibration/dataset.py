@@ -20,7 +20,7 @@ from me2e_compress import documents
 from me2e_compress.calibration.archives import Declared, declared, load_arrays
 from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.calibration.static_inputs import check_static, static_inputs
-from me2e_compress.display import Displayed, Table, reason, table
+from me2e_compress.display import Displayed, Table, counted, reason, table
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.recurrence import not_fed_back, recurrent_inputs, sides
@@ -52,6 +52,7 @@ class CalibrationSet(Displayed):
             raise FramesError(f"{folder}: holds no .npz frames")
         if odd := [each for each in self.files if not each.is_file()]:
             raise FramesError(f"{odd[0]}: not a regular file")
+        # The index tells where scenes begin, and what is pixels.
         index = _index(folder / "scenes.json")
         self.scenes = _scenes(folder / "scenes.json", index, len(self.files))
         self.pixels = _pixels(folder / "scenes.json", index).inputs
@@ -59,7 +60,8 @@ class CalibrationSet(Displayed):
     @property
     def headline(self) -> str:
         """The folder and the numbers of frames and scenes."""
-        return f"{self.folder}: {len(self)} frames in {len(self.scenes)} scenes"
+        frames, scenes = counted(len(self), "frame"), counted(len(self.scenes), "scene")
+        return f"{self.folder}: {frames} in {scenes}"
 
     def tables(self) -> tuple[Table, ...]:
         """Return a table with the type and shape of each input in the first frame."""
@@ -112,6 +114,7 @@ class CalibrationSet(Displayed):
         seal.update(repr(self.scenes).encode())
         if self.pixels:
             seal.update(repr(sorted(self.pixels.items())).encode())
+        # The directory of each archive has its checksums.
         for path in self.files:
             try:
                 with zipfile.ZipFile(path) as archive:
@@ -138,6 +141,7 @@ class CalibrationSet(Displayed):
         """
         fixed = static_inputs(model)
         for path in self.files:
+            # Compare headers before any array is read.
             held = self._as_fed(path, declared(path), PixelInput.fed)
             asked = {name: held[name] for name in held if name not in fixed}
             _check_frame(asked, model, str(path))
@@ -150,6 +154,7 @@ class CalibrationSet(Displayed):
 def _check_frame(frame: Mapping[str, Declared], model: ir.Model, source: str) -> None:
     """Check names, dtypes and shapes before arrays are read."""
     ports = {str(value.name): value for value in model.graph.inputs}
+    # Recurrent inputs may come from the model itself.
     optional = recurrent_inputs(model)
     for name, value in ports.items():
         array = frame.get(name)
@@ -213,6 +218,7 @@ def synthetic(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
             raise PreconditionError(
                 f"input {value.name} is {value.dtype.name}: seeded inputs are numbers"
             )
+    # Frames are drawn lazily, all from one generator.
     generator = np.random.default_rng(seed)
     return (
         Frame(index, index == 0, {str(v.name): _draw(v, generator) for v in ports})

@@ -82,6 +82,7 @@ def read_foreign(path: Path, model: str, tensors: tuple[str, ...]) -> Ranges:
         reach = _parse(path, lines, 1, ": ", _hexadecimal)
     else:
         reach = _parse(path, lines, 0, " ", float)
+    # All required tensors must be in the cache.
     bounds = _needed(path, reach, tensors)
     return Ranges(bounds, IMPORTED, 0, model, "", calibrator=head[1] if head else "")
 

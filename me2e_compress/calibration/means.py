@@ -38,6 +38,7 @@ def token_means(
     if not values:
         return {}
     session = Session(_exposed(model, values), threads=threads, provider=provider)
+    # One pass: the averages are updated frame by frame.
     averages = {name: _Average(name) for name in values}
     for index, found in enumerate(replay(session, frames, list(values))):
         for name, average in averages.items():

@@ -51,6 +51,7 @@ class Extremes:
         count = _cast(size.outputs[0], ir.DataType.FLOAT)
         some = ir.node("Max", [count.outputs[0], least])
         mean = ir.node("Div", [total.outputs[0], some.outputs[0]])
+        # All readings are 1-D, so that they can be joined.
         flat = [
             ir.node("Reshape", [each.outputs[0], one]) for each in (low, high, mean)
         ]
@@ -88,6 +89,7 @@ class Counts:
         number = _cast(capped.outputs[0], ir.DataType.INT32)
         words = ir.node("Reshape", [number.outputs[0], row])
         bins = list(range(BINS))
+        # Count n-grams of length 1: the bin numbers.
         count = ir.node(
             "TfIdfVectorizer",
             [words.outputs[0]],

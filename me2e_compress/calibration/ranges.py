@@ -101,6 +101,7 @@ class Ranges(Displayed):
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"]) or "file"
             raise FramesError(f"{path}: not ranges: {where}: {first['msg']}") from error
+        # Bounds must be finite and in order.
         for name, (low, high) in found.tensors.items():
             if not -LARGEST <= low <= high <= LARGEST:  # NaN too
                 raise FramesError(
@@ -151,6 +152,7 @@ class Ranges(Displayed):
                 f"ranges are stale: of frames {self.source[:12]}, not {wanted[:12]};"
                 f" {again}"
             )
+        # The graph may need tensors that were not measured.
         if missing := [name for name in tensors if name not in self.tensors]:
             raise FramesError(
                 f"ranges lack {missing[0]} and {len(missing) - 1} more of"

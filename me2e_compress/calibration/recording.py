@@ -65,6 +65,7 @@ def write_recording(
     _check_replaceable(partial, PROGRESS)
     draft = _Draft(partial, _with_pixels(about, pixels or {}), key)
     try:
+        # Resume at the first scene that is not complete.
         for frame in source(draft.resume()):
             draft.write(frame)
         if not draft.scenes:
@@ -154,6 +155,7 @@ def _check_replaceable(folder: Path, mark: str = INDEX) -> None:
         return
     if not folder.is_dir():
         raise FramesError(f"{folder} is a file, not a folder for frames")
+    # An empty folder may be used.
     names = sorted(path.name for path in folder.iterdir())
     if not names:
         return

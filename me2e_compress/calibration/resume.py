@@ -48,6 +48,7 @@ class CalibrationCheckpoint:
             done = int(str(found.pop("done")))
         except (ValueError, KeyError) as error:
             raise FramesError(f"{self.path}: not a checkpoint ({error})") from error
+        # A checkpoint of another calibration is refused.
         self._check(key)
         return CalibrationState(
             done,
@@ -64,6 +65,7 @@ class CalibrationCheckpoint:
         if self.path is None:
             return
         state = {_STATE + name: array for name, array in progress.state.items()}
+        # The state shares the archive, under a prefix.
         content = io.BytesIO()
         with zipfile.ZipFile(content, "w") as archive:
             for name, array in {

@@ -91,6 +91,7 @@ def shard(part: FrameSubset, number: int, count: int) -> FrameSubset:
     if not 1 <= number <= count:
         raise FramesError(f"no shard {number} of {count}: they count from 1")
     taken = set(part.places)
+    # Divide whole scenes only: state runs through them.
     scenes = [
         [place for place in scene if place in taken] for scene in _scenes(part.whole)
     ]

@@ -39,6 +39,7 @@ def check_whole(shares: Sequence[Share | None]) -> None:
                 f" {each.number} are of different draws ({len(first.drawn)} and"
                 f" {len(each.drawn)} frames): give -n and --seed alike"
             )
+    # All shards must be there.
     numbers = [each.number for each in known]
     if missing := [at for at in range(1, first.count + 1) if at not in numbers]:
         raise FramesError(

@@ -63,6 +63,7 @@ class Statistics:
         if not empty.any():
             return self.measured
         rows = np.arange(len(self.frames))[:, None]
+        # Take the last frame with an element, for each tensor.
         last = np.maximum.accumulate(np.where(empty, -1, rows), axis=0)
         taken = np.where(last < 0, np.argmin(empty, axis=0), last)
         filled = self.measured[taken, np.arange(len(self.tensors))]
@@ -135,6 +136,7 @@ class Statistics:
         finite = np.isfinite(measured[..., :2]).all(-1)
         if not (finite | no_element(measured)).all():
             raise FramesError(f"{path}: not saved statistics (a bound is not finite)")
+        # An empty array stands for no histograms.
         return cls(
             str(held["model"]),
             str(held["source"]),

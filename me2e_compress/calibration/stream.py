@@ -121,6 +121,7 @@ def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.M
     known = _values(copy)
     if missing := [name for name in tensors if name not in known]:
         raise GraphError(f"the graph has no tensor {missing[0]}")
+    # Measure each tensor right after its producer.
     readings = [
         reading
         for at, name in enumerate(tensors)
@@ -163,6 +164,7 @@ def schedule_probes(model: ir.Model) -> None:
             order.append(node)
             pending += [each for out in node.outputs for each in ready(out)]
 
+    # Place nodes without inputs, readers of inputs, then the rest.
     place([node for node in waiting if not waiting[node]])
     for value in model.graph.inputs:
         place(list(ready(value)))
@@ -188,11 +190,13 @@ def _watch(
     if value.dtype not in (None, ir.DataType.FLOAT):
         nodes.append(ir.node("Cast", [value], {"to": ir.DataType.FLOAT.value}))
         seen = nodes[0].outputs[0]
+    # Names tell which tensor a probe measures.
     measuring, readings = probe.read(where, seen, at)
     nodes += measuring
     for order, node in enumerate(nodes):
         node.name = f"{READINGS}/{value.name}/{order}_{node.op_type}"
         node.outputs[0].name = node.name
+    # A graph input is measured before anything else runs.
     producer = value.producer()
     if producer is not None:
         where.insert_after(producer, nodes)

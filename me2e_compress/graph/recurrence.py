@@ -13,7 +13,7 @@ RECURRENT = "me2e.recurrent"
 ``{}`` where none is."""
 
 SUFFIX, BEFORE, AFTER = "_out", "prev_", "next_"
-"""The naming rules: ``X`` is answered by ``X_out``, ``prev_X`` also by ``next_X``."""
+"""Naming rules: input ``X`` pairs with ``X_out``, ``prev_X`` also with ``next_X``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +49,7 @@ def recurrence(
     pairs = {source: to for source, to in (named or {}).items() if to is not None}
     for source, answer in pairs.items():
         _check(source, answer, inputs, outputs)
+    # An output feeds one input only.
     for source in inputs:
         found = _answer(source, outputs)
         if found is None or source in (named or {}) or found in pairs.values():

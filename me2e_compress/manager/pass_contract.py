@@ -6,6 +6,7 @@ import onnx
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.display import counted
 from me2e_compress.errors import GraphError, Me2eError, VerificationError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.shapes import refined
@@ -80,7 +81,7 @@ def blame_file(name: str, before: ir.Model, found: Me2eError) -> None:
 def _check_claim(current: Pass, result: PassResult, *, changed: bool) -> None:
     if result.changes and not changed:
         raise VerificationError(
-            f"{current.name} claims {result.changes} changes but made none"
+            f"{current.name} claims {counted(result.changes, 'change')} but made none"
         )
     if changed and not result.changes:
         raise VerificationError(f"{current.name} changed the graph and denies it")

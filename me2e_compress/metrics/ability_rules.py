@@ -77,7 +77,6 @@ def _signs(
     counted = good + sum(bool(each) for each in passed.values())
     if not episodes:
         return _share(0, episodes)
-    # the share; half a success has no binomial interval
     # half a success has no binomial interval
     rate = 100.0 * counted / (2 * len(episodes))
     return Estimate(Measure(rate, "%"), None, None, len(episodes))

@@ -124,13 +124,13 @@ def smooth_blocks(
     All arguments are [B, N]: the acceleration along the heading, across it and its norm
     in the plane (m/s2), and the yaw rate in degrees per second.
     """
-    # the yaw rate is unwrapped as the original does, with radians on degrees
+    # as the original: degrees are unwrapped as if they were radians
     a_along, a_across, a_length = map(_smoothed, (along, across, length))
     turns = np.round(np.diff(yaw_rate_degps) / (2.0 * np.pi)).cumsum(axis=1)
     turned = np.pad(turns, ((0, 0), (1, 0)))
     yaw_rate = _smoothed(yaw_rate_degps - 2.0 * np.pi * turned)
     yaw_acceleration = yaw_rate
-    # bounds in SI units, which the original compares with degrees
+    # the last two bounds are in radians, the yaw rate is in degrees
     within = (
         (a_along > -4.05) & (a_along < 2.40),
         np.abs(a_across) < 4.89,

@@ -109,7 +109,7 @@ def _moving(frames: Sequence[EgoFrame]) -> npt.NDArray[np.bool_]:
 def smooth_frames(episode: Episode, bounds: Bounds = BOUNDS) -> npt.NDArray[np.bool_]:
     """Return for each of at least 7 frames whether all six variables are in range."""
     frames = episode.frames
-    # smoothed signals need the acceleration in the world for the jerk
+    # the jerk needs the acceleration vector in the world
     along = np.array([frame.acceleration_mps2 for frame in frames])
     left = np.array([frame.lateral_acceleration_mps2 for frame in frames])
     heading = np.array([frame.heading for frame in frames])

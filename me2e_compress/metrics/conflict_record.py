@@ -11,7 +11,7 @@ TTC_HORIZON_S = 10.0
 threshold in use (0.95 s in nuPlan, 1.5 s in SSAM, 4 s in driver assistance)."""
 
 PET_HORIZON_S = 5.0
-"""Longest post-encroachment time that is one: SSAM's default (FHWA-HRT-08-051)."""
+"""Longest post-encroachment time: SSAM's default (FHWA-HRT-08-051)."""
 
 CROSSING_RAD = math.radians(30.0)
 """From this angle between headings paths cross or merge; below it one follows the
@@ -29,7 +29,6 @@ class Encounter:
     """The ego and a moving actor were at the same place, one after the other.
 
     Attributes:
-        actor: Id of the actor in the scene.
         time_us: When the second of the two arrived.
         pet_s: Post-encroachment time (Allen, Shin and Cooper 1978; SAE J2944): from the
             moment when the first left a place until the second arrived, the minimum

@@ -15,7 +15,7 @@ FLAT = 1e-12
 """A column whose standard deviation is below this share of its values is constant."""
 
 ALIKE = 1e-9
-"""Below this all criteria together tell nothing that another does not."""
+"""Below this share, all criteria are redundant."""
 
 
 def critic_weights(rows: Floats) -> Floats:

@@ -20,7 +20,7 @@ POINTS = "points"
 """Difference of two percentages."""
 
 WIDEST = (-100.0, 100.0)
-"""What a route can differ by, in points."""
+"""Bounds of a route's difference, in points."""
 
 
 SCATTER = 12.0
@@ -29,7 +29,7 @@ the driver that ships and its int8 forms on the 220 routes, decisions free: 11.2
 (``benchmarks/driver/schemes``)."""
 
 Z = 1.96
-"""Of a 95 % interval."""
+"""Standard score of a 95 % interval."""
 
 
 def shown_by(routes: int) -> float:
@@ -120,11 +120,7 @@ class PairedDifference:
 def difference(
     episodes: Sequence[Episode], reference: Sequence[Episode], seed: int = 0
 ) -> PairedDifference:
-    """Compare two drives route by route; at least one route is needed.
-
-    Raises:
-        EvaluationError: The two were not driven on the same routes.
-    """
+    """Compare two drives of the same routes, at least one, route by route."""
     # routes must match, whatever their order
     others = {episode.route: episode for episode in reference}
     unpaired = sorted({*others} ^ {episode.route for episode in episodes})

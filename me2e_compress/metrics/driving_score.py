@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from me2e_compress.metrics.episode import Episode
 
 DIGITS = 6
-"""The leaderboard rounds each of the three scores to so many digits."""
+"""Digits to which the leaderboard rounds each of the three scores."""
 
 
 @dataclass(frozen=True, slots=True)

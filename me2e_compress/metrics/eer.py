@@ -148,13 +148,7 @@ def route_eer(table: Floats, crashed: npt.NDArray[np.bool_], scale: EerScale) ->
 
 
 def scale_of(tables: Mapping[str, Floats], normalization: Normalization) -> EerScale:
-    """Return offset and span of every measure, and their weights by CRITIC.
-
-    The tables are [routes, 4] by variant, without missing values.
-
-    Raises:
-        EvaluationError: CRITIC finds no weights.
-    """
+    """Return offset, span and CRITIC weights of every measure, from complete tables."""
     # the values that the scale is taken over
     rows = np.concatenate(list(tables.values()))
     if normalization is Normalization.VARIANT_MEANS:

@@ -9,7 +9,7 @@ from me2e_compress.metrics.measure import Measure
 CHECKPOINTS = 20
 OUTLIER_PERCENT = 1000.0
 DONE_PERCENT = 95.0
-"""Beyond this much of a route Bench2Drive reports the speed over what is left of it."""
+"""Beyond this Bench2Drive also reports the speed over the last stretch."""
 PERCENT = "%"
 
 

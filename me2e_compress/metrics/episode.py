@@ -47,12 +47,10 @@ class Ending(StrEnum):
 class EgoFrame:
     """The ego at one instant, every 50 ms, in SI units.
 
-    x points east, y north; angles are counter-clockwise from east, in radians.
+    x points east, y north; angles are counter-clockwise from east.
 
     Attributes:
         time_us: Simulated microseconds since the route began.
-        acceleration_mps2: Acceleration along the heading.
-        lateral_acceleration_mps2: Acceleration to the left.
         steering_rad: Angle of the front wheels, left positive; None if not reported.
         route_m: Metres of the route passed; never decreases.
         traffic_speed_mps: Mean speed of nearby vehicles, None if there are none.

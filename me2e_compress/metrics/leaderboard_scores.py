@@ -19,11 +19,7 @@ from me2e_compress.metrics.scores import FULL_SET
 
 @dataclass(frozen=True, slots=True)
 class Quotients:
-    """One sum over records, divided in two ways.
-
-    ``over_set`` divides by the size of the whole set, so that a missing route is zero;
-    ``over_driven`` divides by the number of records.
-    """
+    """One sum over records, divided by the size of the set or by the records."""
 
     over_set: Measure
     over_driven: Measure

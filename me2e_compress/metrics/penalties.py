@@ -23,11 +23,10 @@ class LeaderboardPenalties:
     """The rules of one version.
 
     Attributes:
-        costs: Factor by kind of infraction, or summand if `summed`; a kind that is not
-            listed costs nothing.
+        costs: Factor by kind of infraction, or summand c of 1 / (1 + sum c) if
+            `summed`; a kind that is not listed costs nothing.
         min_speed: Penalty of a check point passed at no speed. At v % of the traffic's
             speed it is (1 - v/100) times that, and nothing from 100 % on.
-        summed: Whether the costs are summands c of 1 / (1 + sum c) instead of factors.
     """
 
     costs: Mapping[InfractionKind, float]

@@ -25,18 +25,16 @@ FULL_SET = 220
 """Routes of a whole benchmark: 44 scenario types with 5 variants each."""
 
 PERCENT, SHARE = (0.0, 100.0), (0.0, 1.0)
-"""Bounds of what a route can have."""
+"""Bounds of a route's values."""
 
 
 @dataclass(frozen=True, slots=True)
 class SafetyScores:
     """How near the routes came to collisions; None where it was not recorded.
 
-    Attributes:
-        ttc_exposure: Percent of the frames with a time to collision below 1.5 s.
-        smallest_ttc: Seconds, over routes on which a contact was ever within 10 s.
-        smallest_pet: Post-encroachment time, seconds, over routes with crossing paths.
-        smallest_distance: Metres between outlines.
+    ``ttc_exposure`` is the percentage of frames with a time to collision below 1.5 s;
+    the smallest values are means of the routes' minima, in seconds or metres: TTC over
+    routes on which a contact was ever within 10 s, PET over routes with crossing paths.
     """
 
     ttc_exposure: Estimate
@@ -60,16 +58,11 @@ class SafetyScores:
 class Scores:
     """Means over the driven routes, each with its interval.
 
-    Attributes:
-        success_rate: Percent of routes completed without an infraction.
-        comfort: Share of smooth segments (equation 7), SI units.
-        comfort_in_motion: Comfort over the segments in which the ego moved.
-        abilities: Mean of the five success rates, percent.
-        bench2drive_efficiency: Efficiency by Bench2Drive's own arithmetic.
-        bench2drive_smoothness: Its smoothness, which it also calls comfort.
-        expected: Number of routes of the whole set; fewer driven means a partial
-            result.
-        failures: How the policy or the simulator failed, by the route that it ended.
+    Percentages, except for comfort: it is the share of smooth segments (equation 7, SI
+    units), ``comfort_in_motion`` that of segments in which the ego moved. The fields
+    ``bench2drive_...`` follow Bench2Drive's own arithmetic; its smoothness is also
+    called comfort there. ``failures`` has the reason for each route that the policy or
+    the simulator ended by failing. A partial result has fewer routes than ``expected``.
     """
 
     driving_score: Estimate
@@ -88,7 +81,7 @@ class Scores:
 
     @property
     def failed(self) -> str:
-        """How many routes a failure ended, and one of them; empty if none."""
+        """Number of routes that a failure ended, with one of them; empty if none."""
         if not self.failures:
             return ""
         route, words = next(iter(self.failures.items()))

@@ -117,13 +117,16 @@ class RawAttention(Dialect):
         value, shapes, reference, offsets, raw = (np.asarray(each) for each in arrays)
         count, (batch, queries, heads, _) = len(shapes), offsets.shape
         group = reference.shape[-1] // 2
+        # Offsets in pixels, around the reference points
         parted = offsets.reshape(batch, queries, heads, count, -1, group, 2)
         scale = shapes[:, None, None, ::-1].astype(np.float64)
         # an empty level has no positions: any number will do
         parted = parted.astype(np.float64) / np.where(scale == 0, 1, scale)
         at = parted + reference.reshape(batch, queries, 1, 1, 1, group, 2)
+        # Softmax in float64
         powers = np.exp(raw - raw.max(axis=-1, keepdims=True).astype(np.float64))
         weights = powers / powers.sum(axis=-1, keepdims=True)
+        # Start of each level
         areas = shapes.astype(np.int64).prod(axis=1)
         return (
             value,
@@ -173,6 +176,7 @@ def _levels_and_group(
         raise PreconditionError(
             f"{name}: the shapes of {shapes.name} and {reference.name} must be known"
         )
+    # Offsets and weights must agree with both numbers
     group = pairs // 2
     whole = (
         steps is None

@@ -171,6 +171,7 @@ def _neighbours(
 ) -> list[tuple[ir.Value, ir.Value, ir.Value]]:
     """Write index, inside and share of the two pixels around a position on one axis."""
     size = _as(call, count, position)
+    # The pixel below the position, and the distance to it
     scaled = call.add("Mul", [position, size])
     pixel = call.add("Sub", [scaled, call.numbers(0.5, position)])
     low = call.add("Floor", [pixel])
@@ -181,6 +182,7 @@ def _neighbours(
         (low, call.add("Sub", [one, part])),
         (call.add("Add", [low, one]), part),
     ):
+        # A neighbour outside of the map counts as zero
         inside = call.add(
             "And",
             [

@@ -61,6 +61,7 @@ class FusedCall:
         )
         for index, value in enumerate(made.outputs):
             value.name = fresh_name(f"{name}_{index}", self.names)
+        # Shape and type are inferred at once
         provenance.inherit(made, [self.node], by=self.by)
         self._where.insert_before(self.node, made)
         _infer(made, self.opset)

@@ -241,12 +241,14 @@ class Dialect:
             return
         wanted = operand.dims.split()
         fits = len(wanted) == len(shape)
+        # A letter stands for one size in all operands
         for letter, size in zip(wanted, shape, strict=False):
             if size is None or letter == "*":
                 continue
             known = int(letter) if letter.isdigit() else sizes.setdefault(letter, size)
             fits = fits and known == size
         if not fits:
+            # Show the sizes found so far
             spelt = {letter: f"{letter}={size}" for letter, size in sizes.items()}
             form = ", ".join(spelt.get(letter, letter) for letter in wanted)
             raise PreconditionError(

@@ -162,17 +162,20 @@ def _nearby(
     at: NdArray, size: int, options: Attributes
 ) -> list[tuple[NdArray, NdArray]]:
     aligned, mode = bool(options["align_corners"]), options["interpolation_mode"]
+    # Position in pixels, padded unless bicubic
     pixel = (at + 1) / 2 * (size - 1) if aligned else ((at + 1) * size - 1) / 2
     if mode != _BICUBIC:
         pixel = _looked_up(pixel, size, options)
     low = np.floor(pixel)
     part = pixel - low
+    # Neighbours and their shares
     if mode == _NEAREST:
         found = [(np.round(pixel), np.ones_like(pixel))]
     elif mode == _BILINEAR:
         found = [(low, 1 - part), (low + 1, part)]
     else:
         found = [(low + step, _cubic(np.abs(part - step))) for step in (-1, 0, 1, 2)]
+    # Bicubic neighbours are padded one by one
     result = []
     for place, share in found:
         edge = _looked_up(place, size, options) if mode == _BICUBIC else place

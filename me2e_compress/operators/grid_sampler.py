@@ -180,6 +180,7 @@ class GridSampler2D(Operator):
         known = [dim for dim in shape or () if dim is not None]
         if shape is None or len(known) < len(shape):
             return None
+        # Nearest moves data only
         mode = number(attributes, "interpolation_mode")
         if mode == 1:
             return 0

@@ -107,6 +107,7 @@ class Inverse(Operator):
 
 def _minors(size: int) -> NdArray:
     """Return the indices of each adjugate element's minor, [n, n, n - 1, n - 1]."""
+    # Rows and columns without the i-th
     kept = np.array([[j for j in range(size) if j != i] for i in range(size)])
     # element (i, j) of the adjugate is the minor without row j and column i
     rows, columns = kept[None, :, :, None], kept[:, None, None, :]

@@ -59,6 +59,7 @@ def import_domains(model: ir.Model) -> None:
     """Import the used domains only; constants of functions become Constant nodes."""
     bodies: list[ir.Graph | ir.Function] = [model.graph, *model.functions.values()]
     for body in bodies:
+        # Drop unused imports and add missing ones
         used = {node.domain for node in nodes_in(body)}
         for domain in [each for each in body.opset_imports if each not in STANDARD]:
             if domain not in used:
@@ -99,6 +100,7 @@ def expand(
         raise PreconditionError(
             f"{by} needs opset {_LEAST_OPSET} or later; the graph is of {opset}"
         )
+    # Own form, body, and back to the layout of the dialect
     call = FusedCall(node, opset=opset, by=by, names=names, compiled=compiled)
     inputs, attributes = _own_call(call, dialect)
     result = operator.body(call, inputs, attributes)
@@ -152,6 +154,7 @@ def set_output(node: ir.Node, operator: Operator, dialect: Dialect) -> bool:
         dims = own if result.shape is None else merged
         if len(dims) == len(own) and (result.shape is None or tuple(dims) != found):
             result.shape, known = ir.Shape(list(dims)), True
+    # The type follows from the inputs
     kind = dialect.output_type(node.inputs)
     if result.type is None and kind is not None:
         result.type, known = ir.TensorType(kind), True

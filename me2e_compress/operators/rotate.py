@@ -127,6 +127,7 @@ class Rotate(Operator):
         """Compute it in numpy, [C, H, W] float64."""
         image, angle, center = (np.asarray(each, np.float64) for each in inputs)
         channels, height, width = image.shape
+        # Rotate the pixel centres back
         turn = -np.deg2rad(angle.item())
         y, x = np.mgrid[:height, :width] + 0.5
         x, y = x - center[0], y - center[1]
@@ -137,6 +138,7 @@ class Rotate(Operator):
             ],
             axis=-1,
         )
+        # Sample, rounded to pixel centres for nearest
         if attributes["interpolation"] == 1:
             at = np.round(at - 0.5) + 0.5
         size = np.array([width, height], np.float64)

@@ -158,6 +158,7 @@ def _fit(edge: Edge, new: ir.Value, old: ir.Value) -> int:
     have, want = _as_queries(new, old), graph.static_shape(old)
     if have is None or want is None or new.dtype != old.dtype:
         return 0
+    # All other axes must agree
     axis = edge.axis
     if not -len(want) <= axis < len(want) or want[axis] < 2:
         return 0

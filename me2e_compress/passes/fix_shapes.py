@@ -157,6 +157,7 @@ def _size(
         return sizes.get(place, dim)
     if dim.value in sizes:
         return sizes[dim.value]
+    # Evaluate expressions such as 2*s0 + 1
     symbols = _symbols(dim)
     if not any(name in sizes for name in symbols):
         return dim

@@ -74,6 +74,7 @@ def _reshape(
 
 
 def _inferred(model: ir.Model, node: ir.Node, what: str) -> dict[str, tuple[int, ...]]:
+    # Constants up to a limit are shown to the inference
     opset = model.opset_imports.get(node.domain, 0)
     read = [value for value in node.inputs if value is not None]
     try:
@@ -94,6 +95,7 @@ def _inferred(model: ir.Model, node: ir.Node, what: str) -> dict[str, tuple[int,
             f"{what} does not fit {node.name} ({node.op_type}), which reads"
             f" {listed(read)}"
         ) from error
+    # Only static shapes count
     return {
         name: tuple(dim.dim_value for dim in kind.tensor_type.shape.dim)
         for name, kind in found.items()

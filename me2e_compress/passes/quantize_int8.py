@@ -163,6 +163,7 @@ class QuantizeInt8(Pass):
         rules = self.rules
         if isinstance(rules, str):
             rules = RULE_SETS.parse(rules)
+        # Options of the pass override those of the rule set
         options: dict[str, object] = {"without": (*rules.without, *self.without)}
         if self.attention_limit is not None:
             options["attention_limit"] = self.attention_limit
@@ -212,6 +213,7 @@ def _findings(plan: QuantPlan, ranges: Ranges) -> tuple[str, ...]:
     on = counted(ranges.frames, "frame")
     notes = [f"{counted(len(ranges.tensors), 'tensor')} calibrated on {on}"]
     costs = sorted(sharing_costs(plan, ranges), key=lambda cost: -cost.loss_db)
+    # Losses of tensors that share a scale, largest first
     shared = [
         f"{cost.group.name}: {len(cost.group.tensors)} tensors, {cost.tensor} loses"
         f" {cost.loss_db:.1f} dB"

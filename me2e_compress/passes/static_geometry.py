@@ -94,6 +94,7 @@ class StaticGeometry(Pass):
                 f"{self.name} needs recorded frames (--frames) or a file"
                 " (calibration=RIG.npz)"
             )
+        # All frames must agree with the first
         found: dict[str, Array] = {}
         for frame in context.frames:
             for name in names:
@@ -119,6 +120,7 @@ def _check(value: ir.Value, array: Array, where: str) -> None:
     kind = None if value.dtype is None else value.dtype.numpy()
     if kind is not None and array.dtype != kind:
         raise FramesError(f"{where} is {array.dtype}, expected {kind}")
+    # Open dimensions fit any size
     wanted = open_shape(value)
     if wanted is not None and (
         len(wanted) != array.ndim

@@ -35,6 +35,7 @@ def result_of(model: ir.Model, part: Part, like: ir.Value | None = None) -> ir.V
         return found[-1]
     if like is None or not found:
         raise PreconditionError(f"no value leaves a scope {part.name} in this graph")
+    # Prefer the best fit, then the last value
     ranked = [(fit(value, like), index) for index, value in enumerate(found)]
     best, index = max(ranked)
     if not best:
@@ -141,6 +142,7 @@ def shaped_like(
     shaped = reshaped(where, new, padded, readers, by)
     if padded == want:
         return shaped
+    # Repeat along axes of size 1
     node = ir.node("Expand", [shaped, _size(where, want, old)])
     provenance.inherit(node, readers, by=by)
     return finished(where, node, want, new, f"{new.name}_repeated")

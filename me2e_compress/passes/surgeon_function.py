@@ -19,12 +19,13 @@ NodeKey = tuple[str, str, tuple[str | None, ...], tuple[str | None, ...]]
 class SurgeonFunction(Pass):
     """Run a function over the graph as onnx-graphsurgeon sees it.
 
-    Modules, origins and other metadata, which graphsurgeon drops, are restored;
-    new nodes belong to the module of their neighbours. In the function,
-    call ``fold_constants`` and ``cleanup`` with ``recurse_functions=False``.
+    Modules, origins and other metadata, which graphsurgeon drops, are restored; new
+    nodes belong to the module of their neighbours. In the function, call
+    ``fold_constants`` and ``cleanup`` with ``recurse_functions=False``.
 
     Given:
         a = Relu(x)  ;  y = Relu(a)     and a function that drops the second Relu
+
     Result:
         y = Relu(x)                     with the provenance of the first
 
@@ -51,6 +52,7 @@ class SurgeonFunction(Pass):
             raise PassError(
                 f"{self.name} returned a {type(given).__name__}, not a graph or None"
             )
+        # Restore what graphsurgeon drops
         result = from_graphsurgeon(
             handed if given is None else given, model, by=self.name
         )

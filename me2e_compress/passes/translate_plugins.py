@@ -53,6 +53,7 @@ class TranslatePlugins(Pass):
         """
         counts: Counter[str] = Counter()
         for fused in operators.fused_nodes(model):
+            # Refuse operators that the library lacks
             to = operators.dialect_of(fused.operator, self.dialect)
             if to is None:
                 raise PreconditionError(self._lacks(fused))

@@ -37,9 +37,7 @@ class AnySession(Protocol):
         ...
 
     def first_state(self, held: Mapping[str, Array]) -> dict[str, Array]:
-        """Return the recurrent inputs for the start of a scene.
-
-        Arrays in ``held``, which come from the frame, take precedence.
+        """Return the recurrent inputs for the start of a scene; ``held`` comes first.
 
         Raises:
             GraphError: an input of unknown shape has no first value.

@@ -32,10 +32,9 @@ _KERNEL = "_kernel_time"
 class Breakdown:
     """The time of every inference, divided in two ways that each add up to the total.
 
-    Attributes:
-        modules_us: by module, largest first; nodes without a module are under
-            :data:`NOWHERE`, time outside of nodes is under :data:`BETWEEN`.
-        operators_us: by operator as it runs: ``FusedConv``, ``QGemm``.
+    ``modules_us`` has nodes without a module under :data:`NOWHERE` and time outside of
+    nodes under :data:`BETWEEN`; ``operators_us`` has operators as they run:
+    ``FusedConv``.
     """
 
     modules_us: Microseconds
@@ -90,6 +89,7 @@ def break_down(
     places = {name: modules[str(node.name)] for name, node in made_of.items()}
     # Record no more events than the profiler can hold.
     wanted = max(1, min(runs, MOST_EVENTS // max(1, len(found.graph))))
+    # Profile the source graph: the session optimizes it again.
     with tempfile.TemporaryDirectory(prefix="me2e-profile-") as folder:
         session = Session(
             source, threads=threads, provider=provider, profiled=Path(folder)
@@ -124,6 +124,7 @@ def node_runs(lines: Iterable[str]) -> Iterator[tuple[int, list[NodeRun]]]:
     for line in lines:
         event = _event(line)
         if event.get("cat") == "Node" and str(event["name"]).endswith(_KERNEL):
+            # Events come at the end of a node, so its body's are earlier.
             begin = int(event["ts"])
             while nodes and nodes[-1].begin_us >= begin:  # inside of this one
                 nodes.pop()
@@ -152,6 +153,7 @@ def _divided(
         for node in nodes:
             modules.add(places.get(node.name) or NOWHERE, index, node.taken_us)
             operators.add(node.operator, index, node.taken_us)
+        # What the nodes do not account for is counted separately.
         rest = max(0, taken_us - sum(node.taken_us for node in nodes))
         modules.add(BETWEEN, index, rest)
         operators.add(BETWEEN, index, rest)

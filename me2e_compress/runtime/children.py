@@ -34,6 +34,7 @@ def sheltered() -> Iterator[None]:
         if os.name == "posix":
             with _told("PYTHONWARNINGS", _TRACKER_IS_SILENT):
                 resource_tracker.ensure_running()  # else a lock starts it unsheltered
+        # Children inherit the signal mask of this thread.
         with _deaf_to_interrupts():
             yield
 
@@ -131,6 +132,7 @@ def run_script(
     Raises:
         subprocess.TimeoutExpired: it took longer than ``timeout_s`` and was killed.
     """
+    # With -P the current folder is not searched for modules.
     command = [sys.executable, "-P", child_main.__file__, str(script), *words]
     ear, mouth = os.pipe()  # nothing is ever said: it ends when this process does
     try:

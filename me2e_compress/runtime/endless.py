@@ -50,6 +50,7 @@ def _rounds(node: ir.Node) -> float:
         return 1
     if goes_on is not body.inputs[1] and not _is_true(goes_on):
         return 1
+    # Without a limit, the loop never ends.
     most = input_at(node, 0)
     if most is None:
         return math.inf

@@ -58,6 +58,7 @@ def try_apart(
             signal.
     """
     begun = perf_counter()
+    # What cannot run is refused later, with a reason.
     if unsupported(model):
         return 0.0
     try:
@@ -82,7 +83,7 @@ def try_apart(
         steps = "open" if feeds is None else "run"
         words = [str(file), str(inputs), steps, ",".join(kernels), *CPU.left_out]
         done = run_script(_SCRIPT, words)
-    # A script that died of a signal is a crash; store the rest.
+    # Exit codes that the script does not give itself mean a crash.
     if done.returncode not in _REFUSED:
         step = (done.stdout.split() or ["start"])[-1]
         raise GraphError(f"{name}: onnxruntime {_end(done.returncode)} at step {step}")

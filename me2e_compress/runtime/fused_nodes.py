@@ -91,6 +91,7 @@ def compiled_or_expanded(
     if not ours:
         return model, ()
     copy = model.clone()
+    # Bodies depend on the types and ranks of their inputs.
     if any(_is_bare(node) for node in unknown_nodes(copy) if node.op_type in ours):
         graph.infer_shapes(copy)  # the file does not say what bodies have to know
     # Expand the fused nodes; bodies may call kernels.
@@ -104,6 +105,7 @@ def compiled_or_expanded(
     for node in list(unknown_nodes(copy)):
         if compiled and _calls_kernel(node):
             read_int8(node, _opset(node, copy), _names(node, taken))
+    # List the kernels, and import their domain.
     needed: dict[str, kernels.CompiledKernel] = {}
     for node in unknown_nodes(copy):
         if node.domain == kernels.DOMAIN and node.graph is not None:

@@ -26,7 +26,7 @@ FORMATS = (
     " expected"
 )
 _RAIL = re.compile(r"\b([A-Z][A-Z0-9_]*) (\d+)mW/\d+mW")
-"""Present and average milliwatts; newer releases also print both units."""
+"""Present and average milliwatts; newer releases print both with their unit."""
 _LONGEST_MS = 1e9
 
 
@@ -66,6 +66,7 @@ def read_imports(paths: Sequence[Path]) -> Imported:
         found = _joined(found, read_import(path), path)
     if found.samples_us:
         return found
+    # A profile alone gives one latency, the sum of its layers.
     if found.layers_us:
         whole = sum(taken for (taken,) in found.layers_us.values())
         return _with(found, samples_us=(whole,))
@@ -75,6 +76,7 @@ def read_imports(paths: Sequence[Path]) -> Imported:
 
 def read_import(path: Path) -> Imported:
     """Read one file."""
+    # The first character tells JSON from a log.
     try:
         content = documents.content(path)
         text = content.decode("utf-8-sig", errors="replace")

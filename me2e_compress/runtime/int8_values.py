@@ -80,9 +80,11 @@ def _stored(value: ir.Value | None, channels: int | None) -> _Stored | None:
             if known is None or known.any():
                 return None
             zero = None
+        # The kernel takes one scale, or one for each channel.
         last = node.attributes.get_int("axis", 1) in (-1, len(source.shape) - 1)
         fits = _size(scale) == 1 or (last and _size(scale) == channels)
         return _Stored(source, scale, zero) if fits else None
+    # The other form: integers cast to float, times a scale.
     if node := _maker(value, "Mul"):
         cast, scale = _maker(node.inputs[0], "Cast"), node.inputs[1]
         if cast is None or cast.inputs[0] is None or scale is None:

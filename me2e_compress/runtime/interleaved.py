@@ -69,6 +69,7 @@ def time_interleaved(
             start, used = perf_counter(), process_time()
             for _ in replay(session, frames[:1]):
                 pass
+            # The first round only warms up.
             if turn:
                 wall[name].append(perf_counter() - start)
                 cpu[name].append(process_time() - used)

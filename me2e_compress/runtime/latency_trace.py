@@ -113,6 +113,7 @@ class LatencyTrace(Displayed):
         shown = [(name, _ms(taken_us)) for name, taken_us in rows]
         note = _untold(len(self.samples_us))
         whole = table(self.headline, ("latency", "ms"), shown, note)
+        # Times of modules are optional.
         if not self.modules_us:
             return (whole,)
         count = len(next(iter(self.modules_us.values())))
@@ -135,6 +136,7 @@ class LatencyTrace(Displayed):
         modules = {"modules_us": taken} if taken else {}
         others = self.others
         busy = {} if others is None else others.to_json()
+        # What was not measured is left out.
         return {
             "model_sha256": self.model_sha256,
             "machine": self.machine,

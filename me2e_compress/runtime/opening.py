@@ -100,6 +100,7 @@ def open_file(
     """
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
+    # Most files open directly, without being loaded here.
     if not _holds_any(path, (_OWN_NODE, _LOOP)):
         try:
             return _build(str(path), options, provider, without), {}
@@ -161,6 +162,7 @@ def open_graph(
         name: ort.OrtValue.ortvalue_from_numpy(np.ascontiguousarray(tensor.numpy()))
         for name, tensor in lent.items()
     }
+    # The arrays stand in for an external file.
     options.add_external_initializers(list(weights), list(weights.values()))
     bare = _without(model, lent).SerializeToString()
     return _build(bare, options, provider, without), weights

@@ -61,6 +61,7 @@ def origins(source: ir.Model, found: ir.Model) -> dict[str, ir.Node]:
         known[node] = known[node] or _first(
             known.get(reader) for value in node.outputs for reader in value.consumers()
         )
+    # Readers may be unknown too: fall back to the inputs.
     for node in found.graph:
         known[node] = known[node] or _first(
             known.get(maker)

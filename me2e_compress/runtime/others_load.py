@@ -71,6 +71,7 @@ class OthersLoad:
                 (self._clock(), self._machine(), self._ours()), self._begun, strict=True
             )
         )
+        # A short block is not judged.
         if wall >= SHORTEST_S:
             others = max(0.0, machine - ours) / wall
             self.load = Load(others, os.cpu_count() or 1)

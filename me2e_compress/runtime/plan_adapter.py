@@ -17,7 +17,7 @@ PLAN = "me2e.plan"
 DEFAULT_OUTPUT = "plan"
 
 CONTRACT_WAYPOINTS, CONTRACT_STEP_S = 6, 0.5
-"""What a plan has that does not say how far apart its waypoints are."""
+"""Waypoints, and seconds between them, of a plan that does not state its step."""
 
 Arrays: TypeAlias = Mapping[str, npt.NDArray[np.generic]]
 
@@ -87,6 +87,7 @@ class PlanAdapter(pydantic.BaseModel):
             raise GraphError(
                 f"metadata {PLAN} is not a plan adapter: {first}"
             ) from error
+        # A name that is not an output is an error here.
         for named in (found.output, found.scores):
             if named is not None and named not in outputs:
                 raise GraphError(
@@ -102,6 +103,7 @@ class PlanAdapter(pydantic.BaseModel):
             GraphError: the output has the wrong shape, or no mode is selected.
         """
         value = self._laid_out(np.asarray(outputs[self.output], np.float64))
+        # Choose the mode, then read the coordinates.
         if value.ndim == 4:
             value = value[:, self._mode(outputs, inputs, value.shape[1])]
         if value.ndim != 3 or value.shape[0] != 1:
@@ -182,6 +184,7 @@ class PlanAdapter(pydantic.BaseModel):
             given: Any = np.asarray(inputs[self.command_input]).reshape(-1)
             command = int(given[0] if len(given) == 1 else np.argmax(given))
             return self._mode_of(command)
+        # Without scores or a command, only a default mode is left.
         self.check_modes(modes)
         return self.default_mode or 0
 

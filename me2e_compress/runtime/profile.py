@@ -39,6 +39,7 @@ def profile(
     wanted = len(frames) if samples is None else samples
     check_work(wanted, warm_up, frames)
     session = TimedSession(model, threads=threads, provider=provider, said=said)
+    # Warm up and measure in one replay of the repeated recording.
     endless = chain.from_iterable(repeat(frames))
     for done, _ in enumerate(islice(replay(session, endless), warm_up + wanted), 1):
         on_sample(max(0, done - warm_up), wanted)

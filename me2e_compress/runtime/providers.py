@@ -194,6 +194,7 @@ class TensorRtProvider(Provider):
             for kind in ("engine", "timing"):
                 options[f"trt_{kind}_cache_enable"] = "True"
                 options[f"trt_{kind}_cache_path"] = str(self.cache)
+        # TensorRT loads its own plugin libraries.
         theirs = [str(each) for each in self.plugins if self._is_tensorrts(each)]
         if theirs:
             options["trt_extra_plugin_lib_paths"] = ";".join(theirs)
@@ -228,6 +229,7 @@ class TensorRtRtxProvider(Provider):
     def attach(self, options: ort.SessionOptions) -> None:
         """Register the provider's own library, then those of operators."""
         super().attach(options)
+        # The provider comes in a package of its own.
         if not super().is_installed():
             module = importlib.import_module(self.package)
             ort.register_execution_provider_library(

@@ -82,12 +82,6 @@ class Session:
         profiled: a folder for the profile that :meth:`end_profile` writes.
         said: metadata that overrides the model's own.
 
-    Attributes:
-        inputs: the inputs by name, in order.
-        outputs: the outputs by name, in order.
-        metadata: the model's own metadata, with ``said``.
-        recurrent: ``{input: output}`` of the state that is fed forward.
-
     Raises:
         GraphError: onnxruntime cannot run this graph; the message names the operator.
         ProviderError: the provider is not installed, or cannot start here.
@@ -179,6 +173,7 @@ class Session:
                 f"{reason}"
             )
         names = list(self.outputs) if outputs is None else list(outputs)
+        # Inputs that do not fit are the caller's fault, others the graph's.
         try:
             fed = {name: feeds[name] for name in self.inputs}
             values = cast("list[Array]", self._ort.run(names, fed, self._each_run))
@@ -212,6 +207,7 @@ def replay(
         GraphError: a recurrent input of unknown shape has no first value.
     """
     wanted = list(session.outputs) if outputs is None else list(outputs)
+    # State is fetched even if the caller does not want it.
     fetched = list(dict.fromkeys([*wanted, *session.recurrent.values()]))
     memory: Mapping[str, Array] = {} if state is None else state
     for frame in frames:
@@ -222,6 +218,7 @@ def replay(
             values = session.run(fed, fetched, first=frame.starts_scene)
         except FramesError as error:
             raise FramesError(f"frame {frame.index}: {error}") from error
+        # The outputs of this frame are the next one's state.
         memory = {name: values[answer] for name, answer in session.recurrent.items()}
         yield {name: values[name] for name in wanted}
 

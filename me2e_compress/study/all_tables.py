@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from me2e_compress.study.outcome import StudyResult
 
 MOST_ROUTES = 40
-"""Routes that are shown one by one; the results hold any number."""
+"""With more routes than this, the table of endings is left out."""
 COLUMNS = ("TTC < 1.5 s, %", "least TTC s", "PET s", "distance m", "at fault %")
 
 

@@ -17,17 +17,15 @@ from me2e_compress.study.drives import Drive
 from me2e_compress.study.route_outcomes import RouteOutcome
 
 TWICE = (2.0 * WIDEST[0], 2.0 * WIDEST[1])
-"""What a difference of differences of a route can be, in points."""
+"""Bounds of a difference of differences of a route, in points."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """One drive minus another over the same routes, in points.
+    """One drive (``VARIANT.CONDITION``) minus another over the same routes, in points.
 
-    Attributes:
-        drive: ``VARIANT.CONDITION``.
-        beyond_driving_score: Change minus the baseline's change; None for the baseline
-            itself, and for a pair.
+    The ``beyond`` estimates are the change minus the baseline's; None for the baseline
+    itself, and for a pair.
     """
 
     drive: str

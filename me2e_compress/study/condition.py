@@ -18,7 +18,7 @@ from me2e_compress.registry import name_in
 from me2e_compress.study.names import check_name
 
 TRACE = "trace"
-"""A latency: what was measured of each model, under the device scale."""
+"""The latency of each model's own trace, times the device scale."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +77,8 @@ class Condition:
     def source(self, seed: int) -> LatencySource:
         """Return the latency source; one that lacks its trace waits for a model's.
 
-        ``seed`` applies if the condition has none of its own.
-
-        Raises:
-            EvaluationError: There is no such source, or an option is invalid.
-            StudyError: It names a file, which belongs to a variant.
+        ``seed`` applies if the condition has none of its own. A trace file is an error:
+        it belongs to a variant.
         """
         if self._names_a_file:
             raise StudyError(self._refusal())
@@ -171,12 +168,7 @@ def _per_second(fps: float) -> str:
 
 
 def check_conditions(conditions: Sequence[Condition], variants: Sequence[str]) -> None:
-    """Check the references between conditions.
-
-    Raises:
-        StudyError: A mean is of a drive that does not come earlier, or a condition is
-            compared with one that does not exist.
-    """
+    """Check that means refer to earlier drives, and ``against`` to conditions."""
     before = list[str]()
     names = [each.name for each in conditions]
     for each in conditions:
@@ -195,11 +187,7 @@ def check_conditions(conditions: Sequence[Condition], variants: Sequence[str]) -
 
 
 def check_conditions_elsewhere(evaluator: str, conditions: Sequence[Condition]) -> None:
-    """Refuse conditions that only highway understands.
-
-    Raises:
-        StudyError: A condition has more than a name and the latency ``none``.
-    """
+    """Refuse conditions that only highway understands."""
     for each in conditions:
         if each != Condition(each.name, "none"):
             raise StudyError(
@@ -213,11 +201,7 @@ def check_pairs(
     variants: Sequence[str],
     conditions: Sequence[str],
 ) -> None:
-    """Check that pairs name drives of the study.
-
-    Raises:
-        StudyError: A variant or condition is unknown.
-    """
+    """Check that pairs name drives of the study."""
     for name in (name for pair in pairs for name in pair):
         variant, _, condition = name.partition(".")
         if variant not in variants or condition not in conditions:

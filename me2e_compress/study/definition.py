@@ -175,11 +175,7 @@ class Study:
 
     @property
     def elsewhere(self) -> bool:
-        """Whether an evaluator other than highway drives.
-
-        Raises:
-            EvaluationError: Options are given to highway; the study has its own.
-        """
+        """Whether an evaluator other than highway drives."""
         return not is_highway(self.evaluator)
 
     def _check_elsewhere(self) -> None:
@@ -227,11 +223,7 @@ class Study:
             yield from (file for step in each.passes for file in step.files())
 
     def check_recordings(self) -> None:
-        """Open the study's recordings, and check that the variants' files exist.
-
-        Raises:
-            StudyError: A recording is invalid, or a file is missing.
-        """
+        """Check that its recordings are valid and its variants' files exist."""
         for each in self.variants:
             for key, file in (("adapter", each.adapter), ("trace", each.trace)):
                 if file is not None and not file.is_file():
@@ -253,11 +245,7 @@ class Study:
         return tuple(each for each in self.variants if each.name in wanted)
 
     def of_blocks(self, names: Sequence[str]) -> "Study":
-        """Return the part of the study that some blocks need; ``2`` names ``table-2``.
-
-        Raises:
-            StudyError: There is no such block.
-        """
+        """Return the part that some blocks need; ``2`` names ``table-2``."""
         there = {each.name: each for each in self.blocks}
         chosen = list[StudyBlock]()
         for name in names:

@@ -128,8 +128,8 @@ class DriverDemo:
     def compress(self, listener: Listener) -> CompressResult:
         """Copy the driver, record frames, and compress it.
 
-        The int8 plan is for this machine's runtime: placed for TensorRT, it is slower
-        than float on the CPU.
+        The int8 plan is for the provider that drives here: one placed for TensorRT is
+        slower than float on the CPU.
         """
         export_stack(self.name, self._source, ExportOptions(force=self.force))
         for folder, count, seed in (

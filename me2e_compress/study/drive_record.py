@@ -1,7 +1,6 @@
-"""The part of a drive that tables need, without its frames: one line per route.
+"""The part of a drive that tables need: one line per route, without frames.
 
-A drive of 220 routes takes 30 MB of episodes and 0.1 MB of these lines: small enough to
-keep in a repository, and quick to read.
+A drive of 220 routes takes 30 MB of episodes and 0.1 MB of these lines.
 """
 
 import json
@@ -25,7 +24,7 @@ from me2e_compress.metrics.infraction import COLLISIONS
 from me2e_compress.runtime.atomic import write_bytes
 
 PERCENTS = (50, 90, 99, 100)
-"""Of the latencies of a route's decisions."""
+"""Percentiles of the latencies of a route's decisions."""
 DIGITS = 6
 
 _STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
@@ -37,21 +36,15 @@ class RouteSummary:
     """One route of one drive; unrecorded values are None.
 
     Attributes:
-        driving_score: Percent.
-        completion: Percent of the route.
+        driving_score: Percent, as are completion, efficiency and ttc_exposure.
         succeeded: Whether the whole route was driven without an infraction.
         infractions: Kind, microseconds if known, and the other party or obstacle.
-        efficiency: Percent; None if no traffic moved, or the ego did not.
+        efficiency: None if no traffic moved, or the ego did not.
         comfort: Share of smooth segments; None if there was no whole one.
         duration_us: Time of the last frame.
-        decisions: Number of decisions.
-        latency_us: `PERCENTS` of their latencies on the vehicle.
-        latency_sum_us: Sum of their latencies.
-        ttc_exposure: Percent of the frames with a time to collision below 1.5 s.
-        smallest_ttc: Seconds.
+        latency_us: `PERCENTS` of the decisions' latencies on the vehicle.
+        ttc_exposure: Share of the frames with a time to collision below 1.5 s.
         smallest_pet: Post-encroachment time of crossing paths, seconds.
-        smallest_distance: Metres.
-        at_fault: Whether a collision was the ego's fault.
     """
 
     route: str
@@ -113,11 +106,7 @@ _ROUTE = TypeAdapter(RouteSummary)
 
 @dataclass(frozen=True)
 class DriveRecord:
-    """One variant under one condition over routes.
-
-    ``made_by`` is the fingerprint of the evaluation without its routes: version,
-    digests of policy and routes, latency and so on.
-    """
+    """One drive over routes; ``made_by`` is its fingerprint without the routes."""
 
     variant: str
     condition: str
@@ -152,11 +141,7 @@ class DriveRecord:
         return 1e6 * sum(each.decisions for each in self.routes) / max(time_us, 1)
 
     def save(self, path: Path) -> None:
-        """Write it as JSON lines: the fingerprint, then one line per route.
-
-        Raises:
-            StudyError: The file cannot be written.
-        """
+        """Write it as JSON lines: the fingerprint, then one line per route."""
         head = {
             "variant": self.variant,
             "condition": self.condition,
@@ -172,12 +157,7 @@ class DriveRecord:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a file that `save` wrote.
-
-        Raises:
-            StudyError: The file is unreadable, malformed or truncated, or repeats a
-                route.
-        """
+        """Read a file that `save` wrote; a repeated route or a cut-off is an error."""
         try:
             head, *rows = map(documents.from_json, _lines(path))
             routes = tuple(_ROUTE.validate_python(row) for row in rows)

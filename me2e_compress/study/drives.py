@@ -30,14 +30,10 @@ from me2e_compress.workflows.listener import Listener
 
 @dataclass(frozen=True)
 class Drive:
-    """One variant under one condition.
+    """One variant under one condition, or the reason why it was not driven.
 
-    Attributes:
-        scores: Over all routes; None if it was not driven.
-        difference: Difference from the baseline under the same condition, paired by
-            route; None for the baseline itself and if one of the two was not driven.
-        routes: One per route, in the order of the study.
-        reason: Why it was not driven; empty if it was.
+    ``difference`` is paired by route with the baseline under the same condition; it is
+    None for the baseline itself.
     """
 
     variant: str
@@ -61,11 +57,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class DriveSetup:
-    """What all drives of a study share.
-
-    ``means_us`` caches the mean latency of each ``mean_of`` condition, ``image_sizes``
-    the rows and columns that each variant's policy wants.
-    """
+    """What all drives share; ``means_us`` caches means for ``mean_of`` conditions."""
 
     study: Study
     clock: Clock
@@ -78,12 +70,7 @@ class DriveSetup:
     def under(
         self, condition: Condition, prepared: Sequence[PreparedVariant]
     ) -> tuple[Drive, ...]:
-        """Drive the variants of one condition, the baseline first.
-
-        Raises:
-            EvaluationError: A folder belongs to another evaluation or cannot be
-                written.
-        """
+        """Drive the variants of one condition, the baseline first."""
         driven = self.study.driven_under(condition)
         prepared = [each for each in prepared if each.variant in driven]
         if not prepared:
@@ -143,13 +130,7 @@ class DriveSetup:
         return round(fmean(taken))
 
     def record(self, prepared: PreparedVariant, condition: Condition) -> DriveRecord:
-        """Drive, and keep the result without its frames; kept drives are not repeated.
-
-        Raises:
-            EvaluationError: A folder belongs to another evaluation or cannot be
-                written, or a process was killed.
-            StudyError: It cannot be driven, or the kept drive is of another evaluation.
-        """
+        """Drive, and keep the result without frames; kept drives are not repeated."""
         variant, job = prepared.variant, self.job(prepared, condition)
         if job is None:
             raise StudyError(self._why_not(prepared))
@@ -193,7 +174,7 @@ class DriveSetup:
     def some(
         self, prepared: PreparedVariant, condition: Condition, routes: Sequence[Route]
     ) -> tuple[Episode, ...]:
-        """Drive what is missing of some of the routes; errors are those of `record`."""
+        """Drive what is missing of some of the routes, and return these."""
         job = self.job(prepared, condition)
         if job is None:
             raise StudyError(self._why_not(prepared))

@@ -21,10 +21,6 @@ def episodes_elsewhere(
     """Return the episodes of a variant, from its folder if they were kept.
 
     ``evaluator`` is its name and options; the policy becomes its option ``policy``.
-
-    Raises:
-        EvaluationError: There is no such evaluator, it has no option ``policy``, or it
-            fails.
     """
     model = prepared.model
     policy = prepared.variant.policy if model is None else str(model)

@@ -23,7 +23,7 @@ from me2e_compress.workflows.other_evaluators import HIGHWAY, is_highway
 from me2e_compress.zoo.shipped import SHIPPED
 
 STUDIES = Path(__file__).parent / "shipped"
-"""Studies that ship, one TOML file each."""
+"""Shipped studies, one TOML file each."""
 
 
 def study_path(study: str | Path) -> Path:
@@ -64,7 +64,7 @@ def load_study(
         ProviderError: A provider or library is missing.
     """
     path = study_path(path)
-    # read the file, which may be any TOML
+    # read the file and check its form
     try:
         content = documents.from_toml(documents.content(path))
     except FileNotFoundError as error:
@@ -156,7 +156,7 @@ class _Study(_Table):
     report: Literal["comparison", "paper"] = "comparison"
     latency: _Latency = Field(default_factory=_Latency)
     variant: list[_Variant] = Field(validation_alias=AliasChoices("variant", "scheme"))
-    """Files written before variants had their name say ``[[scheme]]``."""
+    """Files from before variants were called so say ``[[scheme]]``."""
     condition: list[_Condition]
     block: list[_Block] = Field(default_factory=list)
     pair: list[_Pair] = Field(default_factory=list)

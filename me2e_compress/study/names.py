@@ -10,11 +10,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
 
 
 def check_name(kind: str, name: str) -> None:
-    """Check that a name can name a folder.
-
-    Raises:
-        StudyError: It has other characters, or does not begin with a letter or digit.
-    """
+    """Check that a name can name a folder: it begins with a letter or digit."""
     if _NAME.fullmatch(name) is None:
         raise StudyError(
             f"{kind} {name!r}: a name is made of letters, digits, '_', '+' and '-'"
@@ -22,11 +18,7 @@ def check_name(kind: str, name: str) -> None:
 
 
 def check_unique(kind: str, names: Iterable[str]) -> None:
-    """Check that there are names, without repetition.
-
-    Raises:
-        StudyError: There are none, or one is repeated.
-    """
+    """Check that there are names, without repetition."""
     counts = Counter(names)
     if not counts:
         raise StudyError(f"the study has no {kind}")

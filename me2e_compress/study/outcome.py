@@ -26,11 +26,7 @@ LATENCY_PERCENTILES = (50, 99)
 
 @dataclass(frozen=True)
 class VariantOutcome:
-    """What a variant is, apart from how it drives.
-
-    ``size_mb`` includes the weights (1e6 bytes); ``latency_ms`` maps percentiles to
-    milliseconds on the device.
-    """
+    """A variant's size (1e6 bytes), latency percentiles and plan, without drives."""
 
     prepared: PreparedVariant
     size_mb: Measure
@@ -85,11 +81,9 @@ class StudyResult(Result):
     """All results of a study, and what they were made with.
 
     Attributes:
-        variants: In the study's order.
         drives: Condition by condition, the variants in the study's order.
         contrasts: Pictures of moments at which two drives differ.
         device_scale: How many times slower the device is than the machine timed on.
-        machine: The machine of the study, in words.
         versions: Versions of the packages that decide the result.
         load: Load by other processes while latencies were measured; None if none was
             measured here.
@@ -155,7 +149,7 @@ class StudyResult(Result):
         return [self._record(each) for each in self.drives]
 
     def _record(self, drive: Drive) -> dict[str, object]:
-        # a drive that failed has no scores
+        # a drive that was not made has no scores
         scores, of = drive.scores, self.variant(drive.variant)
         found = (
             {}

@@ -17,15 +17,12 @@ from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.workflows.listener import Listener
 
 EXACT = "no noise: equal to the bit"
-"""Why a plan that did not move has no signal to noise."""
+"""Reason why an unchanged plan has no signal-to-noise ratio."""
 
 
 @dataclass(frozen=True)
 class PlanFidelity:
-    """The plan of a variant compared with the baseline's on held-out frames.
-
-    ``mean_m`` and ``max_m`` are displacements of the waypoints.
-    """
+    """The plan of a variant compared with the baseline's on held-out frames."""
 
     mean_m: Measure
     max_m: Measure
@@ -59,8 +56,7 @@ def judge(
 ) -> PlanFidelity:
     """Run both models over the held-out frames.
 
-    A model with other inputs or outputs is not an error: it is not measured, and the
-    reason says why.
+    A model with another interface is not an error: the result has a reason instead.
     """
     # reasons why there is nothing to compare
     if study.held_out is None:

@@ -31,7 +31,6 @@ class PreparedVariant:
     """A variant whose driver is ready.
 
     Attributes:
-        model: The ONNX file; None for a driver without one.
         source: Name of the file that passes were applied to.
         pipeline: The passes, as text; empty if the model is its own source.
         size_bytes: Size of the model with its weights.
@@ -54,11 +53,7 @@ class PreparedVariant:
 def prepare_all(
     study: Study, workspace: Workspace, listener: Listener
 ) -> list[PreparedVariant]:
-    """Find or make every variant's driver; one that fails does not stop the others.
-
-    Raises:
-        Me2eError: The baseline's failed, so there is nothing to compare with.
-    """
+    """Prepare every variant; only a failure of the baseline is an error."""
     return [
         _prepared_or_failed(study, each, workspace, listener) for each in study.variants
     ]
@@ -80,13 +75,7 @@ def _prepared_or_failed(
 def prepare_variant(
     study: Study, variant: Variant, workspace: Workspace, listener: Listener
 ) -> PreparedVariant:
-    """Find or make a variant's driver, and open it once.
-
-    Raises:
-        StudyError: There is no such model, or a file that a pass reads is missing.
-        EvaluationError: It cannot drive.
-        Me2eError: A pass refused the graph or failed.
-    """
+    """Find or make a variant's driver, and open it once."""
     # drivers without a file need no preparation
     driver = driver_named(variant.policy, variant.adapter)
     if not isinstance(driver, OnnxDriver):
@@ -162,10 +151,7 @@ def _compressed(
     workspace: Workspace,
     listener: Listener,
 ) -> Path:
-    """Apply the passes, unless a file exists that still matches its report.
-
-    The report is written last.
-    """
+    """Apply the passes, unless a file exists that still matches its report."""
     frames = None if study.frames is None else CalibrationSet(study.frames)
     output = workspace.model(variant, _key(study, variant, source, frames))
     if graph.is_stack(source):  # several files in a folder

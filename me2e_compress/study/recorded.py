@@ -13,10 +13,6 @@ def recorded(study: Study, workspace: Workspace, listener: Listener) -> Study:
     """Return the study with folders of frames, recorded unless they exist.
 
     The held-out frames use the next seed, hence other routes.
-
-    Raises:
-        EvaluationError: The baseline is not a model that drives.
-        FramesError: One of the folders has other content.
     """
     asked = study.to_record
     if asked is None:

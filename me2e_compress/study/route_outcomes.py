@@ -33,13 +33,11 @@ class RouteOutcome:
 
     Attributes:
         driving_score: Percent.
-        succeeded: Whether the whole route was driven without an infraction.
-        infractions: Kind and time in microseconds, in order of time; the time is None
-            if unknown.
+        infractions: Kind and time in microseconds, in order of time, None if unknown.
         duration_us: Time of the last frame.
-        apart_m: Greatest distance to the baseline's ego at the same time; None for the
-            baseline itself and for a route without frames.
-        apart_us: Time of that distance.
+        apart_m: Greatest distance to the baseline's ego at the same time, and
+            ``apart_us`` its time; None for the baseline itself and for a route without
+            frames.
     """
 
     route: str

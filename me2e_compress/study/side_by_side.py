@@ -21,14 +21,7 @@ SCORED, MOVED_M = 1.0, 0.5
 
 @dataclass(frozen=True)
 class Contrast:
-    """A picture of one moment of two drives.
-
-    Attributes:
-        route: The baseline's outcome.
-        other: The variant's outcome.
-        time_us: The moment; a drive that was over by then shows its end.
-        picture: PNG: the baseline in grey under the variant.
-    """
+    """A PNG of one moment of two drives: the baseline in grey under the variant."""
 
     route: RouteOutcome
     other: RouteOutcome
@@ -86,11 +79,7 @@ def take_pictures(
 ) -> tuple[Contrast, ...]:
     """Drive the routes on which variants diverge the most again, up to the moment.
 
-    Existing pictures are reused. At most ``limit`` distinct routes are shown, and
-    variants alternate.
-
-    Raises:
-        EvaluationError: A picture cannot be written.
+    Existing pictures are reused; no route is shown twice, and variants alternate.
     """
     # look-ups by the names in the drives
     found = list[Contrast]()

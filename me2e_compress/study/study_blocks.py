@@ -9,9 +9,7 @@ from me2e_compress.study.names import check_name
 
 @dataclass(frozen=True)
 class StudyBlock:
-    """A part of a study: some of its variants under some of its conditions.
-
-    Variants and conditions are names, in the order of the block's tables.
+    """Some variants under some conditions, named in the order of the block's tables.
 
     Raises:
         StudyError: A name is invalid, or there is nothing to drive.
@@ -27,11 +25,7 @@ class StudyBlock:
             raise StudyError(f"block {self.name}: there is nothing to drive")
 
     def check(self, variants: Sequence[str], conditions: Sequence[str]) -> None:
-        """Check that its variants and conditions exist.
-
-        Raises:
-            StudyError: One does not.
-        """
+        """Check that its variants and conditions exist."""
         for kind, named, there in (
             ("variant", self.variants, variants),
             ("condition", self.conditions, conditions),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from me2e_compress.study.outcome import StudyResult, VariantOutcome
 
 MISSING = "\N{EN DASH}"
-"""Stands where nothing was measured."""
+"""Shown if nothing was measured."""
 INFINITE = "\N{INFINITY}"
 MINUS = "\N{MINUS SIGN}"
 SCORES = ("DS", "SR %", "DE %", "DC")
@@ -26,10 +26,7 @@ COSTS = ("size MB", "p50 ms", "p99 ms", "plan m", "SQNR dB")
 
 
 def scoreboards(outcome: "StudyResult") -> tuple[Table, ...]:
-    """Show the driving scores, size and latency of every variant.
-
-    There is one table per condition, or one of all conditions for a single variant.
-    """
+    """Show driving scores, size and latency of all variants, by condition."""
     if len(outcome.variants) > 1:
         return tuple(_scoreboard(outcome, each) for each in outcome.study.conditions)
     return (

@@ -24,11 +24,10 @@ class Clock:
 
     Attributes:
         traces: As measured, by the variant's name.
-        scale: How many times slower the device is than the machine of the traces; one
-            number for all variants.
+        scale: How many times slower the device is than the machine of the traces.
         reason: Why a variant has no trace; empty if all have one.
-        load: The highest load by other processes while traces were measured; None if
-            none was measured here.
+        load: The highest load by other processes during measurements, if there were
+            any.
     """
 
     traces: Mapping[str, LatencyTrace]
@@ -139,8 +138,8 @@ def _measured(
 ) -> dict[str, LatencyTrace]:
     """Measure in turn, always with the baseline.
 
-    If the baseline's trace is kept, the others are put on its scale: machines are
-    slower on some days than on others.
+    If its trace is kept, the others are put on its scale: a machine's speed varies from
+    day to day.
     """
     if not missing:
         return {}

@@ -29,7 +29,7 @@ FRAME_S, DECISION_S = 0.0024, 0.021
 inference of the driver that ships on one core of a Xeon (two routes, at every frame
 and at every eighth)."""
 ENOUGH = 20
-"""Routes in the logs of a folder that make its own speed known."""
+"""Fewest logged routes from which the machine's speed is fitted."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,7 @@ class PlannedDrive:
 
 @dataclass(frozen=True, repr=False)
 class Workload(Result):
-    """Remaining work of a study.
-
-    Attributes:
-        drives: Condition by condition.
-        set_size: Number of routes of the whole set.
-        workers: Number of concurrent routes.
-        measured: Whether hours are based on the folder's own routes.
-    """
+    """Remaining work of a study; ``measured`` if hours come from its own routes."""
 
     title: str
     drives: tuple[PlannedDrive, ...]
@@ -111,8 +104,7 @@ class Workload(Result):
 def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
     """Count the missing routes, and estimate the hours.
 
-    A route costs world frames and decisions; the condition decides the number of frames
-    per decision.
+    A route costs world frames and decisions; the condition decides their ratio.
     """
     # speed of this machine, from earlier logs if possible
     place = Workspace(Path(folder))

@@ -8,7 +8,7 @@ from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Variant
 
 JSON, MARKDOWN, HTML = "study.json", "tables.md", "report.html"
-"""What is found, for programs, in a repository and in a browser."""
+"""Files of the results for programs, repositories and browsers."""
 
 
 @dataclass(frozen=True)

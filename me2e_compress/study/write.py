@@ -45,7 +45,7 @@ def write_study(
         StudyError: The folder cannot be written.
         GraphError: A file was changed since we wrote it.
     """
-    # the Markdown tables
+    # paths, and all tables as Markdown
     folder = Path(folder)
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
     title = f"{outcome.study.title}{outcome.study.preview}"

@@ -117,7 +117,13 @@ class Target(abc.ABC):
 
     @abc.abstractmethod
     def place(self, model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
-        """Return a copy of a float graph in which a plan's nodes are int8."""
+        """Return a copy of a float graph in which a plan's nodes are int8.
+
+        Raises:
+            PreconditionError: the graph is older than opset 13 or in a float type
+                without int8 here, or a planned weight is not constant.
+            FramesError: the range of a tensor is missing.
+        """
 
     def kept_float(self, plan: QuantPlan, model: ir.Model) -> tuple[KeptFloat, ...]:
         """List the plan's nodes that stay float in that copy, with the reasons."""
@@ -138,6 +144,7 @@ class Target(abc.ABC):
                 opset float16 scales; the message has a remedy.
         """
         types = {v.name: v.dtype for node in model.graph for v in node.outputs}
+        # Float16 needs kernels, and scales of that type.
         halves = [e for e in plan.chosen if types[e.output] == ir.DataType.FLOAT16]
         opset, since = opset_of(model), self.half_since
         if not halves or (since is not None and since <= opset):
@@ -164,6 +171,7 @@ class Target(abc.ABC):
 
     def lint(self, model: ir.Model) -> tuple[LintFinding, ...]:
         """List all findings of a graph, errors first; the graph is not changed."""
+        # The rules need inferred shapes.
         copy = model.clone()
         graph.infer_shapes(copy)
         found = [finding for rule in self.lint_rules() for finding in rule(copy)]

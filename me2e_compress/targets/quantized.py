@@ -49,6 +49,7 @@ def describe_quantized(model: ir.Model) -> str | None:
     if not counts:
         return None
     listed = ", ".join(f"{count} {op}" for op, count in sorted(counts.items()))
+    # Operators first, then the grid and the producer.
     parts = [listed]
     if any(op in counts for op in PAIR):
         parts.append(_grid(model))

@@ -34,6 +34,7 @@ def store_weights(model: ir.Model, plan: QuantPlan) -> None:
 def _store(writer: Writer, node: ir.Node, weight: QuantizedWeight) -> None:
     integers = weight.integers
     transposed = node.attributes.get_int("transB", 0) == 1
+    # Kernels read [K, N]: transpose the stored weight.
     if node.op_type == "Gemm" and transposed:
         integers = integers.T.copy()
         node.attributes["transB"] = ir.AttrInt64("transB", 0)

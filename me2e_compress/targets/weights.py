@@ -49,6 +49,7 @@ def weights_of(
             f"the graph is of opset {opset}: int8 with one scale a channel needs"
             f" {MIN_OPSET} or later, export it so"
         )
+    # Find the weight of each planned layer, and its channel axis.
     nodes = {str(node.outputs[0].name): node for node in model.graph}
     layers = {
         each.output: _planned(nodes[each.output], each, each.weight)
@@ -59,6 +60,7 @@ def weights_of(
     values = dict.fromkeys(value for value, _ in layers.values())
     made = [str(each.name) for each in values if each.producer() is not None]
     computed = evaluate_constants(model, made)
+    # Quantize each weight once.
     quantized = {
         (value, axis): _quantize(value, axis, computed)
         for value, axis in dict.fromkeys(layers.values())
@@ -72,9 +74,10 @@ def quantize_weight(
     """Round a weight to symmetric int8, with one scale per index of an axis, or one.
 
     ``scale = max|w| / 127`` over everything but the axis, ``q = round(w / scale)``,
-    ties to even, as QuantizeLinear rounds. A channel that is zero throughout gets scale
-    1. Returns int8 of the same shape, and float32 [channels], or [] without an axis.
+    ties to even, as QuantizeLinear rounds. The scale of an all-zero channel is 1.
+    Returns int8 of the same shape, and float32 [channels], or [] without an axis.
     """
+    # Reduce over every axis but that of the channels.
     others = tuple(each for each in range(weight.ndim) if each != axis)
     reach = np.abs(weight).max(axis=others, initial=0.0, keepdims=True)
     steps = np.asarray(reach / np.float32(QUANT_MAX), np.float32)
@@ -103,6 +106,7 @@ def _quantize(
         array = value.const_value.numpy()
     else:
         raise PreconditionError(f"{name} is planned as a weight, but is not a constant")
+    # A batch of one matrix is stored as that matrix.
     if axis == -1:
         array, axis = array.reshape(array.shape[-2:]), 1
     integers, scales = quantize_weight(array.astype(np.float32), axis)

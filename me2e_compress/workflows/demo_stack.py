@@ -44,8 +44,9 @@ class FilesResult(Result):
 
     @property
     def headline(self) -> str:
-        """What the user has now."""
-        return self.ending
+        """What a frame takes, against the stack as it was exported."""
+        first, *_, last = (each.median_wall_s for each in self.times.values())
+        return f"{last:.2f} s a frame, {last / first:.2f} of {first:.2f}"
 
     def lines(self) -> tuple[str, ...]:
         """Return the last file's size and time, the plan, and what is not measured."""

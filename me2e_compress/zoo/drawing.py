@@ -45,6 +45,7 @@ def draw_weights(model: nn.Module, gains: Gains, seed: int) -> None:
     """Draw all parameters of a model, in place."""
     generator = torch.Generator().manual_seed(seed)
     modules: Mapping[str, nn.Module] = dict(model.named_modules())
+    # The order of parameters fixes the random numbers
     for name, parameter in model.named_parameters():
         owner = modules[name.rpartition(".")[0]]
         parameter.copy_(_drawn(name, parameter, owner, gains, generator))

@@ -122,6 +122,7 @@ def build(
     if spec.name == TCP.name:
         if fused:
             raise GraphError(f"{stack} has no deformable attention: no plugin fits it")
+        # Published weights fill an empty module
         if weights is not None:
             return _filled(spec, weights)
         from me2e_compress.zoo.tcp.initialise import build_tcp

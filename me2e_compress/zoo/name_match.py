@@ -88,6 +88,7 @@ class NameMatch:
         if not self.ema:
             return {name: name for name in self.wanted}
         parameters = dict(self.module.named_parameters())
+        # The moving average of every tensor that has one
         averages = {name: AVERAGE + name.replace(".", "_") for name in self.wanted}
         return {
             name: average

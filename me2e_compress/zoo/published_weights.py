@@ -45,6 +45,7 @@ def published_weights(
     spec = _with_original(stack, heads)
     state = read_state_dict(path)
     match = _match(spec, state, ema)
+    # Name heads that would fit
     wrong = match.mismatch()
     if wrong:
         line = f"{path}: not the weights of {stack}: {wrong.line()}"

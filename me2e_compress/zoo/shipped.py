@@ -126,6 +126,7 @@ def sample_frames(model: Path, folder: Path | None = None) -> Path | None:
     folder = folder or WEIGHTS
     for name in SHIPPED:
         known, frames = card(name, folder), folder / f"{name}-frames"
+        # Compare sizes before hashing
         if not frames.is_dir() or model.stat().st_size != known.bytes:
             continue
         if hashlib.sha256(model.read_bytes()).hexdigest() == known.sha256:

@@ -90,6 +90,7 @@ class Stack:
 
     def metadata(self) -> dict[str, str]:
         """Return the ONNX metadata properties that describe the exported file."""
+        # Conventions of the plan
         plan: dict[str, object] = {
             "output": self.plan,
             "deltas": self.plan_deltas,
@@ -98,6 +99,7 @@ class Stack:
         }
         if self.plan_step_s is not None:
             plan["step_s"] = self.plan_step_s
+        # Conventions of the image input
         image = {
             "input": "img",
             "mean": self.image.mean,
@@ -221,6 +223,7 @@ UNIAD_COUNTS = ("obj_idxes", "disappear_time", "save_period", "max_obj_id")
 def _uniad(
     name: str, image_hw: tuple[int, int], cells: int, scale: float, straight_on: int
 ) -> Stack:
+    # Every recurrent input prev_X is fed by next_X
     remembered = {f"prev_{key}": shape for key, shape in UNIAD_REMEMBERED.items()}
     counts = [key for key in remembered if key.endswith(UNIAD_COUNTS)]
     recurrent = {f"prev_{key}": f"next_{key}" for key in UNIAD_REMEMBERED}

@@ -77,6 +77,7 @@ def read_state_dict(path: Path) -> StateDict:
     if importlib.util.find_spec("torch") is None:
         raise MissingExtraError("torch", "zoo")
     with reading(path, GraphError, "not read as weights"):
+        # Hash the file before parsing it
         check_regular(path)
         with path.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
@@ -135,10 +136,12 @@ def _tensors(whole: object) -> Mapping[Any, Any]:
     """Return the content under the wrapper's key, or everything."""
     if not isinstance(whole, Mapping):
         raise MalformedError(f"it holds a {type(whole).__name__}, not tensors by name")
+    # Unwrap the only known key
     held = [key for key in WRAPPERS if isinstance(whole.get(key), Mapping)]
     if len(held) > 1:
         raise MalformedError(f"it holds {' and '.join(held)}: keep one")
     found: Mapping[Any, Any] = whole[held[0]] if held else whole
+    # Everything left must be tensors by name
     wrong = next((k for k in found if not _is_tensor(k, found[k])), None)
     if wrong is not None and not held:
         keys = [str(key) for key in whole]

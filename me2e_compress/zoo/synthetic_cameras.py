@@ -84,6 +84,7 @@ def rig(scale: float = SCALE) -> tuple[Pinhole, ...]:
     hw = round(FULL_HW[0] * scale), round(FULL_HW[1] * scale)
     cameras = []
     for _, yaw_deg, position, (focal, cx, cy) in MOUNTS:
+        # Axes of the camera in the lidar frame
         yaw = math.radians(yaw_deg)
         ahead = (-math.sin(yaw), math.cos(yaw), 0.0)
         right = (math.cos(yaw), math.sin(yaw), 0.0)
@@ -135,9 +136,11 @@ def render(
 def _background(
     world: SyntheticWorld, ego: EgoPose, camera: Pinhole, rays: Array
 ) -> tuple[Array, Array]:
+    # The sky by elevation
     rise = np.clip(rays[..., 2:] / 0.5, 0, 1)
     colour = SKY_LOW * (1 - rise) + SKY_HIGH * rise
     depth = np.full(rays.shape[:2], np.float32(0))
+    # The ground where rays go down
     down = rays[..., 2] < -0.01
     height = camera.position[2] + LIDAR_HEIGHT_M
     reach = -height / rays[..., 2][down]

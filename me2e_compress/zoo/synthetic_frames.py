@@ -69,6 +69,7 @@ def _normalise(
     spec: Stack, seen: NDArray[np.uint8 | np.float32], noise: np.random.Generator
 ) -> NDArray[np.float32]:
     """Convert [n, h, w, 3] RGB pixels to [n, 3, H, W], zero-padded at the bottom."""
+    # Sensor noise, then rounding to grey levels
     grain = noise.normal(0, SENSOR_NOISE, seen.shape[:3])[..., None]
     pixels = np.clip(np.rint(seen + grain), 0, 255).astype(np.float32)
     mean = np.array(spec.image.mean, np.float32)
@@ -121,12 +122,14 @@ def draw_world(rng: np.random.Generator) -> SyntheticWorld:
     """Draw a road with 8 to 12 vehicles, parked cars, buildings, people and cones."""
     bend = float(rng.uniform(-0.008, 0.008))
     speed_mps = float(rng.uniform(3, 10))
+    # Objects by kind
     boxes = [
         *(_vehicle(rng, bend, speed_mps) for _ in range(int(rng.integers(8, 13)))),
         *(_parked(rng, bend) for _ in range(int(rng.integers(4, 8)))),
         *(_building(rng, bend) for _ in range(int(rng.integers(10, 15)))),
         *(_small(rng, bend) for _ in range(int(rng.integers(5, 9)))),
     ]
+    # Ground texture of two scales
     coarse = rng.normal(0, 7, (TILE // 8, TILE // 8)).repeat(8, 0).repeat(8, 1)
     tile = (coarse + rng.normal(0, 6, (TILE, TILE))).astype(np.float32)
     return SyntheticWorld(
@@ -152,12 +155,14 @@ def _colour(rng: np.random.Generator, bounds: Range) -> tuple[float, float, floa
 
 def _vehicle(rng: np.random.Generator, bend: float, ego_mps: float) -> Cuboid:
     """Draw a moving vehicle; in the ego's lane it is about as fast as the ego."""
+    # Keep a gap around the ego vehicle in its lane
     lane = int(rng.integers(0, LANES)) - LANES // 2
     ahead = lane != 0 or rng.random() < 0.7
     along = float(rng.uniform(9, 60) if ahead else rng.uniform(-50, -9))
     if lane != 0:
         along = float(rng.uniform(-45, 60))
     x, y, yaw = _place(bend, along, lane * LANE_M)
+    # A fifth of the vehicles are trucks
     truck = rng.random() < 0.2
     return Cuboid(
         x=x,

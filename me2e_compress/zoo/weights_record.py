@@ -40,11 +40,13 @@ class WeightsRecord:
 
     def lines(self) -> tuple[str, ...]:
         """Return the lines of a report."""
+        # What the graph was made from
         counts = {"epoch": self.epoch, "iteration": self.iteration}
         stated = [f"{key} {n}" for key, n in counts.items() if n is not None]
         said = [", ".join([f"weights: {self.file}", *stated, f"sha256 {self.sha256}"])]
         for type_, count in self.converted.items():
             said.append(f"{count} tensors of {type_} converted to float32")
+        # What was not used
         if self.unread:
             parts = list(dict.fromkeys(name.split(".")[0] for name in self.unread))
             said.append(

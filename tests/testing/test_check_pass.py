@@ -91,7 +91,7 @@ def test_a_pass_that_is_not_idempotent_is_caught(context: Context) -> None:
 def test_a_second_run_that_claims_and_changes_nothing_is_explained(
     context: Context,
 ) -> None:
-    words = r"on its second run, .* claims 1 changes but made none; .*remove_dead"
+    words = r"on its second run, .* claims 1 change but made none; .*remove_dead"
     with pytest.raises(VerificationError, match=words):
         check_pass(LeavesWhatIsUnread(), ir.from_onnx_text(NEGATIONS), context)
 

@@ -215,6 +215,7 @@ def _agents(boxes: Sequence[Mapping[str, Any]], path: Path) -> list[Agent]:
         x, y, z = matrix_of(box["center"], (3,), what).tolist()
         if abs(z - road) > STOREY_M:
             continue
+        # CARLA's angles are clockwise, its extents half sizes.
         half_length, half_width, _ = matrix_of(box["extent"], (3,), what).tolist()
         heading = -math.radians(matrix_of(box["rotation"], (3,), what).tolist()[-1])
         found.append(Agent(x, -y, heading, 2 * half_length, 2 * half_width))

@@ -34,6 +34,7 @@ def recorded_future(
     """
     now = scene[at]
     later = [_later(scene, at, step, log.half_second) for step in range(1, STEPS + 1)]
+    # Poses are relative to the ground frame at this moment.
     from_world = lidar_to_ground @ np.linalg.inv(now.lidar_to_world)
     back = np.linalg.inv(lidar_to_ground)
     waypoints = [
@@ -59,6 +60,7 @@ def command_at(log: DriveLog, scene: LogScene, at: int) -> int:
     now = scene[at]
     if now.command is not None:
         return now.command
+    # Take the last known moment of the next three seconds.
     later = [_later(scene, at, step, log.half_second) for step in range(1, STEPS + 1)]
     last = next((each for each in reversed(later) if each is not None), now)
     right, _ = _place(np.linalg.inv(now.lidar_to_world) @ last.lidar_to_world)

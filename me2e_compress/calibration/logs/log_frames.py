@@ -52,6 +52,7 @@ class LoggedInputs:
 
     def check(self, log: DriveLog) -> None:
         """Check that a log can feed the model."""
+        # Every input must be one that a log can provide.
         for name in self.forms:
             if name not in MADE:
                 raise FramesError(
@@ -139,6 +140,7 @@ def log_frames(
         ]
         before = None
         for at in chosen:
+            # Changes are relative to the last chosen moment.
             arrays, ground = (
                 model.arrays(log, scene, at, before),
                 model.ground(scene[at]),
@@ -204,8 +206,10 @@ def _fed(array: Array, form: InputForm, name: str) -> Array:
     if name == "img":
         lead = (1,) * (len(form.shape) - array.ndim)
         return array.reshape(lead + array.shape)
+    # Add leading dimensions of 1, or drop them.
     missing = len(form.shape) - array.ndim
     sides = (1,) * missing + array.shape if missing >= 0 else array.shape[-missing:]
+    # Sizes that the model fixes must agree.
     fits = (
         array.size == math.prod(sides)
         and len(sides) == len(form.shape)

@@ -152,6 +152,7 @@ class NuScenesLog(DriveLog):
                 bus[7:16] = np.concatenate(parts)
             else:
                 bus[7], bus[10:13], bus[13:16] = parts[2][0], parts[0], parts[1]
+        # Position and heading come from the vehicle's pose.
         bus[0:3] = car_to_world[:3, 3]
         bus[3:7] = self._tables.ego(lidar)["rotation"]
         heading = math.atan2(car_to_world[1, 0], car_to_world[0, 0]) % (2 * math.pi)

@@ -72,6 +72,7 @@ class NuScenesTables:
             lambda row: True,
             *("sensor_token", "translation", "rotation", "camera_intrinsic"),
         )
+        # Then the sensor data of the samples, and the poses it uses.
         self.data = self._key_frames()
         used = {
             d["ego_pose_token"] for each in self.data.values() for d in each.values()
@@ -89,6 +90,7 @@ class NuScenesTables:
         found: dict[str, dict[str, Row]] = {token: {} for token in self.samples}
         path = self.folder / "sample_data.json"
         names = ("sample_token", "ego_pose_token", "calibrated_sensor_token")
+        # Sweeps between key frames are left out.
         for row in rows(path, *names, "is_key_frame", "filename"):
             if row["is_key_frame"] and row["sample_token"] in found:
                 sensor = channels.get(self.sensor(row)["sensor_token"])
@@ -98,6 +100,7 @@ class NuScenesTables:
         return found
 
     def _boxes(self) -> dict[str, list[Agent]]:
+        # A box refers to an instance, and that to its category.
         kinds = by_token(self.folder / "category.json", lambda row: True, "name")
         things = by_token(
             self.folder / "instance.json", lambda row: True, "category_token"
@@ -168,6 +171,7 @@ def _objects(path: Path) -> Iterator[dict[str, Any]]:
     decode = json.JSONDecoder().raw_decode
     documents.check_regular(path)
     with path.open(encoding="utf-8") as file:
+        # The file is one array of rows.
         text, at = file.read(PIECE), 0
         at = _past(text, at, " \t\r\n")
         if text[at : at + 1] != "[":

@@ -41,6 +41,7 @@ def read_picture(path: Path, pixels: PixelInput, columns: int) -> Picture:
 
     found = _decoded(path)
     height, width = found.shape[:2]
+    # Scale to the columns, and keep the aspect ratio.
     rows = max(1, round(height * columns / width))
     if (rows, columns) != (height, width):
         found = np.asarray(cv2.resize(found, (columns, rows)), np.uint8)
@@ -80,6 +81,7 @@ def _decoded(path: Path) -> Bytes:
         raise FramesError(f"{path}: {error.strerror}") from error
     except MalformedError as error:
         raise FramesError(f"{path}: {error}") from error
+    # Check the end before decoding: OpenCV would not.
     if not _is_whole(content):
         raise FramesError(f"{path}: the picture breaks off, or is no JPEG or PNG")
     found = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)

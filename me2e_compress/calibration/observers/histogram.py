@@ -112,6 +112,7 @@ def _divergence(counts: Counts, edge: int) -> float:
     Elements beyond the edge count in the last bin before it. A level spreads its
     elements evenly over those of its bins that are not empty.
     """
+    # Zero is on every grid: its bin must not dominate.
     kept = counts[:edge].astype(np.float64)
     kept[0] = kept[1] if edge > 1 else kept[0]
     clipped = kept.copy()
@@ -125,6 +126,7 @@ def _divergence(counts: Counts, edge: int) -> float:
     bins = np.bincount(level, filled, LEVELS)
     spread = np.where(filled, (held / np.maximum(bins, 1))[level], 0)
     p, q = clipped / clipped.sum(), spread / spread.sum()
+    # A bin without any mass left makes the divergence infinite.
     lost = (p > 0) & (q == 0)
     if lost.any():
         return np.inf

@@ -22,12 +22,7 @@ class _Line(BaseModel):
 
 
 def read_decisions(path: Path) -> tuple[InferenceRecord, ...]:
-    """Read a ``decisions.jsonl``.
-
-    Raises:
-        BrokenRecordingError: A line is incomplete.
-        MalformedError: It is not a text file.
-    """
+    """Read a ``decisions.jsonl``."""
     found = list[InferenceRecord]()
     lines = documents.content(path, documents.LARGEST_LOG_BYTES).splitlines()
     for number, line in enumerate(lines, 1):

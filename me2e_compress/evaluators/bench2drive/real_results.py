@@ -35,10 +35,9 @@ from me2e_compress.metrics.scores import FULL_SET
 
 @dataclass(frozen=True)
 class CollectedResults:
-    """Every route once, and everything else that was found.
+    """Every route once, in the order of numbers, and everything else that was found.
 
     Attributes:
-        episodes: In the order of route numbers.
         route_set: The version of Bench2Drive that the routes are from, if any.
         missing: Numbers of the set's routes without a record.
         repeated: Routes with identical records, as when a merged file lies next to its
@@ -47,14 +46,12 @@ class CollectedResults:
             count.
         contradictory: Routes with different results; the lowest driving score counts.
         broken: Incomplete files and records, with the reason.
-        unfinished: Results files without a record, left by a worker killed on its first
-            route.
+        unfinished: Results files of workers killed on their first route.
         unrecorded: Routes without a recording of the ego.
         off_rate: Seconds between two steps, for routes not recorded at the simulator's
             rate.
         repetitions: How often the set was driven: a leaderboard's ``--repetitions``.
         stated: Merged files that state scores of their own.
-        notes: Unexpected findings, one line each.
     """
 
     episodes: tuple[Episode, ...]
@@ -103,11 +100,7 @@ class Bench2DriveResults:
         yield from self.collect().episodes
 
     def collect(self) -> CollectedResults:
-        """Read everything, and report what was found besides the episodes.
-
-        Raises:
-            EvaluationError: There is no such folder, or no record below it.
-        """
+        """Read everything, and report what was found besides the episodes."""
         found = find_files(self.folder)
         if self.metrics is not None:
             apart = find_files(self.metrics)

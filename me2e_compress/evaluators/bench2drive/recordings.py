@@ -18,14 +18,14 @@ from me2e_compress.metrics.episode import LARGEST, EgoFrame
 TICK_S = 0.05
 """Simulated seconds between two ticks of a leaderboard run."""
 INTERVALS_S = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0)
-"""What agents may record at: UniAD, VAD, TCP every tick, ADMLP every tenth."""
+"""Intervals of agents: UniAD, VAD, TCP every tick, ADMLP every tenth."""
 
 _PARTS = ("acceleration", "angular_velocity", "forward_vector", "right_vector")
 _LOCATION = "location"
 _STEP = re.compile(r"-?\d{1,15}")
 _LIKENESS, _SURE = 0.3, 0.95
-"""Correlations from which two signals are taken to tell of the same motion, and from
-which nothing else is asked."""
+"""Correlations above which two signals describe the same motion, and above
+which no other source is asked."""
 _STOOD_M = 1.0
 _LEAST_MPS2, _LEAST_RADPS = 0.05, 0.01
 """Root mean squares below which a signal is noise."""
@@ -42,14 +42,9 @@ class BrokenRecordingError(ValueError):
 class RecordedRoute:
     """One recording in our conventions: x east, y north, angles counter-clockwise.
 
-    Attributes:
-        steps: [N] step counts of the agent, in the order of the file.
-        position_m: [N, 2].
-        acceleration_mps2: [N, 2] in the world.
-        heading_rad: [N], unwrapped.
-        yaw_rate_radps: [N].
-        along_mps2: [N] acceleration along the heading.
-        left_mps2: [N] acceleration to the left.
+    Positions and accelerations are [N, 2] in the world, other arrays [N]. The heading
+    is unwrapped; ``along_mps2`` and ``left_mps2`` are accelerations in the ego's frame,
+    ``steps`` the agent's own counts in the order of the file.
     """
 
     steps: npt.NDArray[np.int64]
@@ -179,11 +174,7 @@ def _usual(interval_s: float) -> float | None:
 
 
 def read_recording(raw: object) -> RecordedRoute:
-    """Read a parsed ``metric_info.json``; its numbers may be infinite or NaN.
-
-    Raises:
-        BrokenRecordingError: There is no step, or one is incomplete or not finite.
-    """
+    """Read a parsed ``metric_info.json``; its numbers may be infinite or NaN."""
     # steps are keyed by their number
     if not isinstance(raw, dict) or not raw:
         raise BrokenRecordingError("no step is recorded")

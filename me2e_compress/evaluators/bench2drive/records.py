@@ -38,8 +38,8 @@ ENDINGS: Mapping[str, Ending] = MappingProxyType(
         _FAILED: Ending.SIMULATOR_FAILED,
     }
 )
-"""By status. Bench2Drive repeats a route whose status is ``Failed`` alone, as after a
-crash."""
+"""By status. Bench2Drive repeats a route whose status is just ``Failed``,
+as after a crash."""
 CRASHES = (Ending.POLICY_FAILED, Ending.SIMULATOR_FAILED)
 
 
@@ -56,8 +56,7 @@ class RouteRecord:
         number: The route's id in its routes file, such as ``1711``.
         recording: Name of the folder of its ``metric_info.json``, if any.
         duration_s: Simulated seconds; None if not stated.
-        content: How the route ended, its infractions and scores, to tell a copy from a
-            drive with another result.
+        content: Result of the route, to tell a copy from another drive.
         notes: What could not be interpreted, one line each.
     """
 
@@ -77,9 +76,7 @@ class RouteRecord:
 def read_record(raw: object) -> RouteRecord:
     """Read one parsed record; its numbers may be infinite or NaN.
 
-    Raises:
-        BrokenRecordError: A part is missing, mistyped or not finite, or the route was
-            not finished.
+    An unfinished route raises a `BrokenRecordError`, too.
     """
     try:
         record = _Record.model_validate(raw)

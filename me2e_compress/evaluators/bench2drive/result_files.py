@@ -29,9 +29,9 @@ _UNREADABLE = {
     _UTF_16: "not UTF-8 but UTF-16, as PowerShell writes it",
 }
 _RECORDING = "metric_info.json"
-"""What Bench2Drive's agents call it: one that says nothing else must be named, too."""
+"""Name that Bench2Drive's agents use; needed if the content is ambiguous."""
 _DECISIONS = "decisions.jsonl"
-"""What `agents.RealTimeAgent` calls its log."""
+"""Name of the log of `agents.RealTimeAgent`."""
 _HEAD_BYTES = 4096
 _PICTURES = {".png", ".jpg", ".jpeg", ".gif", ".mp4", ".npz", ".npy", ".laz", ".bin"}
 
@@ -40,10 +40,8 @@ _PICTURES = {".png", ".jpg", ".jpeg", ".gif", ".mp4", ".npz", ".npy", ".laz", ".
 class ResultFile:
     """One results file: a worker's checkpoint, or several merged.
 
-    Attributes:
-        broken: Why records could not be read, by their index in the file.
-        stated: Scores that a merged file states, NaN if not a number; empty for a
-            checkpoint.
+    ``broken`` says why records could not be read, by their index. ``stated`` are the
+    scores that a merged file states, NaN if not a number.
     """
 
     path: Path
@@ -54,13 +52,7 @@ class ResultFile:
 
 @dataclass
 class FoundFiles:
-    """Files found below a folder, ordered by path.
-
-    Attributes:
-        recordings: Files of recorded steps.
-        decisions: Logs of decisions.
-        broken: Incomplete results files, with the reason.
-    """
+    """Files found below a folder, ordered by path; ``broken`` ones with the reason."""
 
     results: list[ResultFile] = field(default_factory=list)
     recordings: list[Path] = field(default_factory=list)
@@ -74,11 +66,7 @@ def holds_records(folder: Path) -> bool:
 
 
 def find_files(folder: Path) -> FoundFiles:
-    """Find and read the results files below a folder, and find its recordings.
-
-    Raises:
-        EvaluationError: There is no such folder.
-    """
+    """Find and read the results files below a folder, and find its recordings."""
     if not folder.exists():
         raise EvaluationError(f"{folder}: no such folder")
     found = FoundFiles()

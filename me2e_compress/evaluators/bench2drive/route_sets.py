@@ -52,7 +52,7 @@ _SECOND = """
 ROUTE_SETS: Mapping[RouteSet, frozenset[str]] = MappingProxyType(
     {"0.0.3": frozenset(_FIRST.split()), "0.0.4": frozenset(_SECOND.split())}
 )
-"""By the version of Bench2Drive that brought them, 220 each."""
+"""Ids by version of Bench2Drive, 220 each."""
 
 
 def likely_set(numbers: Collection[str]) -> RouteSet | None:

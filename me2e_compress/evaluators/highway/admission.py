@@ -29,11 +29,8 @@ ENDS_ONLY = (
 class DryRun:
     """How one drive of one route went.
 
-    Attributes:
-        infractions: Distinct kinds of infractions in order, without `ENDS_ONLY`.
-        triggered: Whether the scenario's event happened.
-        actors_crashed: Whether two actors collided: a fault of the scenario.
-        seconds: Simulated time at the end.
+    ``infractions`` are distinct, in order and without `ENDS_ONLY`; a collision of two
+    actors is a fault of the scenario.
     """
 
     infractions: tuple[InfractionKind, ...]
@@ -79,12 +76,7 @@ class _WorldListener:
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """The gate's verdict on one route.
-
-    Attributes:
-        expert: The expert's drive; None if the blind drives already rejected the route.
-        blind: The blind driver's drive at each speed that was tried.
-    """
+    """The gate's verdict on one route; without expert if a blind drive solved it."""
 
     route: Route
     expert: DryRun | None

@@ -24,9 +24,9 @@ from me2e_compress.evaluators.highway.reentry import (
 from me2e_compress.simulator.scene import Ego, RoutePath
 
 SPEEDS_MPS = (4.0, 8.0, 12.0)
-"""The speeds at which the admission gate tries it."""
+"""Speeds at which the admission gate tries the blind driver."""
 ACCELERATION_MPS2 = 3.0
-"""How fast it reaches its speed."""
+"""Acceleration to its speed."""
 REENTRY_S = 1.5
 
 

@@ -17,14 +17,10 @@ class Conditions:
     """The conditions that a policy drives under.
 
     Args:
-        latency: Latency of each decision.
         dt_us: Step of the world, a divisor of 50 ms; `realtime.skipped_decisions` tells
             what a finer one changes. Frames are recorded every 50 ms regardless.
         image_size: Rows and columns of each camera.
         latency_model: Whether a latency drops decisions or delays every control.
-
-    Raises:
-        EvaluationError: The step does not divide 50 ms, or the latency names no trace.
     """
 
     latency: LatencySource = field(default_factory=FixedLatency)
@@ -47,11 +43,7 @@ class Conditions:
 
 
 def latency_model_named(name: str) -> LatencyModel:
-    """Return the latency model of a name.
-
-    Raises:
-        EvaluationError: There is none.
-    """
+    """Return the latency model of a name."""
     if name not in list(LatencyModel):
         there = ", ".join(LatencyModel)
         raise EvaluationError(f"no latency model {name!r}; there are {there}")
@@ -59,11 +51,7 @@ def latency_model_named(name: str) -> LatencyModel:
 
 
 def step_us(dt_ms: float) -> int:
-    """Return a step of the world in whole microseconds.
-
-    Raises:
-        EvaluationError: It is longer than a frame, or not above 0.
-    """
+    """Return a step of the world, at most one frame, in whole microseconds."""
     if not 0 < dt_ms <= FRAME_US / 1000:
         raise EvaluationError(
             f"a step of {dt_ms:g} ms: it must divide {FRAME_US // 1000} ms"

@@ -30,19 +30,19 @@ from me2e_compress.simulator.plane_geometry import Lane, Roadmap
 from me2e_compress.simulator.scene import Actor, Ego, Scene
 
 LATEST = round(PET_HORIZON_S * 1e6 / FRAME_US)
-"""Frames between the first and the second at one place."""
+"""Most frames between the first and the second at one place."""
 
 STOPPED_MPS = 0.05
-"""nuPlan's threshold of what stands, the ego and others alike."""
+"""nuPlan's threshold of standing, for the ego and others alike."""
 
 BEHIND_RAD = math.radians(150.0)
-"""nuPlan: a partner whose centre is so far round from the ego's heading is behind."""
+"""nuPlan: from this bearing on, the other's centre is behind the ego."""
 
 AT_FAULT = (Contact.STANDING_PARTNER, Contact.FRONT)
-"""The ego's fault wherever it was; a contact at its side only where it left a lane."""
+"""Always the ego's fault; a contact at its side only outside of one lane."""
 
 CHUNK = 256
-"""Frames of the ego that are compared at once."""
+"""Number of ego frames that are compared at once."""
 
 Box = tuple[float, float, float, float, float]
 

@@ -44,25 +44,22 @@ from me2e_compress.simulator.traffic.bodies import (
 )
 
 AHEAD_S = (0.5, 1.0)
-"""When the plan's places decide the acceleration, whatever its waypoints' times."""
+"""Seconds ahead at which the planned positions set the acceleration."""
 MIN_STEP_M = 0.3
-"""Waypoints nearer than this to the one before give no direction."""
+"""Waypoints nearer than this to their predecessor give no direction."""
 STATION_M = 0.25
 """Spacing of the curve that is tracked."""
 BEYOND_M = 20.0
-"""Straight end of the curve, so that a short plan can be looked along."""
+"""Straight extension of the curve, for lookahead beyond a short plan."""
 
 
 @dataclass(frozen=True, eq=False)
 class AnchoredPlan:
     """A plan in the world frame, fixed at the pose where it was computed.
 
-    Args:
-        time_us: When the observation was taken.
-        curve: [M, 2] metres, a smooth curve through the waypoints, sampled every 0.25
-            m, with a straight extension of 20 m.
-        travel_m: [n + 1] metres along the curve at ``times_s``.
-        times_s: [n + 1] seconds, 0 and those of the waypoints.
+    ``curve`` [M, 2] passes smoothly through the waypoints, sampled every 0.25 m, with a
+    straight extension of 20 m. ``travel_m`` and ``times_s`` [n + 1] are metres and
+    seconds at the start and at the waypoints.
     """
 
     time_us: int

@@ -21,9 +21,9 @@ from me2e_compress.simulator.routes import Route, load_routes
 from me2e_compress.simulator.world import World
 
 STEP_US = 500_000
-"""Between two frames of a scene: as far apart as the waypoints of a plan."""
+"""Time between two frames of a scene: that between two waypoints."""
 SEED_OFFSET = 1_000_000
-"""Added to every seed, so that no seed of frames is one of a set of routes."""
+"""Added to every seed, so that it never equals one of a set of routes."""
 
 
 def driven_frames(

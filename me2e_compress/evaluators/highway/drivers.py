@@ -78,12 +78,7 @@ class OnnxDriver(Driver):
             object.__setattr__(self, "adapter", adapter_file(self.adapter))
 
     def open(self) -> Policy:
-        """Return the policy.
-
-        Raises:
-            EvaluationError: There is no such file, or the model cannot drive.
-            ProviderError: The provider is not available.
-        """
+        """Return the policy; open files and provider."""
         from me2e_compress.driving.adapter import Adapter
         from me2e_compress.driving.onnx_policy import OnnxPolicy
         from me2e_compress.runtime.providers import PROVIDERS

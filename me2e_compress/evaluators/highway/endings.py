@@ -8,7 +8,7 @@ from me2e_compress.simulator.world import EndReason, World
 BLOCKED_MPS = 0.1
 BLOCKED_US = 60_000_000
 TIMEOUT_US = 200_000_000
-"""4000 ticks of 50 ms; the leaderboard's own, longer limits are never reached."""
+"""4000 ticks of 50 ms; the leaderboard's own limits are longer."""
 DEVIATION_M = 30.0
 ASTRAY_M = 15.0
 ASTRAY_SHARE = 0.3

@@ -17,22 +17,15 @@ CONNECT_TIMEOUT_S = 5.0
 class RayEngine:
     """One Ray actor per worker; model files must be readable from every node.
 
-    Args:
-        workers: Number of concurrent routes; each takes one CPU of the cluster.
-        address: Address of a running cluster; None starts one on this machine for the
-            duration of the evaluation.
+    Each worker takes one CPU of the cluster. Without an address, a cluster is started
+    on this machine for the duration of the evaluation.
     """
 
     workers: int = 1
     address: str | None = None
 
     def drive(self, job: Job, routes: Sequence[Route]) -> Iterator[Driven]:
-        """Yield each route as it finishes.
-
-        Raises:
-            MissingExtraError: Ray is not installed.
-            EvaluationError: There is no cluster at the address.
-        """
+        """Yield each route as it finishes."""
         ray = _ray()
         self._connect(ray)
         try:

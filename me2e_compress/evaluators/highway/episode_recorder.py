@@ -32,7 +32,7 @@ from me2e_compress.simulator.traffic.legs import ANNOUNCED_M
 from me2e_compress.simulator.world import Event, EventKind, World
 
 NEAR_M = 50.0
-"""Vehicles no farther than this are the traffic that the ego is compared with."""
+"""Range of the vehicles whose speed the ego's is compared with."""
 
 VEHICLES = (
     ActorKind.CAR,

@@ -81,12 +81,7 @@ class HighwayEvaluation:
         on_warning: Callable[[str], None] = lambda line: None,
         driver: Driver | None = None,
     ) -> HighwayEvaluator:
-        """Build the evaluator; without a driver, the policy is looked up by name.
-
-        Raises:
-            EvaluationError: An option is invalid.
-            MissingExtraError: The extra ``highway`` is not installed.
-        """
+        """Build the evaluator; without a driver, the policy is looked up by name."""
         need_extra("highway", "driving")
         # options become routes, driver and conditions
         picked, set_size = routes_named(self.routes)
@@ -122,11 +117,7 @@ class HighwayEvaluation:
 
 
 def routes_named(text: str) -> tuple[tuple[Route, ...], int]:
-    """Return the routes asked for, and the size of the set they are from.
-
-    Raises:
-        EvaluationError: There is no such route, or no file of routes.
-    """
+    """Return the routes asked for, and the size of the set they are from."""
     if text.endswith(".json"):
         routes = load_routes(Path(text))
         return routes, len(routes)
@@ -135,11 +126,7 @@ def routes_named(text: str) -> tuple[tuple[Route, ...], int]:
 
 
 def engine_of(name: str, workers: int, address: str | None) -> Engine:
-    """Return the engine of a name.
-
-    Raises:
-        EvaluationError: There is no such engine, or it takes no address.
-    """
+    """Return the engine of a name; only ``ray`` takes an address."""
     if name == "local" and address is None:
         return LocalEngine(workers)
     if name == "ray":
@@ -151,11 +138,7 @@ def engine_of(name: str, workers: int, address: str | None) -> Engine:
 
 
 def weather_of(text: str) -> Weather:
-    """Read ``option=value`` pairs; dropped cameras are joined by ``+``.
-
-    Raises:
-        EvaluationError: There is no such option, or its value is invalid.
-    """
+    """Read ``option=value`` pairs; dropped cameras are joined by ``+``."""
     options: dict[str, object] = {}
     for pair in filter(None, text.split(",")):
         name, _, value = pair.partition("=")

@@ -18,10 +18,7 @@ from me2e_compress.simulator.routes import Route
 
 @dataclass(frozen=True)
 class DrivingProgress:
-    """Progress of an evaluation; scores are means in percent, None before the first.
-
-    Routes of earlier runs count as ``done``.
-    """
+    """Progress of an evaluation; scores are means in percent, None before the first."""
 
     done: int
     total: int
@@ -35,16 +32,7 @@ class HighwayEvaluator:
 
     Running it again with the same folder drives what is missing. The files do not
     depend on the number of workers, the engine or the clock, unless latency is measured
-    during the run.
-
-    Args:
-        job: Driver and conditions.
-        routes: At least one.
-        folder: Where the results go.
-        set_size: Number of routes of the whole set.
-        engine: Where the routes are driven.
-        on_progress: Called at the start and after every route.
-        on_warning: Called with each warning, one line.
+    during the run. ``on_progress`` is called at the start and after every route.
     """
 
     name: ClassVar[str] = "highway"

@@ -15,7 +15,7 @@ from me2e_compress.simulator.scenarios.builders import stage_of
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES, VARIANTS
 
 MOST_TRIES = 8
-"""Proposals of a type for every route wanted, before we give up."""
+"""Most proposals of a type per wanted route."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,7 @@ class ScenarioRoutes:
 
 
 def propose(scenario: str, seed: int, name: str) -> Route:
-    """Return a route of one of the 44 types, with every parameter written out.
-
-    Raises:
-        EvaluationError: There is no such type.
-    """
+    """Return a route of one of the 44 types, with every parameter written out."""
     known = SCENARIO_ABILITIES.get(scenario)
     if known is None:
         there = ", ".join(sorted(SCENARIO_ABILITIES))
@@ -55,11 +51,7 @@ def seed_of(seed: int, scenario: str, attempt: int) -> int:
 def admitted_routes(
     scenario: str, seed: int, variants: int = VARIANTS
 ) -> ScenarioRoutes:
-    """Propose routes of a type until enough are admitted.
-
-    Raises:
-        EvaluationError: `MOST_TRIES` proposals per route were not enough.
-    """
+    """Propose routes of a type until enough are admitted."""
     routes, refusals = list[Route](), list[str]()
     for attempt in range(MOST_TRIES * variants):
         name = f"{scenario}_{len(routes)}"

@@ -18,12 +18,7 @@ from me2e_compress.simulator.world import World
 
 @dataclass
 class ObservationBuilder:
-    """Builds the observations of one route.
-
-    Args:
-        rig: Provides lidar2img, also for a policy that sees no images.
-        cameras: Render the images; None if none are needed.
-    """
+    """Builds the observations of one route; ``cameras`` is None if unused."""
 
     world: World
     policy: Policy
@@ -66,7 +61,7 @@ ROAD_USERS = (
     ActorKind.PEDESTRIAN,
     ActorKind.PARKED,
 )
-"""What a tracker would follow: all but doors, cones and barriers."""
+"""Actors that a tracker would follow: all but doors, cones and barriers."""
 
 
 def road_users(scene: Scene) -> npt.NDArray[np.float64]:
@@ -79,11 +74,7 @@ def road_users(scene: Scene) -> npt.NDArray[np.float64]:
 
 
 def scene_and_world(observation: Observation, who: str) -> tuple[Scene, World]:
-    """Return the scene and the world that a privileged policy of this simulator gets.
-
-    Raises:
-        EvaluationError: The observation has none, or those of another simulator.
-    """
+    """Return scene and world, which only privileged policies of highway get."""
     scene, world = observation.scene, observation.world
     if isinstance(scene, Scene) and isinstance(world, World):
         return scene, world

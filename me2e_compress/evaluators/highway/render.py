@@ -44,9 +44,6 @@ def render(job: Job, route: Route, folder: Path) -> tuple[Path, Path]:
 
     The animation shows six cameras and the view from above with the plan, infractions
     marked; the strip shows four moments including the end.
-
-    Raises:
-        EvaluationError: The policy cannot be opened, or a file cannot be written.
     """
     film = _Film()
     drive(route, job.driver.open(), job.conditions, Listeners(on_moment=film.see))

@@ -20,12 +20,12 @@ from me2e_compress.version import __version__
 MANIFEST = "evaluation.json"
 ROUTES = "routes"
 BEFORE = {"latency_model": "drop"}
-"""What holds of a folder from before its manifest had the key."""
+"""Defaults for folders from before their manifest had the key."""
 MEASURED = "latency_samples"
-"""Key of a manifest: how many the latencies were drawn from. It follows from what
-decides the results, of which it is none."""
+"""Key of a manifest: number of samples that latencies were drawn from. It is
+derived data, and not compared."""
 LARGEST_SET = 1_000_000
-"""Routes of a set that a manifest may claim."""
+"""Most routes of a set that a manifest may claim."""
 
 
 def fingerprint(job: Job, routes: Sequence[Route], set_size: int) -> dict[str, Any]:
@@ -61,14 +61,10 @@ class ResultsFolder:
     def create(
         cls, path: Path, made_by: dict[str, Any], measured: int | None = None
     ) -> Self:
-        """Create the folder, or resume one of the same evaluation.
+        """Create the folder, or resume one of the same evaluation; others are refused.
 
         ``measured`` is the number of samples of the trace that latencies are drawn
         from; None if none are drawn.
-
-        Raises:
-            EvaluationError: It holds another evaluation or other files, or cannot be
-                written.
         """
         # claim an empty folder
         try:
@@ -95,11 +91,7 @@ class ResultsFolder:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Open an existing folder.
-
-        Raises:
-            EvaluationError: It is not a results folder.
-        """
+        """Open an existing folder."""
         try:
             made_by = documents.from_json(documents.content(path / MANIFEST))
         except OSError as error:
@@ -135,11 +127,7 @@ class ResultsFolder:
         return {route: one for route, one in found.items() if one is not None}
 
     def save(self, driven: Driven) -> None:
-        """Write one route, and log its cost.
-
-        Raises:
-            EvaluationError: The disk is full, or the folder cannot be written.
-        """
+        """Write one route, and log its cost."""
         episode = driven.episode
         cost = {
             "route": episode.route,
@@ -156,7 +144,7 @@ class ResultsFolder:
             raise _unwritable(self.log, error) from error
 
     def keep(self, episode: Episode) -> None:
-        """Write one route; errors are those of `save`."""
+        """Write one route."""
         record = {"fingerprint": self._digest, "episode": episode.to_json()}
         try:
             write_json(self._file(episode.route), record)

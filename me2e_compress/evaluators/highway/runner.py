@@ -110,7 +110,6 @@ class _Drive:
             _reset(self.policy, self.route)
             self.listeners.on_answer()
             while ending is None:
-                # the last frame has no decision
                 self.recorder.record(scene)
                 if self.clock.decision_is_due:
                     self.decide(scene)
@@ -120,6 +119,7 @@ class _Drive:
                 ending = self.rules.ending(world, scene.ego.speed_mps)
         except PolicyFailedError as failure:
             return self.recorder.episode(Ending.POLICY_FAILED, str(failure))
+        # the last frame has no decision
         self.recorder.record(scene)
         self.show(scene)
         return self.recorder.episode(ending)

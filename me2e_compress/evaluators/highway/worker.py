@@ -28,8 +28,8 @@ POLL_S = 0.05
 FRAME_LIMIT_S = 60.0
 
 Heartbeat: TypeAlias = "SynchronizedArray[float]"
-"""[0] number of the call that the policy is in, 0 outside of one; [1] percent of the
-route passed."""
+"""[0] number of the policy call in progress, 0 between calls; [1] percent of
+the route passed."""
 
 
 @dataclass(frozen=True)

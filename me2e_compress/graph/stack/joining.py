@@ -69,6 +69,7 @@ class _Joiner:
         self.folder = folder
         self.names = Names(files)
         self.files = {each.label: each for each in files}
+        # A name without a part may stand for several inputs.
         self.edges = {
             taker: self.names.output(output, f"[edges] {text}")
             for text, output in content.edges.items()
@@ -79,6 +80,7 @@ class _Joiner:
             for text, entry in content.state.items()
             for taker in self.names.inputs(text, f"[state] {text}")
         }
+        # One input cannot have two sources.
         if both := [each for each in self.state if each in self.edges]:
             part, name = both[0]
             raise GraphError(f"{part}.{name} is fed by [edges] and by [state]")
@@ -147,6 +149,7 @@ class _Joiner:
         for (part, name), entry in self.state.items():
             if entry.first == ZEROS or self._given_first(entry) is not None:
                 continue
+            # Files and initializers are read; outputs are joined instead.
             where = f"[state] {name}: first value {entry.first}"
             if name not in read:
                 raise GraphError(
@@ -172,6 +175,7 @@ class _Joiner:
         *,
         first: bool,
     ) -> FeedSource:
+        # Edges come first, then state, then equal names.
         key = taker.part, name
         if key in self.edges:
             return self.edges[key]
@@ -180,6 +184,7 @@ class _Joiner:
             return given or FeedSource("", name)
         if taker.recurrent().get(name) is not None:
             return FeedSource("", name)
+        # An output of the same name feeds the input.
         givers = [
             part
             for part, each in graphs.items()
@@ -214,6 +219,7 @@ def _inputs(joints: Sequence[Joints]) -> dict[str, SessionPort]:
     found = dict[str, tuple[PartGraph, SessionPort]]()
     for each in joints:
         for taker, name, public in each.outside():
+            # All parts that take it must agree on type and shape.
             port = taker.inputs[name]
             other, known = found.setdefault(public, (taker, port))
             if misfit(known, port):

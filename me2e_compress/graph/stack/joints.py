@@ -61,6 +61,7 @@ class Joints:
 def _check(
     graphs: Mapping[str, PartGraph], taker: PartGraph, name: str, source: FeedSource
 ) -> None:
+    # The part must run, have the output, and fit the input.
     giver = graphs.get(source.part)
     if giver is None:
         raise GraphError(

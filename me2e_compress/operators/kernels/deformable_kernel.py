@@ -1,8 +1,7 @@
 """The kernel of multi-scale deformable attention, vectorized per block of queries.
 
 For all points of one query the positions and weights of the four corners are computed
-first; then the rows are summed (:mod:`weighted_rows`). One kernel serves any number
-of levels, points, heads and channels.
+first; then the rows are summed (:mod:`weighted_rows`). All sizes are read at run time.
 """
 
 from collections.abc import Callable, Mapping
@@ -146,6 +145,7 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
     quantized = bytes_each == 1
 
     def block(user: int, index: int) -> Word:
+        # The queries of this block
         a = words(user)
         blocks = (a[Q] + QUERIES - 1) // QUERIES
         n = index // blocks
@@ -155,11 +155,13 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
         at_once = a[M] if points == 0 else min(a[M], CAPACITY // points)
         if a[SHARED]:
             at_once = 1  # one head after the other looks at the same places
+        # Tables are the same for all queries
         w, o = _floats(), _ints()
         _tables(a, w, o, at_once)
         for q in range(from_query, to_query):
             m = 0
             while m < a[M]:
+                # As many heads at once as the tables hold
                 heads = min(at_once, a[M] - m)
                 first = (n * a[Q] + q) * a[M] + m
                 looked_at = n * a[Q] + q if a[SHARED] else first
@@ -187,7 +189,10 @@ def _refused(t: Any, message: int) -> Word:
 
 @compiled
 def _read(t: Any, context: int, index: int, to: int) -> Word:
-    """Read an input into ten words and return its rank, of which 8 are stored."""
+    """Read an input into ten words (dimensions, address, type) and return its rank.
+
+    More than eight dimensions are not read.
+    """
     slot = _slot()
     at = address_of(slot)
     call(t[abi.GET_INPUT], context, index, at, 0, 0)
@@ -239,6 +244,7 @@ def _compute(inputs: int) -> Callable[[int, int], Word]:
 
     def compute(state: int, context: int) -> Word:
         t, x, a = words(state), _inputs(), _words()
+        # Read the inputs and check their ranks
         for i in range(EACH * len(RANKS)):
             x[i] = 0
         for i in range(inputs):
@@ -249,6 +255,7 @@ def _compute(inputs: int) -> Callable[[int, int], Word]:
                 x[EACH * i] = 1
         for i in range(len(RANKS)):
             a[i] = x[EACH * i + ADDRESS]
+        # Sizes and flags for the blocks
         a[N], a[S], a[M], a[D] = x[0], x[1], x[2], x[3]
         a[L], a[Q], a[P], a[SCALES] = x[10], x[31], x[34], x[EACH * SCALE]
         a[SHARED] = x[32] == 1 and a[M] != 1
@@ -257,6 +264,7 @@ def _compute(inputs: int) -> Callable[[int, int], Word]:
         misfit = _misfit(a, x)
         if misfit >= 0:
             return _refused(t, misfit)
+        # Scale and zero point of quantized values
         if inputs > SCALE:
             if (a[SCALES] != 1 and a[SCALES] != a[M] * a[D]) or x[EACH * ZERO] != 1:
                 return _refused(t, SCALE_WRONG)
@@ -265,6 +273,7 @@ def _compute(inputs: int) -> Callable[[int, int], Word]:
                 a[ZERO] = np.int64(signed_bytes(zero)[0])
             else:
                 a[ZERO] = np.int64(unsigned_bytes(zero)[0])
+        # Create the output
         x[0], x[1], x[2], x[3] = a[N], a[Q], a[M], a[D]
         status = call(t[abi.GET_OUTPUT], context, 0, address_of(x), 4, address_of(a))
         if status != 0:
@@ -273,6 +282,7 @@ def _compute(inputs: int) -> Callable[[int, int], Word]:
         a[0] = x[ADDRESS]
         call(t[abi.GET_DATA], tensor, address_of(x), 0, 0, 0)
         a[OUT] = x[0]
+        # Run the blocks on the session's threads
         work = a[N] * ((a[Q] + QUERIES - 1) // QUERIES)
         if work * a[M] * a[D] == 0:
             return 0

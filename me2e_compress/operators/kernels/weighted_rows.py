@@ -40,6 +40,7 @@ def weighted_rows(kind: Any) -> Any:
         out: Any,
         size: Any,
     ) -> tuple[Any, Callable[..., Any]]:
+        # Numba calls this with LLVM values
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             _Loops(builder, kind, *arguments).write()
             return context.get_dummy_value()

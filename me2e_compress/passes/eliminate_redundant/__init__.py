@@ -77,6 +77,7 @@ def _key(node: ir.Node, module: str) -> object:
     inputs = [id(value) for value in node.inputs]
     if node.op_type in COMMUTATIVE:
         inputs.sort()
+    # Serialized attributes compare by value
     attributes = tuple(
         ir.serde.serialize_attribute(node.attributes[name]).SerializeToString(
             deterministic=True
@@ -266,9 +267,11 @@ def _move(branch: ir.Graph, node: ir.Node, graph: ir.Graph, by: str) -> None:
     names = value_names(graph)
     weights = list(branch.initializers.values())
     nodes = list(branch)
+    # Detach everything before it enters the outer graph
     branch.outputs.clear()
     branch.initializers.clear()
     branch.remove(nodes)
+    # Names must be unique in the whole model
     for value in weights:
         value.name = fresh_name(value.name or "weight", names)
         if value.const_value is not None:

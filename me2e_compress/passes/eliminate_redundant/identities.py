@@ -142,6 +142,7 @@ def _undoes(node: ir.Node, opset: int) -> ir.Value | None:
 def _neutral(test: Callable[[Array], bool], *, either: bool) -> Rule:
 
     def rule(node: ir.Node, opset: int) -> ir.Value | None:
+        # Either operand may be the neutral one if the operator commutes
         for kept, other in ((0, 1), (1, 0))[: 2 if either else 1]:
             array = array_of(node.inputs[other])
             source = node.inputs[kept]

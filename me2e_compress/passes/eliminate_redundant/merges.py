@@ -139,6 +139,7 @@ def _transposes(node: ir.Node, site: MergeSite) -> ir.Node | None:
     outer_perm, inner_perm = _perm(node), _perm(inner)
     if outer_perm is None or inner_perm is None:
         return None
+    # Compose both permutations; drop the pair if nothing moves
     perm = [inner_perm[axis] for axis in outer_perm]
     source = inner.inputs[0]
     if source is None:
@@ -172,6 +173,7 @@ def _casts(node: ir.Node, site: MergeSite) -> ir.Node | None:
     source, middle = inner.inputs[0].dtype, inner.outputs[0].dtype
     if source is None or middle is None:
         return None
+    # The first Cast must lose nothing
     if middle.name not in WIDENS.get(source, "").split():
         return None
     if sole_reader(inner.outputs[0]) is None and source != node.outputs[0].dtype:
@@ -217,6 +219,7 @@ def _window(node: ir.Node) -> list[list[int]] | None:
         if array is None and value is not None:
             return None
         given.append(None if array is None else [int(entry) for entry in array])
+    # Fill in the defaults of axes and steps
     starts, ends, axes, steps = [*given, None, None, None, None][:4]
     if not rank or starts is None or ends is None:
         return None
@@ -229,6 +232,7 @@ def _concats(node: ir.Node, site: MergeSite) -> ir.Node | None:
     axis = node.attributes.get_int("axis", 0)
     inputs: list[ir.Value | None] = []
     inner_nodes: list[ir.Node] = []
+    # Take in the operands of Concats that nothing else reads
     for index, value in enumerate(node.inputs):
         inner = _before(node, index)
         if (

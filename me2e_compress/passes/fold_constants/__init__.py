@@ -58,11 +58,10 @@ class FoldConstants(Pass):
 
     Attributes:
         bytes_per_node: how many bytes of new weights the removal of a node may cost,
-            scaled by the node's work per frame (:mod:`me2e_compress.passes.work`). A
-            fold that shrinks the weights is always done; one that grows them only up to
-            this
-            price: a position table repeated for every token stays computed, an
-            attention between constants does not.
+            scaled by the node's work (:mod:`me2e_compress.passes.work`). A fold that
+            shrinks the weights is always done, one that grows them only up to this
+            price, so that a position table repeated for every token stays computed and
+            an attention between constants does not.
         through_compute: fold through products, convolutions and softmax too, at the
             same price; False keeps every named layer, e.g. to ablate it later.
     """
@@ -235,6 +234,7 @@ def _seat(choice: ir.Node, graph: ir.Graph, opsets: Mapping[str, int], by: str) 
     branches = [attribute.as_graph() for attribute in choice.attributes.values()]
     if all(branch_fits(choice, branch, opsets) for branch in branches):
         return 0
+    # Find the ranges that read a result of the If
     bounds = [
         (use.node, use.idx, value)
         for value in choice.outputs
@@ -242,6 +242,7 @@ def _seat(choice: ir.Node, graph: ir.Graph, opsets: Mapping[str, int], by: str) 
         if use.node.op_type == "Range" and use.node.graph is graph
     ]
     for node, index, value in bounds:
+        # Reshape each bound to a scalar
         shape = add_constant(graph, np.zeros(0, np.int64), f"{value.name}_shape")
         scalar = ir.node("Reshape", [value, shape], name=f"{node.name}_bound_{index}")
         scalar.outputs[0].name = f"{value.name}_scalar_{node.name}_{index}"

@@ -71,12 +71,14 @@ class _Market:
             for value in one.inputs:
                 if value is not None:
                     self.readers.setdefault(value, {})[one] = None
+        # Values that nodes outside of constant expressions read
         self.outside = {
             value
             for one in known.expressions
             for place, value in enumerate(one.nodes[0].outputs)
             if self._is_read_outside(one, place)
         }
+        # Weights that only constant expressions read
         self.weights = {
             value: value.const_value.nbytes + ENTRY_BYTES
             for value in self.readers
@@ -138,12 +140,14 @@ class _Market:
     def lots(self) -> list[list[Expression]]:
         parent = {one: one for one in self.known.expressions}
 
+        # Union-find over the expressions
         def root(one: Expression) -> Expression:
             while parent[one] is not one:
                 parent[one] = parent[parent[one]]
                 one = parent[one]
             return one
 
+        # Join the maker and readers of each value
         for value, readers in self.readers.items():
             maker = self.known.maker.get(value)
             linked = readers if maker is None else (maker, *readers)

@@ -44,6 +44,7 @@ def _one_by_one(
     for one in needed:
         outputs = [value for value in one.nodes[0].outputs if value.name]
         inputs = [value for value in one.inputs if value is not None]
+        # Skip nodes whose inputs could not be computed
         if any(value in known.maker and value not in done for value in inputs):
             continue
         try:

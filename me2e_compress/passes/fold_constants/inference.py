@@ -72,6 +72,7 @@ def _ask(
     version = opsets.get("", opsets.get("ai.onnx", 0))
     if not is_standard(node) or not onnx.defs.has(node.op_type, version):
         return {}
+    # Types of all inputs, and data of the known ones
     types: dict[str, onnx.TypeProto] = {}
     data: dict[str, onnx.TensorProto] = {}
     for value in node.inputs:
@@ -100,6 +101,7 @@ def _record(
         proto = found.get(value.name or "")
         if proto is None:
             continue
+        # Shapes of graph outputs are only refined
         if value.is_graph_output():
             shape = ir.serde.deserialize_type_proto_for_shape(proto)
             if answers and (more := refined(value.shape, shape)) is not value.shape:

@@ -117,6 +117,7 @@ class Sweep:
             return False
         if node.op_type == "Dropout" and not _is_inference(node, self.opset):
             return False
+        # Bodies may read outer values
         if has_subgraph(node) or not node.inputs or _is_answer(node):
             return False
         return all(value is None or self._known(value) for value in node.inputs)
@@ -187,12 +188,14 @@ class Sweep:
     def _evaluate(self, node: ir.Node) -> Array | None:
         if len(node.outputs) != 1:
             return None
+        # Shapes need no data
         if node.op_type in ("Shape", "Size"):
             shape = static_shape(node.inputs[0])
             return None if shape is None else _shape(node, shape)
         expected = static_shape(node.outputs[0])
         if expected is None or math.prod(expected) > SMALL:
             return None
+        # Other nodes are computed if they are small and fully known
         inputs = [
             None if value is None else self.known.arrays.get(value)
             for value in node.inputs

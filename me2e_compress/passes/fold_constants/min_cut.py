@@ -64,6 +64,7 @@ class FlowNetwork:
                 path = self._fill(path)
                 vertex = self.head[path[-1]] if path else source
                 continue
+            # Advance along an edge of the level graph
             for edge in untried[vertex]:
                 if (
                     self.left[edge] > 0
@@ -73,6 +74,7 @@ class FlowNetwork:
                     vertex = self.head[edge]
                     break
             else:
+                # A dead end: retreat, or stop at the source
                 if not path:
                     return
                 levels[vertex] = -1

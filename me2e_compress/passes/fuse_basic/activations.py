@@ -127,6 +127,7 @@ def _stays_a_part(match: Match, facts: Facts) -> str | None:
     """
     ahead, seen = deque(match.root.outputs), set(match.root.outputs)
     while ahead:
+        # Search forward up to the next layers
         for reader in ahead.popleft().consumers():
             if reader.op_type == "Log":
                 return "Sigmoid that a Log turns back: only written out it is exact"

@@ -46,6 +46,7 @@ def _is_over_last_axes(match: Match, facts: Facts) -> bool:
         return False
     if rank_of(match.root.outputs[0]) != rank:
         return False  # the epsilon has more axes
+    # The axes must be the last ones
     last = list(range(rank - len(first), rank))
     return sorted(axis % rank for axis in first) == last
 

@@ -94,7 +94,6 @@ def _is_sampler(node: ir.Node) -> bool:
 
 
 class _Run:
-
     def __init__(
         self, current: FuseOperators, opset: int, names: set[str], proofs: Proofs
     ) -> None:
@@ -172,6 +171,7 @@ class _Run:
             (4, (*plan.weights.views, *mask)),
         ):
             value = node.inputs[index]
+            # Only operands without computed parts
             constant = all(array_of(view.value) is not None for view in read)
             if value is None or value.producer() is None or not constant:
                 continue

@@ -173,6 +173,7 @@ class _Form:
     def _outer(self, middle: tuple[Digit, ...]) -> Layout:
         images = self.found.batch // self.heads
         batch = (Digit(BATCH, self.heads, images),) if images > 1 else ()
+        # Images that are added up become levels
         kept = split_like(batch, self.found.images)
         kept = tuple(digit for digit in kept if digit not in self.found.images)
         return (kept, middle, whole(BATCH, self.heads))

@@ -187,6 +187,7 @@ def _unscaled(node: ir.Node, view: View) -> View | None:
         return None
     if static_shape(source) != static_shape(view.value) or constant == 0.0:
         return None
+    # Compose with the scale and shift so far
     scale, shift = view.scale, view.shift
     if node.op_type == "Mul":
         scale *= constant

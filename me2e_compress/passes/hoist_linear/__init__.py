@@ -20,7 +20,7 @@ from me2e_compress.rewrite import graphs_of, remove_dead, value_names
 __all__ = ["HoistLinear"]
 
 OLDEST_OPSET = 8
-"""Earlier opsets broadcast differently and have no Expand."""
+"""The first opset that has Expand and broadcasts as numpy does."""
 
 ROUNDS = 8
 """A round may move further what the last one moved: real graphs need two."""
@@ -64,8 +64,8 @@ class HoistLinear(Pass):
 
     Result:  MatMul(x) -> Tile;  x W + p (P W) + c W;  x -> Relu -> MatMul -> Expand
 
-    A product moves in front of nodes that only rearrange or repeat rows (Tile, Expand,
-    Gather, Concat; Slice, Reshape and Transpose that keep the last axis). It is
+    A product moves in front of nodes that only rearrange or repeat rows and keep the
+    last axis (Tile, Expand, Gather, Concat, Slice, Reshape and Transpose). It is
     distributed over a sum, or over concatenated columns, of which a part is small or
     repeated. Two consecutive linear layers become one. Each rewrite is done only where
     it needs fewer multiply-accumulates and is cheaper in total: nodes, memory traffic
@@ -90,7 +90,6 @@ class HoistLinear(Pass):
         tally, opset = _Tally(), opset_of(model)
         if opset < OLDEST_OPSET:
             return PassResult(model, 0)
-        # Unread nodes would hold on to their inputs
         tally.unread = remove_dead(model.graph)  # it would hold on to what it reads
         names = value_names(model.graph)
         rewriters = [

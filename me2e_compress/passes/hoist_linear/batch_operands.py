@@ -88,12 +88,14 @@ def _operand(product: ir.Node) -> BatchOperand | None:
 def _terms(value: ir.Value) -> tuple[list[ir.Value], list[ir.Node]] | None:
     if sole_reader(value) is None:
         return None
+    # A repetition is a sum of one term
     node, source = value.producer(), without_repeats(value)
     if node is not None and source is not None:
         return [source], [node]
     total = maker(value, "Add")
     if total is None:
         return None
+    # Nodes between the sum and its terms go, too
     found = [term for term, _, _ in terms_of(total, static_shape(value) or ())]
     between = [
         repeat

@@ -99,6 +99,7 @@ def _regroup(axes: list[list[Atom]], shape: tuple[int, ...]) -> list[list[Atom]]
     found: list[list[Atom]] = []
     for size in shape:
         axis: list[Atom] = []
+        # Take atoms from the front, and split the last if it divides
         while size > 1:
             if not atoms:
                 return None

@@ -97,7 +97,7 @@ class Prices:
         self.owned.known.clear()
 
     def saving(self, layer: LinearLayer) -> Price | None:
-        """Return a cheaper way of fewer MACs with the savings; None if there is none."""
+        """Return a cheaper way of fewer MACs and its savings; None if there is none."""
         # Compare the direct product with the best other way
         columns = (static_shape(layer.product.outputs[0]) or (0,))[-1]
         source = layer.source
@@ -156,6 +156,7 @@ class Prices:
         self, asked: Question, node: ir.Node, sources: tuple[ir.Value, ...]
     ) -> Price:
         prices = {id(value): self.cheapest(asked.of(value)) for value in sources}
+        # Views move no data
         cost = 1.0 + sum(part.work for part in prices.values())  # each is made once
         if node.op_type not in VIEWS:
             read = sum(asked.of(value).product_bytes for value in sources)
@@ -177,6 +178,7 @@ class Prices:
         if not found:
             return None
         terms, cost, macs = [], 0.0, 0
+        # The product of each term
         for value, owned, rows in found:
             mine = asked.owned and owned
             one = self.cheapest(asked.of(value, owned=mine, fresh=rows is not None))
@@ -189,6 +191,7 @@ class Prices:
                 * _item(asked.value)
                 / (MOVED_BYTES_PER_NODE)
             )
+        # Adding the products up
         sums = len(terms) - 1
         cost += sums + sums * asked.product_bytes / MOVED_BYTES_PER_NODE
         return Price(Distributed(node, tuple(terms)), cost, macs)

@@ -69,6 +69,7 @@ class LinearLayer:
         """Return the added vector, [N]; None if there is none."""
         total: Numbers | None = None
         columns = (static_shape(self.result) or ())[-1:]
+        # A Gemm has its own bias
         if len(self.product.inputs) > 2 and self.product.inputs[2] is not None:
             beta = self.product.attributes.get_float("beta", 1.0)
             total = _vector(self.product.inputs[2], columns) * beta

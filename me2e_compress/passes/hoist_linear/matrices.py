@@ -57,6 +57,7 @@ def vector_of(way: Way, matrix: Matrix) -> Numbers | None:
         return plus(mine, vector_of(way.way, matrix.behind(way)))
     if not isinstance(way, Distributed):
         return None
+    # Add up the vectors of all terms
     total: Numbers | None = None
     for at, term in enumerate(way.terms):
         more = vector_of(term.way, matrix.part(term))

@@ -159,10 +159,12 @@ class _Writer:
     ) -> ir.Value:
         """Write the terms, the fewest rows first, which take the vector."""
         terms, minus = list(way.terms), way.node.op_type == "Sub"
+        # Constant terms join the vector
         if not minus:
             terms.sort(key=lambda term: math.prod(term.shape[:-1]))
             terms, vector = _without_vectors(terms, matrix, vector)
         total: ir.Value | None = None
+        # Only the first term takes the vector
         for term in terms:
             one = self._write_way(term.way, matrix.part(term), vector)
             vector = None

@@ -24,9 +24,11 @@ def demote(model: ir.Model, by: str) -> tuple[int, str]:
     """
     if not any(True for _ in _doubles(model)):
         return 0, ""
+    # Stop where the outside needs double
     keeper = _keeper(model)
     if keeper:
         return 0, f"float64 stays: {keeper} is double"
+    # Weights, attributes, then value types
     count = _demote_weights(model)
     for node in nodes_of(model):
         if found := _demote_attributes(node):
@@ -58,6 +60,7 @@ def _keeper(model: ir.Model) -> str:
             if value.type is not None and _is_double(value.type):
                 return f"{kind} {value.name}"
     for node in nodes_of(model):
+        # Standard operators and functions can change type
         known = node.domain == "" and node.op_type not in _BY_WIDTH
         if known or node.op_identifier() in model.functions:
             continue

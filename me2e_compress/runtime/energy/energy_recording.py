@@ -62,6 +62,7 @@ class EnergyRecording:
     def idle_w(self, schedule: EnergySchedule) -> float | None:
         """Return the mean watts before and after the work; None if both are short."""
         working = np.flatnonzero(np.diff(self.frames) > 0)
+        # The stretches before the first frame and after the last.
         ends = ((0, int(working[0])), (int(working[-1]) + 1, len(self.times_s) - 1))
         idle = [
             self._window(begin, end)

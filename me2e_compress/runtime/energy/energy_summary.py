@@ -35,8 +35,10 @@ def summarise(
     before and after each window.
     """
     found = estimate(windows, by.step_s, idle_w)
+    # Pauses between frames are not part of a frame's time.
     frames = sum(each.frames for each in windows)
     frame_s = sum(each.taken_s - each.paused_s for each in windows) / frames
+    # Not every device reports temperatures or clocks.
     warmth = [e.temperature_c for e in states if e.temperature_c is not None]
     throttled = dict.fromkeys(reason for each in states for reason in each.throttled)
     return EnergyResult(

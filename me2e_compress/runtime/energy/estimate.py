@@ -123,6 +123,7 @@ def beat(frame_s: float, frames: int, step_s: float) -> float:
     """
     orders = np.arange(1, HARMONICS + 1)
     turns = orders * frame_s / step_s
+    # The phases of evenly spaced frames sum to a Dirichlet kernel.
     across = np.abs(np.sin(np.pi * turns))
     agree = np.ones(HARMONICS)
     far = across > 1e-9
@@ -137,6 +138,7 @@ def detuning(frame_s: float, frames: int, step_s: float) -> float:
     by one step, or a whole fraction of one: the counter then samples every part of a
     frame. Returns 0 if they are not in step.
     """
+    # Take the shortest pause that suffices, else the best one.
     fractions = [0.0, *(step_s / order for order in range(HARMONICS, 0, -1))]
     pauses = [behind / frames for behind in fractions]
     found = [beat(frame_s + pause, frames, step_s) for pause in pauses]

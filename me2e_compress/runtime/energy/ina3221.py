@@ -81,6 +81,7 @@ class Ina3221Reader(Reader):
     def __init__(self, channels: Sequence[Channel], sensors: Sequence[Path]) -> None:
         self._channels = channels
         self.device = "Jetson"
+        # The scope tells how the sensor averages its power.
         averaging = ", ".join(
             f"{name} {text}"
             for name in ("samples", "update_interval")

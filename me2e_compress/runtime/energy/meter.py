@@ -108,6 +108,7 @@ class EnergyMeter:
     ) -> EnergyResult:
         reader, frames = self._reader, spans[0].frames
         pause = detuning(frame_s, frames, step_s)
+        # Warn if even the pauses leave frames in step.
         left = beat(frame_s + pause, frames, step_s)
         warnings = (
             f"energy: frames of {frame_s * 1e3:.1f} ms keep step with the counter"
@@ -178,6 +179,7 @@ class EnergyMeter:
         """Run one window at a random phase of the counter."""
         frames = self._schedule.frames(frame_s)
         pause = detuning(frame_s, frames, step_s)
+        # The lead-in follows the wait: caches must hold this model.
         self._sleep(float(self._random.uniform(0, step_s)))
         first = self._reader.state()
         self._lead_in(run)

@@ -101,6 +101,7 @@ class ModelledEnergy(Displayed):
             (module, f"{1e3 * joules:.3f}", f"{joules / whole:.1%}" if whole else "-")
             for module, joules in self.by_module.items()
         ]
+        # The note has the totals, and the source of the figures.
         macs = ", ".join(
             f"{count / 1e9:.3f} G {number}" for number, count in self.macs.items()
         )
@@ -145,6 +146,7 @@ def modelled_energy(
     for each in found:
         by_module[each.module] += _mac_j(each, costs) + _memory_j(each, costs)
         macs[each.number] += each.macs
+    # There is no figure where no node could be counted.
     mac_j = sum(_mac_j(each, costs) for each in found)
     memory_j = sum(_memory_j(each, costs) for each in found)
     return ModelledEnergy(
@@ -208,6 +210,7 @@ def _traffic(node: ir.Node, macs: int, module: str, seen: set[str]) -> _Traffic 
         elif value.name not in seen:
             seen.add(str(value.name))
             weights += size
+    # Outputs count in the type in which they are written.
     for value in node.outputs:
         size = value_bytes(as_written(value))
         if size is None:

@@ -42,13 +42,8 @@ def measure_energy(
     own; ``on_window`` is called with windows done, windows in all, and the model's
     name.
 
-    Returns:
-        Joules per frame by model; without a counter, the reason why not, at once.
-
-    Raises:
-        EnergyError: the counter fails, or a recording is given for several models.
-        GraphError: a model cannot be run.
-        FramesError: a frame does not fit, or there is none.
+    Returns joules per frame by model; without a counter, the reason why not, at once. A
+    counter that fails, or a recording given for several models, is an EnergyError.
     """
     digests = {name: sha256_of(path) for name, path in models.items()}
     # Measure, take the recording, or say why there is no counter.
@@ -66,6 +61,7 @@ def measure_energy(
         found = _metered(
             *(models, frames, opened, schedule, threads, provider, on_window, said)
         )
+    # Each result carries the digest of its model's files.
     return {
         name: dataclasses.replace(result, model_sha256=digests[name])
         for name, result in found.items()
@@ -88,6 +84,7 @@ def _metered(
             name: open_session(path, threads=threads, provider=provider, said=said)
             for name, path in models.items()
         }
+        # Each model replays the frames held in memory endlessly.
         work = {
             name: replay(session, chain.from_iterable(repeat(held))).__next__
             for name, session in sessions.items()

@@ -97,6 +97,7 @@ class NvmlReader(Reader):
             name: _number(pynvml.nvmlDeviceGetClockInfo, self._handle, kind)
             for name, kind in _CLOCKS.items()
         }
+        # A bit mask tells why the GPU runs slower.
         mask = _number(pynvml.nvmlDeviceGetCurrentClocksEventReasons, self._handle)
         slowed = tuple(
             words

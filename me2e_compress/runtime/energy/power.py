@@ -34,7 +34,7 @@ class PowerSamples:
         return sum(begin_s <= each <= end_s for each, _ in self._taken)
 
     def joules(self, begin_s: float, end_s: float) -> float:
-        """Return the energy between two times; it takes enough samples."""
+        """Return the energy between two times; too few samples are an error."""
         times, watts = np.array(self._taken or [(0.0, 0.0)]).T
         count = self.count(begin_s, end_s)
         if count < FEWEST_SAMPLES:
@@ -70,6 +70,7 @@ def in_background(period_s: float, call: Callable[[], None]) -> Iterator[None]:
             except EnergyError as error:
                 failed.append(error)
 
+    # A daemon thread does not keep a failed process alive.
     thread = Thread(target=repeat, daemon=True)
     thread.start()
     try:
@@ -77,5 +78,6 @@ def in_background(period_s: float, call: Callable[[], None]) -> Iterator[None]:
     finally:
         done.set()
         thread.join()
+    # An error in the thread is raised here.
     if failed:
         raise failed[0]

@@ -38,6 +38,7 @@ class Rapl(EnergyCounter):
         }
         if not any(name.startswith("package") for name in zones.values()):
             return Absent(f"no package in {self.root}")
+        # Opening reads every counter once.
         try:
             return RaplReader(zones)
         except PermissionError as error:

@@ -50,6 +50,7 @@ class Recorded(EnergyCounter):
 def _read(path: Path) -> tuple[Mapping[str, Sequence[Any]], Mapping[str, str]]:
     """Return the columns, and the texts that describe the device."""
     content = documents.content(path)
+    # JSON: arrays are columns, texts describe the device.
     if path.suffix.lower() == ".json":
         record = documents.from_json(content)
         if not isinstance(record, dict):

@@ -38,10 +38,7 @@ class GridPoint:
     def passes(
         self, rules: str, target: str, dims: Mapping[str, int]
     ) -> tuple[Pass, ...]:
-        """Return the passes that turn the float model into this one.
-
-        Consumers of a removed module read its average over the frames.
-        """
+        """Return its passes; a removed module leaves its mean over the frames."""
         chosen = list(with_sizes(recipe.load("exact"), dims))
         if self.ablated:
             at = 1 + [each.name for each in chosen].index(BEFORE_ABLATION)
@@ -54,13 +51,9 @@ class GridPoint:
 
 @dataclass(frozen=True)
 class GridModules:
-    """The modules of a graph, and which of them may be removed.
+    """The modules of a graph that have nodes, in the order of the map.
 
-    Attributes:
-        features: Modules of feature extraction that have nodes, in the order of the
-            map.
-        predictions: Modules of prediction, likewise.
-        needed: Prediction modules that make the plan.
+    ``needed`` are the prediction modules that make the plan, which cannot be removed.
     """
 
     features: tuple[str, ...]
@@ -69,11 +62,7 @@ class GridModules:
 
     @classmethod
     def of(cls, model: ir.Model, modules: ModuleMap) -> Self:
-        """Read them off a graph.
-
-        Raises:
-            GraphError: The graph's metadata names a plan that does not exist.
-        """
+        """Read them off a graph."""
         placed = assign(model, modules)
         present = {placed.module_of(node) for node in model.graph}
         named = [str(value.name) for value in model.graph.outputs]
@@ -107,9 +96,6 @@ class GridModules:
         In ``groups``, ``A+B,C`` lets A and B share a choice, C has its own and others
         stay in float; None takes feature extraction and prediction. In ``ablate``,
         ``A,B`` may be removed; None takes all removable ones, ``none`` takes none.
-
-        Raises:
-            RecipeError: A module does not exist, is named twice, or cannot be removed.
         """
         if groups is None:
             chosen = [each for each in (self.features, self.predictions) if each]

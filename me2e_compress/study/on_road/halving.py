@@ -14,19 +14,15 @@ from statistics import fmean
 from me2e_compress.simulator.routes import Route
 
 FINAL = 2
-"""So many are left for all routes."""
+"""Number of schemes that drive all routes."""
 
 Differ = Callable[[str, Sequence[Route]], Sequence[float]]
-"""Drives one of them over routes: points of driving score beside the reference's."""
+"""Drives a scheme over routes: points of driving score minus the reference's."""
 
 
 @dataclass(frozen=True)
 class Standing:
-    """One scheme on one rung.
-
-    ``difference`` is the mean over the rung's routes, points of driving score; ``kept``
-    tells whether it continues or, on the last rung, wins.
-    """
+    """One scheme on one rung; ``difference`` is a mean in points of driving score."""
 
     name: str
     difference: float
@@ -51,8 +47,7 @@ def halve(
     """Drive all over the first routes, the better half over twice as many, and so on.
 
     The last two, or all if no routes are left, drive every route; the first of the last
-    rung wins. ``names`` lists preferred ones first, ``routes`` is in the order of
-    :func:`stratified`, and ``first`` is the number of routes of the first rung.
+    rung wins. ``names`` lists preferred ones first, ``routes`` are :func:`stratified`.
     """
     left, rungs = list(names), list[Rung]()
     for size in sizes(len(left), len(routes), first):

@@ -10,13 +10,7 @@ from me2e_compress.workflows.budgets import Joules, check_budgets
 
 @dataclass(frozen=True)
 class Weighed:
-    """Costs of one scheme.
-
-    Attributes:
-        mb: Size of the weights, 1e6 bytes.
-        ms: Median of a decision on the device, milliseconds.
-        joules: Per frame, measured or modelled as the search says.
-    """
+    """Costs of one scheme: MB of weights, median decision in ms, joules per frame."""
 
     mb: float
     ms: float

@@ -26,19 +26,12 @@ from me2e_compress.workflows.budgets import Joules, joules_of
 from me2e_compress.workflows.listener import Listener
 
 ASKED = "search.json"
-"""What decides the drives of a folder; budgets and the grid do not."""
+"""File of what decides the drives of a folder; budgets and grid do not."""
 
 
 @dataclass(frozen=True)
 class RoadDrives:
-    """Schemes that are made and weighed, and driven on request.
-
-    Attributes:
-        prepared: Models that can drive, by scheme; schemes with byte-identical files
-            share the first one's.
-        weighed: Costs of each scheme.
-        failures: Why a scheme has no model.
-    """
+    """Schemes that are made and weighed; identical files share the first model."""
 
     setup: DriveSetup
     prepared: Mapping[str, PreparedVariant]
@@ -57,12 +50,7 @@ class RoadDrives:
         return "" if first == name else first
 
     def episodes(self, name: str, routes: Sequence[Route]) -> tuple[Episode, ...]:
-        """Drive what is missing of some routes; return them in order.
-
-        Raises:
-            StudyError: It cannot be driven.
-            EvaluationError: The folder belongs to another evaluation.
-        """
+        """Drive what is missing of some routes; return them in order."""
         (condition,) = self.study.conditions
         return self.setup.some(self.prepared[name], condition, routes)
 
@@ -97,10 +85,6 @@ def make_drives(
     """Make and weigh the models of a study; one that fails does not stop the others.
 
     The study has one condition; latency is measured on its frames.
-
-    Raises:
-        StudyError: The folder belongs to another search.
-        Me2eError: The float model cannot drive, or frames do not fit.
     """
     # make the models; identical files count once
     _claim(study, folder)

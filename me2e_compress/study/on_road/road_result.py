@@ -25,11 +25,8 @@ from me2e_compress.workflows.result import (
 class Scheme:
     """One assignment, apart from how it drives.
 
-    Attributes:
-        name: Name of its variant.
-        weighed: Its costs; None if it could not be made.
-        refused: Why it did not drive; empty if it could.
-        same_as: The scheme with a byte-identical file; empty if there is none.
+    It has no costs if it could not be made; ``refused`` says why it did not drive, and
+    ``same_as`` names a scheme with a byte-identical file, if there is one.
     """
 
     name: str
@@ -45,8 +42,6 @@ class RoadSearchResult(Result):
 
     Attributes:
         output: The recipe that was written.
-        schemes: The whole grid.
-        float_costs: Costs of the unchanged model.
         difference: The winner minus the float model, over all routes.
         device_scale: How many times slower the device is than this machine.
         coverage: Routes that were driven, and those of the whole set.

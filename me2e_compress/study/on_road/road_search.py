@@ -26,7 +26,7 @@ from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import counted, duration, number
 
 BASELINE = "float"
-"""The model as it is given: what all are held against."""
+"""The unchanged model, with which all schemes are compared."""
 CONDITION = "road"
 
 
@@ -100,19 +100,13 @@ def search_on_road(
 def planned(
     path: Path, frames: Path, options: RoadSearchOptions
 ) -> tuple[Study, dict[str, GridPoint]]:
-    """Return the study of a grid, and its points by the names of their variants.
-
-    Raises:
-        RecipeError: A module does not exist or cannot be removed.
-        EvaluationError: Routes or latency are unknown.
-        StudyError: A module's name is no file name, or a study cannot use the latency.
-    """
+    """Return the study of a grid, and its points by the names of their variants."""
     # the grid of the model's modules
     loaded = graph.load(path)
     modules = GridModules.of(loaded, load_map(options.module_map, loaded))
     points = modules.grid(options.modules, options.ablate, options.most_ablated)
     grid = {each.name: each for each in points}
-    # the float model is the baseline
+    # routes, and the float model as the baseline
     routes, set_size = routes_named(options.routes)
     driver = driver_named(str(path), options.adapter)
     adapter = driver.adapter if isinstance(driver, OnnxDriver) else None
@@ -164,11 +158,7 @@ def ahead(
 
 
 def within(made: RoadDrives, options: RoadSearchOptions) -> tuple[str, ...]:
-    """Return the schemes within the budgets, the cheapest first, each file once.
-
-    Raises:
-        EvaluationError: There is none; the message names the least cost.
-    """
+    """Return the schemes within the budgets, the cheapest first, each file once."""
     limits, weighed = options.limits, made.weighed
     ours = [name for name in made.prepared if name != BASELINE]
     if not ours:

@@ -45,10 +45,7 @@ class SeenBox:
 @with_config(_STRICT)
 @dataclass(frozen=True)
 class PlannedMoment:
-    """All road users at one moment, and the ego's plan.
-
-    ``plan`` holds waypoints in the world, and is empty before the first decision.
-    """
+    """The road users at one moment, and the ego's waypoints in the world, if any."""
 
     time_us: int
     ego: SeenBox
@@ -59,11 +56,7 @@ class PlannedMoment:
 @with_config(_STRICT)
 @dataclass(frozen=True)
 class Accident:
-    """The last seconds of a route that ended in a collision.
-
-    ``path`` is the route's centre line; ``moments`` are in order of time, the last one
-    at the collision.
-    """
+    """The last seconds of a route, up to a collision, with its centre line."""
 
     variant: str
     condition: str
@@ -74,11 +67,7 @@ class Accident:
     moments: tuple[PlannedMoment, ...]
 
     def save(self, path: Path) -> None:
-        """Write it as JSON.
-
-        Raises:
-            StudyError: The file cannot be written.
-        """
+        """Write it as JSON."""
         try:
             write_json(path, _ACCIDENT.dump_python(self, mode="json"))
         except OSError as error:
@@ -86,11 +75,7 @@ class Accident:
 
     @classmethod
     def load(cls, path: Path) -> "Accident":
-        """Read a file that `save` wrote.
-
-        Raises:
-            StudyError: The file cannot be read, or has other content.
-        """
+        """Read a file that `save` wrote."""
         try:
             content = documents.from_json(documents.content(path))
             return _ACCIDENT.validate_python(content)

@@ -20,10 +20,7 @@ MARGIN_M = 8.0
 
 
 def plans_before(accident: Accident) -> Figure:
-    """Draw the ego, plan and neighbours of each moment, later ones darker.
-
-    All are in the frame of the ego at the last moment, which looks to the right.
-    """
+    """Draw all moments in the frame of the ego at the last one, later ones darker."""
     with styled():
         # the road, in the ego's frame at the collision
         figure = Figure(figsize=(WIDTH_IN, 3.6), layout="constrained")

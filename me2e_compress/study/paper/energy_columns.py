@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from me2e_compress.study.paper.paper_result import PaperResult
 
 Energy = Literal["measured", "modelled"]
-"""Where joules a frame come from."""
+"""Source of the joules per frame."""
 ENERGY = ("J/frame", "EER_AV", "modelled mJ/frame", "EER_AV, modelled")
 EER = (
     "EER_AV (equations 8 to 11) in points, by CRITIC weights over the rows of one"

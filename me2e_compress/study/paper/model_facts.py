@@ -30,10 +30,9 @@ _STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
 class Int8Counts:
     """Counts of the int8 part of a graph.
 
-    Attributes:
-        tensors: Activations with a scale of their own: nodes that quantize.
-        operators: Nodes that read int8: layers, attention products, residual Adds.
-        compute_intensive: Those of them that are convolutions or matrix products.
+    ``tensors`` are activations with a scale of their own (nodes that quantize),
+    ``operators`` are nodes that read int8: layers, attention products, residual Adds.
+    Those that are convolutions or matrix products are ``compute_intensive``.
     """
 
     tensors: int
@@ -47,19 +46,15 @@ class ModelFacts:
     """A variant's file.
 
     Attributes:
-        sha256: None if there is no file.
         pipeline: The passes that made it, as text.
         size_bytes: Size of the file with its weights.
-        parameters: Number of elements of its weights.
         macs: Multiply-accumulates of one inference.
         int8: None for a file without a plan.
         latency_us: Latencies of inferences alone, warm, on the target device.
         modules_us: Latencies by module under a profiler, on the target device.
-        modelled_j: Joules per frame from published energies of MACs and bytes; not
-            measured.
+        modelled_j: Joules per frame from published energies of MACs and bytes.
         joules: Measured joules per frame, and the ends of their 95 % interval; None
-            without a counter.
-        no_joules: Why there is no measurement.
+            without a counter, and ``no_joules`` says why.
         failure: Why there is no file that can drive; empty if there is one.
     """
 
@@ -144,11 +139,8 @@ def facts_of(
 def weighed(folder: Path) -> tuple[ModelFacts, ...]:
     """Count the files of another stack, for table 4 only.
 
-    The folder's name is the stack's. It holds some of ``exact.onnx``,
-    ``prediction.onnx``, ``feature-ext.onnx`` and ``full.onnx``.
-
-    Raises:
-        StudyError: The folder holds none of them.
+    The folder has the stack's name and some of ``exact.onnx``, ``prediction.onnx``,
+    ``feature-ext.onnx`` and ``full.onnx``.
     """
     files = [(scheme, folder / f"{scheme}.onnx") for scheme in SCHEMES]
     there = [(scheme, path) for scheme, path in files if path.is_file()]
@@ -182,11 +174,7 @@ def int8_counts(path: Path) -> Int8Counts | None:
 def save_facts(
     path: Path, facts: Sequence[ModelFacts], about: Mapping[str, object]
 ) -> None:
-    """Write facts, and what they were measured on.
-
-    Raises:
-        StudyError: The file cannot be written.
-    """
+    """Write facts, and what they were measured on."""
     rows = _FACTS.dump_python(tuple(facts), mode="json")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -196,11 +184,7 @@ def save_facts(
 
 
 def load_facts(path: Path) -> tuple[dict[str, object], dict[str, ModelFacts]]:
-    """Read what `save_facts` wrote: what it was measured on, and facts by variant.
-
-    Raises:
-        StudyError: The file cannot be read, or has other content.
-    """
+    """Read what `save_facts` wrote: what it was measured on, and facts by variant."""
     try:
         content = documents.from_json(documents.content(path))
         facts = _FACTS.validate_python(content.pop("variants"))

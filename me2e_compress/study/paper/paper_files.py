@@ -24,10 +24,6 @@ def write_paper(
 
     ``command`` is the command line that reproduces them; ``force`` also replaces files
     that were changed since we wrote them.
-
-    Raises:
-        StudyError: The folder cannot be written.
-        GraphError: A file was changed since we wrote it.
     """
     folder = Path(folder)
     report, tables, record = folder / HTML, folder / MARKDOWN, folder / JSON

@@ -22,7 +22,7 @@ def _figure_6(result: PaperResult) -> Figure | None:
 
 
 Drawn: TypeAlias = tuple[Markup, str]
-"""An SVG and what is said below it."""
+"""An SVG and its caption."""
 FIGURES: dict[str, tuple[tuple[Callable[[PaperResult], Figure | None], str], ...]] = {
     "Table 2": (
         (

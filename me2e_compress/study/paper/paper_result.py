@@ -23,12 +23,8 @@ CellKey = tuple[str, str]
 class PaperResult(Result):
     """The drives that were made, and facts about the files that drove.
 
-    Attributes:
-        facts: One per variant, in the study's order.
-        cells: The finished drives.
-        failures: Why a drive failed.
-        device_scale: How many times slower the device is than the machine timed on.
-        accident: An accident of the baseline, for figure 6; None if it had none.
+    ``cells`` are the finished drives, ``failures`` the reasons of the others; the
+    device is ``device_scale`` times slower than the machine timed on.
     """
 
     study: Study

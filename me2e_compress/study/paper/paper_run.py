@@ -53,13 +53,9 @@ def run_paper(
     """Make the models, time them and drive every cell, block by block.
 
     Run again with the same folder it resumes: finished models, traces, routes and cells
-    (``records/``) are reused. A variant that fails, or a cell that cannot be driven, is
-    reported, and the rest continues. ``on_block`` is called with all results after each
-    block driven now; ``weigh`` are folders of other stacks' files, counted in table 4.
-
-    Raises:
-        GraphError: The folder is a file or an input.
-        Me2eError: The baseline cannot drive, or frames do not fit.
+    (``records/``) are reused. A variant or cell that fails is reported, and the rest
+    continues. ``on_block`` is called after each block driven now; ``weigh`` are folders
+    of other stacks' files, counted in table 4.
     """
     folder = Path(folder)
     check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
@@ -76,9 +72,6 @@ def read_paper(
     """Read finished cells (``records/`` of a run); nothing is made or driven.
 
     ``weigh`` adds folders of other stacks' files to table 4.
-
-    Raises:
-        StudyError: A folder holds no such files, or one that cannot be read.
     """
     # finished cells, and facts of their files
     folder = Path(records)
@@ -244,7 +237,7 @@ def _with_joules(
     }
     if study.held_out is None or not models:
         return list(found)
-    # all are measured together, and share their noise
+    # all models are measured in one run
     measured = measure_energy(
         models,
         CalibrationSet(study.held_out),

@@ -1,7 +1,7 @@
 """The paper's tables, from the drives made here.
 
-The paper's own figures are in separate columns: they are of other stacks, on other
-roads, with other traffic.
+The paper's own figures are of other stacks, roads and traffic: they have columns of
+their own.
 """
 
 from typing import TYPE_CHECKING

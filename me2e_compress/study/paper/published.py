@@ -10,14 +10,8 @@ from dataclasses import dataclass
 class PublishedDrive:
     """A row of tables 2, 3, 5 or 6; None where the table has no such column.
 
-    Attributes:
-        fps: Frames per second.
-        ds: Driving score.
-        de: Driving efficiency, percent.
-        dc: Driving comfort.
-        joules: Energy per frame.
-        eer: EER_AV.
-        watts: Power.
+    ds, de (percent) and dc are driving score, efficiency and comfort; joules are per
+    frame, watts the power.
     """
 
     fps: float
@@ -110,6 +104,6 @@ INT8_COUNTS = {
     ("VAD", "feature-ext"): PublishedInt8(72, 72, 56, 119.25),
     ("VAD", "full"): PublishedInt8(194, 155, 77, 83.32),
 }
-"""Table 4."""
+"""Table 4: counts of int8 parts."""
 STATIC_COLLISIONS_WITHOUT_MAP = 0.5507
 """Share of collisions with static structures, of all, in schemes 2 and 6."""

@@ -48,12 +48,8 @@ class Verdict(StrEnum):
 class Finding:
     """A question about a finding of the paper, and the answer.
 
-    Attributes:
-        question: Phrased so that the paper's answer is yes.
-        paper: What the paper says, with its figures.
-        test: What is computed here, in words.
-        estimate: None if nothing could be computed.
-        reason: Why nothing could be computed.
+    The question is phrased so that the paper's answer is yes; ``paper`` and ``test``
+    say in words what the paper found and what is computed here.
     """
 
     question: str
@@ -138,11 +134,7 @@ class Evidence:
         return self.result.study.seed
 
     def cell(self, name: CellName) -> DriveRecord:
-        """Return a drive.
-
-        Raises:
-            UntestedError: It is missing; the message says why.
-        """
+        """Return a drive, or raise an `UntestedError` that says why it is missing."""
         found = self.result.cell(*name)
         if found is None:
             raise UntestedError(self.result.why_not(*name))

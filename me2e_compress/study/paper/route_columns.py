@@ -10,13 +10,7 @@ from me2e_compress.study.drive_record import DriveRecord, RouteSummary
 
 @dataclass(frozen=True)
 class RouteColumn:
-    """One number of every route.
-
-    Attributes:
-        name: Heading in a table.
-        of: Takes it from a route; None if it was not measured.
-        bounds: Smallest and largest value of a route, if there are any.
-    """
+    """One number of every route; None if it was not measured."""
 
     name: str
     unit: str
@@ -74,10 +68,7 @@ def mean_gap(
     seed: int = 0,
     of: int = 1,
 ) -> Estimate:
-    """Return the mean of differences by route, with its intervals.
-
-    ``of`` is 2 for differences of differences, whose bounds are twice as wide.
-    """
+    """Return the mean of differences; ``of`` is 2 for differences of differences."""
     unit = "points" if column.unit == "%" else column.unit
     if not found:
         return _none(unit, f"no route has a {column.name} in both drives")

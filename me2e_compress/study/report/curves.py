@@ -12,7 +12,7 @@ from me2e_compress.study.report.figures import WIDTH_IN
 from me2e_compress.study.report.style import ACCENT, BASELINE, MUTED, styled, svg
 
 ENOUGH = 3
-"""Conditions that make a curve; fewer are read off the tables."""
+"""Fewest conditions that make a curve; fewer are read off the tables."""
 
 Score = Callable[[Scores], Estimate]
 
@@ -62,7 +62,7 @@ def _curve(
         for place, each in enumerate(found)
         if each is not None and each.value is not None
     ]
-    # intervals below the line
+    # intervals are drawn under the curve
     for place, _, low, high in driven:
         if low is not None and high is not None:
             axes.plot([place] * 2, [low, high], color=colour, alpha=0.3, linewidth=1.6)

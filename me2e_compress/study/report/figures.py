@@ -24,21 +24,18 @@ from me2e_compress.study.report.style import (
 CROWD = 6
 """With more variants than this, only the front and the baseline bear names and bars."""
 WIDTH_IN = 9.2
-"""Of the page's column."""
+"""Width of the page's column."""
 LINE_PT = 10.5
 """Height of a line of labels, points."""
 CHARACTER_PT = 4.9
-"""Mean width of a character of this size, points: an estimate is enough here."""
+"""Mean width of a character, points: an estimate is enough here."""
 GAP_PT = 7.0
 POINTS_AN_INCH = 72.0
 
 
 @dataclass(frozen=True)
 class Point:
-    """A variant in the plane of cost and driving score.
-
-    ``cost`` is in megabytes or milliseconds.
-    """
+    """A variant in the plane of cost (megabytes or milliseconds) and driving score."""
 
     name: str
     cost: float
@@ -169,7 +166,7 @@ def _scatter(axes: Axes, points: Sequence[Point], words: str) -> None:
             markersize=5,
             zorder=3,
         )
-    # room for the names on the right
+    # the cost axis starts at zero, with room for names
     axes.set_xlabel(words)
     axes.margins(x=0.12)
     axes.set_xlim(left=0.0)

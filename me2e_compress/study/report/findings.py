@@ -63,10 +63,7 @@ def _road(drive: Drive, several: bool) -> str:
 
 
 def sure(found: Estimate) -> int:
-    """Return the sign of a difference that is certain, otherwise 0.
-
-    Bounds are rounded to a tenth of a point, as they are printed.
-    """
+    """Return the sign of a difference that is certain as printed, otherwise 0."""
     if found.low is not None and round(found.low, 1) > 0.0:
         return 1
     if found.high is not None and round(found.high, 1) < 0.0:

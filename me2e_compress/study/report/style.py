@@ -12,7 +12,7 @@ INK, MUTED, RULE = "#1d2127", "#6b7480", "#d9dde3"
 ACCENT, BASELINE = "#2a6fb0", "#1d2127"
 STYLE = Path(__file__).with_name("report.mplstyle")
 PAGE_FONT = "Inter, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif"
-"""Texts stay texts: matplotlib measures one font, the reader sees the page's."""
+"""Text stays text: matplotlib measures one font, the page shows its own."""
 
 
 def styled() -> AbstractContextManager[None]:

@@ -26,8 +26,8 @@ def convert(model: ir.Model, ranges: Ranges | None = None) -> ir.Model:
 
     Unconverted, such a graph is slower than a float one: onnxruntime's convolutions
     write uint8 and so need a pair after them, and it has no fast kernel for int8
-    activations. The copy has the same int8 layers, with the same weights and the same
-    ranges. ``ranges`` has those of the tensors that :func:`unranged` lists.
+    activations. Layers, weights and ranges stay the same. ``ranges`` has the tensors of
+    :func:`unranged`.
 
     Raises:
         PreconditionError: the pairs are not symmetric int8, or there are none.
@@ -40,11 +40,7 @@ def convert(model: ir.Model, ranges: Ranges | None = None) -> ir.Model:
 
 
 def unranged(model: ir.Model) -> tuple[str, ...]:
-    """Return the tensors whose range is needed and is not in the graph.
-
-    They are outputs of convolutions without a pair: before a residual Add, and where a
-    float node reads them.
-    """
+    """Return the outputs of convolutions without a pair, whose range is needed."""
     draft = _draft_of_qdq(model)
     region = find_region(draft.model.graph, draft.weights)
     return tuple(name for name in region.ranged if name not in draft.reach)
@@ -82,6 +78,7 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
     """
     copy = model.clone()
     graph.infer_shapes(copy)
+    # Find the pairs of activations, and their ranges.
     pairs = {node: value for node in copy.graph if (value := _activation(node))}
     if not pairs:
         raise PreconditionError(
@@ -100,6 +97,7 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
         if bias is not None:
             name = f"{node.inputs[2].name}_stored" if node.inputs[2] else ""
             node.replace_input_with(2, rewrite.add_constant(copy.graph, bias, name))
+    # Only layers with a kernel become int8.
     weights = {node: weight_of(node) for node in layers if has_kernel(node)}
     # Remove the pairs of activations.
     for node, value in pairs.items():

@@ -140,6 +140,7 @@ def work_of(layer: ir.Node) -> tuple[Counts, Counts] | None:
     grouped = "grouped_" if layer.attributes.get_int("group", 1) > 1 else ""
     float_ |= {f"float_{grouped}mac": macs, "float_reorder": _reordered(layer)}
     int8 |= {f"int8_{grouped}mac": macs, "int8_answer": outputs}
+    # Kernels larger than 1 copy patches first.
     taps = math.prod(weight[2:])
     if taps > 1 and not grouped:
         int8["int8_patch"] = taps * outputs // weight[0]
@@ -161,6 +162,7 @@ def _reordered(layer: ir.Node) -> int:
     found = 0
     if source is not None and not _is_convolved(source):
         found += math.prod(static_shape(source) or ())
+    # The output stays blocked if any reader works on blocks.
     if not any(reader.op_type in _BLOCKED for reader in end.consumers()):
         found += math.prod(static_shape(end) or ())
     return found
@@ -197,6 +199,7 @@ class _Flow:
         """Describe one of the tensors."""
         elements = math.prod(static_shape(value) or ())
         direct, carriers, others = self._uses(value)
+        # Joins connect this tensor's layers with those of others.
         joins = [node for node in carriers if node.op_type in JOINS]
         quantize = "requantize" if self._is_product(value) else "quantize"
         return Border(
@@ -250,6 +253,7 @@ class _Flow:
         layers: list[ir.Node] = []
         carriers: list[ir.Node] = []
         others = False
+        # A float reader forces a conversion.
         for reader, index in value.uses():
             if not self._region.reads(reader, index):
                 others = True

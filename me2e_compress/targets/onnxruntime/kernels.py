@@ -39,6 +39,7 @@ def objection(node: ir.Node) -> str | None:
     """
     if not is_standard(node) or node.op_type not in LAYERS:
         return f"there is no int8 kernel for {node.op_type}"
+    # Each operator has its own conditions.
     if node.op_type == "Conv":
         stored = bias_of(node) is None or graph.array_of(bias_of(node)) is not None
         return None if stored else "the bias is computed"
@@ -61,11 +62,8 @@ def _is_plain_gemm(node: ir.Node) -> bool:
 
 
 def is_bias(value: ir.Value | None, rank: int, columns: int | None) -> bool:
-    """Return whether a value is a constant that adds one number to every column.
-
-    ``rank`` and ``columns`` are those of the product: a constant of higher rank would
-    raise its rank, and a longer one would add columns to a single column.
-    """
+    """Return whether a value is a constant that adds one number to every column."""
+    # A higher rank or more columns would change the product's shape.
     array = graph.array_of(value)
     return (
         array is not None
@@ -83,6 +81,7 @@ def biased_end(product: ir.Node) -> ir.Node | None:
     rank = rank_of(product.inputs[0]) or 0
     if addition is None or addition.op_type != "Add":
         return None
+    # The other operand must be a plain bias.
     others = [each for each in addition.inputs if each is not value]
     columns = extent(product, weight=True).columns
     found = len(others) == 1 and is_bias(others[0], rank, columns)
@@ -99,7 +98,7 @@ def is_move(node: ir.Node) -> bool:
 
 
 def end_of(node: ir.Node) -> ir.Value:
-    """Return the output of a layer's kernel: after the ReLU, if one follows.
+    """Return the output of a layer's kernel: that of the ReLU after it, if any.
 
     A ReLU costs nothing where its uint8 grid begins at zero: quantization clips.
     """

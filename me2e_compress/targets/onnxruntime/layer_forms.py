@@ -39,6 +39,7 @@ def write_layer(
     if bias is None:
         _store(writer, node, 1, weight)
         return
+    # The bias is in units of the product's steps.
     weight, integers = with_bias(weight, bias, step)
     units = (weight.scales * step).astype(np.float32)
     if node.op_type == "MatMul":
@@ -56,6 +57,7 @@ def with_bias(
     If a channel's weights are so small that its bias does not fit, the channel gets a
     coarser scale: its products are then below the bias's own rounding.
     """
+    # The scales at which the largest bias still fits.
     least = np.abs(bias) / (np.float64(BIAS_MAX) * step)
     scales = np.maximum(weight.scales, least).astype(np.float32)
     if (scales > weight.scales).any():
@@ -119,6 +121,7 @@ def _write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Nod
     answer = gemm.outputs[0]
     if len(leading) > 1:
         answer = place.restored(answer, left, leading, size[1], name)
+    # The result replaces that of the Add.
     answer.shape, answer.type = old.shape, old.type
     rewrite.replace_value(old, answer)
     return gemm
@@ -153,6 +156,7 @@ class _Place:
         name: str,
     ) -> ir.Value:
         """Reshape [rows, columns] to the leading dimensions of another value."""
+        # At most one open dimension: a constant shape suffices.
         known = [dim if isinstance(dim, int) else -1 for dim in leading]
         if known.count(-1) <= 1:
             return self.reshaped(rows, [*known, columns], f"{name}_ranked")

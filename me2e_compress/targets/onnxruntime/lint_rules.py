@@ -75,16 +75,13 @@ def signed_activations(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def unanswered(model: ir.Model) -> Iterator[LintFinding]:
-    """Find quantized convolutions whose output is not quantized: they run in float.
-
-    A Relu or Clip may be between: it is fused. A convolution with a float weight is
-    meant to run in float.
-    """
+    """Find int8 convolutions whose output is not quantized: they run in float."""
     for node in _layers(model):
         quantized = all(map(is_dequantized, node.inputs[:2]))
         if node.op_type not in CONVOLUTIONS or not quantized:
             continue
         value = node.outputs[0]
+        # Look past a fused Relu or Clip.
         readers = list(value.consumers())
         if len(readers) == 1 and readers[0].op_type in ("Relu", "Clip"):
             readers = list(readers[0].outputs[0].consumers())
@@ -104,6 +101,7 @@ def padded_pools(model: ir.Model) -> Iterator[LintFinding]:
         pad = producer_of(node.inputs[0]) if node.op_type == "MaxPool" else None
         if pad is None or not is_standard(pad) or not _pads_with_zeros(pad):
             continue
+        # Without negative values the result is the same.
         before = producer_of(pad.inputs[0])
         if before is None or before.op_type not in _NEVER_NEGATIVE:
             yield error(

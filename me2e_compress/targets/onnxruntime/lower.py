@@ -19,10 +19,8 @@ from me2e_compress.targets.weights import QuantizedWeight
 class Draft:
     """A float graph, and what of it becomes int8; lowering changes the graph in place.
 
-    Attributes:
-        weights: weights of the layers to quantize, by the name of their first output.
-        reach: max(|low|, |high|) of the activations whose range is known, by name.
-        sampled: output names of the fused operators that sample int8.
+    ``weights`` and ``sampled`` name layers and sampling operators by their first
+    output; ``reach`` is max(|low|, |high|) of the activations whose range is known.
     """
 
     model: ir.Model
@@ -77,6 +75,7 @@ def _write_pairs(
         ]
         producer = value.producer()
         source = producer if born and producer is not None else uses[0][0]
+        # Insert the pair, and reconnect the readers.
         quantize, dequantize = _pair(writer, value, grid, source)
         if producer is None:
             writer.graph.insert_before(writer.graph[0], [quantize, dequantize])
@@ -84,6 +83,7 @@ def _write_pairs(
             writer.graph.insert_after(producer, [quantize, dequantize])
         for reader, index in uses:
             reader.replace_input_with(index, dequantize.outputs[0])
+        # A graph output keeps its name.
         if born and value.is_graph_output():
             _hand_over(value, dequantize.outputs[0], quantize)
 
@@ -94,6 +94,7 @@ def _pair(
     name = str(value.name)
     scale = writer.constant(np.array(grid.scale), f"{name}_scale")
     zero = writer.constant(np.array(grid.zero, np.uint8), f"uint8_{grid.zero}")
+    # Both nodes share scale and zero point.
     quantize = writer.node(
         "QuantizeLinear", [value, scale, zero], f"{name}_uint8", [source]
     )

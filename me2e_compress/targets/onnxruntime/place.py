@@ -37,11 +37,6 @@ class OnnxRuntime(Target):
 
         Products of two activations stay float here. ``ranges`` must have every tensor
         that :meth:`tensors` lists.
-
-        Raises:
-            PreconditionError: the graph is older than opset 13 or in a float type
-                without int8 here, or a planned weight is not constant.
-            FramesError: the range of a tensor is missing.
         """
         self.check_types(plan, model)
         weights = weights_of(model, _layers_of(plan))
@@ -53,6 +48,7 @@ class OnnxRuntime(Target):
         """List the plan's nodes that :meth:`place` leaves in float, and why."""
         region = _region(plan, model)
         nodes = {str(node.outputs[0].name): node for node in model.graph}
+        # Nodes without an objection become int8.
         reasons = (
             (each, _objection(nodes[each.output], each, region)) for each in plan.chosen
         )

@@ -33,6 +33,7 @@ def read_back(model: ir.Model, provider: Provider = CPU) -> Iterator[LintFinding
     except GraphError as refusal:
         yield error("refused", None, str(refusal))
         return
+    # Layers with only int8 weights are meant to run in float.
     plan = plan_of(model)
     meant = set() if plan is None else {each.output for each in plan.weight_only}
     known = origins(source, found)

@@ -29,13 +29,11 @@ class Region:
     """The int8 part of a graph.
 
     Attributes:
-        layers: convolutions and matrix products in graph order, with their inputs.
         grids: the uint8 tensors, and the tensor whose range each one uses: usually its
             own, or the first of a chain that only moves elements.
         born: tensors that an int8 kernel writes, so that no float version exists.
-        readers: other nodes that read uint8.
-        sampled: fused operators that sample uint8, by the first node that reads it:
-            themselves, or a Reshape before them.
+        readers: nodes that read uint8, other than layers.
+        sampled: fused operators that sample uint8, by the first node that reads it.
     """
 
     layers: dict[ir.Node, ir.Value]
@@ -114,9 +112,10 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
 
 
 def _sampled(node: ir.Node, born: Collection[ir.Value]) -> tuple[ir.Value, ir.Node]:
-    """Return the original tensor that a fused operator samples, and its reader."""
+    """Return what a fused operator samples through reshapes, and its reader."""
     value = node.inputs[0]
     assert value is not None
+    # Look through reshapes with one reader.
     while value not in born and len(value.uses()) == 1:
         made = value.producer()
         if made is None or made.op_type != "Reshape" or made.inputs[0] is None:
@@ -160,16 +159,14 @@ class Grid:
 
 
 def never_negative(value: ir.Value) -> bool:
-    """Prove from its producers that no element of a tensor is negative.
-
-    Every node is visited once, so the time is linear.
-    """
+    """Prove from its producers, in linear time, that a tensor is never negative."""
     pending: list[ir.Value | None] = [value]
     seen: set[ir.Value] = {value}
     while pending:
         node = producer_of(pending.pop())
         if node is None:
             return False
+        # Moves and joins pass the question on to their inputs.
         if node.op_type in _UNSIGNED or is_clip_at_zero(node):
             continue
         if node.op_type != "Concat" and not is_move(node):

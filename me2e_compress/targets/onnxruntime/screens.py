@@ -48,6 +48,7 @@ def _would_run_in_float(product: ir.Node) -> bool:
         return False
     if product.op_type == "MatMul" and readers[0].op_type == "Add":
         return True
+    # A Relu or Clip hides the layer, unless only pairs follow.
     clipped = readers[0].outputs[0]
     return readers[0].op_type in _CLIPS and (
         clipped.is_graph_output()

@@ -19,6 +19,7 @@ def step_of(node: ir.Node) -> Floats:
     scale = graph.array_of(node.inputs[1])
     zero = graph.array_of(graph.input_at(node, 2))
     name = node.name or node.outputs[0].name
+    # The scale must be constant, the grid symmetric int8.
     if scale is None or scale.dtype != np.float32:
         kind = "computed" if scale is None else scale.dtype
         way = ": convert-float32 makes it so" if kind == np.float16 else ""
@@ -58,11 +59,13 @@ def weight_of(layer: ir.Node) -> QuantizedWeight | None:
         if step.size > 1 and along != integers.ndim - 1:
             return None
         integers, along, axis = integers.reshape(integers.shape[-2:]), 1, 1
+    # Scales must run along the output channels.
     if step.size > 1 and (along != axis or step.shape != (integers.shape[axis],)):
         raise PreconditionError(
             f"{node.name} has scales of shape {list(step.shape)} along axis {along},"
             f" expected one for each of {integers.shape[axis]} along axis {axis}"
         )
+    # One scale in all is repeated for every channel.
     scales = np.broadcast_to(step.reshape(-1), (integers.shape[axis],))
     source = node.inputs[0]
     name = str(layer.outputs[0].name if source is None else source.name)
@@ -86,6 +89,7 @@ def _integers(dequantize: ir.Node, step: Floats) -> npt.NDArray[np.int8] | None:
     stored = graph.array_of(source)
     if stored is not None:
         return stored.astype(np.int8)
+    # ModelOpt stores floats: quantize them here.
     quantize = producer_of(source)
     if quantize is None or quantize.op_type != QUANTIZE:
         return None

@@ -39,11 +39,7 @@ class Writer:
         sources: Sequence[ir.Node],
         attributes: dict[str, int] | None = None,
     ) -> ir.Node:
-        """Build a node of a standard operator without inserting it.
-
-        ``name`` is made unique; provenance comes from ``sources``, the leading one
-        first.
-        """
+        """Build a node with a unique name and the sources' provenance."""
         unique = rewrite.fresh_name(name, self._names)
         node = ir.node(op, inputs, attributes or {}, name=unique)
         node.outputs[0].name = unique
@@ -68,6 +64,7 @@ class Writer:
         steps = self.constant(scales, f"{name}_scale")
         inputs = [stored, steps, self.constant(zeros, f"{name}_zero")]
         axes = None if axis is None else {"axis": axis}
+        # The node is named after its reader: weights may be shared.
         label = f"{reader.name or reader.outputs[0].name}/{name}_float"
         node = self.node("DequantizeLinear", inputs, label, [reader], axes)
         node.outputs[0].shape = ir.Shape(integers.shape)

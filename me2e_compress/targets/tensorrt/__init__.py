@@ -66,10 +66,6 @@ class TensorRT(Target):
         Every activation that the plan reads gets a QuantizeLinear and a
         DequantizeLinear (int8, zero point 0, scale = max(|low|, |high|) / 127); weights
         become int8 initializers before a DequantizeLinear.
-
-        Raises:
-            PreconditionError: the graph is older than opset 13 or in a float type
-                without int8 here, or a planned weight is not constant.
         """
         self.check_types(plan, model)
         weights = weights_of(model, plan.chosen)
@@ -91,6 +87,7 @@ class TensorRT(Target):
         found = find(node)
         if found is None or ir.DataType.INT8 not in found[1].operands[0].types:
             return f"the plugin {node.op_type} takes float32 or float16 alone"
+        # The scale must be an input that is not set yet.
         scale, shape = found[1].int8_scale, static_shape(node.inputs[0])
         if scale is None:
             return f"the plugin {node.op_type} gets the scale of int8 not by QDQ"
@@ -124,6 +121,7 @@ class _Writer:
         self, node: ir.Node, decision: Decision, weight: QuantizedWeight | None
     ) -> None:
         """Rewrite one node to read int8."""
+        # Fused operators get integers; layers get pairs and weights.
         if reads := int8_inputs(node):
             self._feed(node, reads[0])
             return
@@ -146,6 +144,7 @@ class _Writer:
         dequantize = self._activation(value, plugin).producer()
         if dequantize is None:
             return
+        # The plugin reads the integers before the DequantizeLinear.
         plugin.replace_input_with(index, dequantize.inputs[0])
         step = scale_of(*self._ranges.tensors[str(value.name)])
         scales = self._constant(np.full(channels, step), f"{value.name}_scales")
@@ -160,6 +159,7 @@ class _Writer:
             if self._zero is None:
                 self._zero = self._constant(np.array(0, np.int8), "int8_zero")
             pair = [scale, self._zero]
+            # Build the pair.
             quantize = self._node("QuantizeLinear", [value, *pair], name, value, reader)
             quantize.outputs[0].type = ir.TensorType(ir.DataType.INT8)
             dequantize = self._node(

@@ -56,6 +56,7 @@ def costs_of(model: ir.Model, layers: Collection[ir.Node], rates: GpuRates) -> C
         if seconds is not None:
             saved[layer] = seconds
     chosen = frozenset(layers)
+    # Each tensor that layers read may need a pair.
     borders = tuple(
         _border(value, found, chosen, rates) for value, found in readers.items()
     )
@@ -68,6 +69,7 @@ def _saved_s(layer: ir.Node, rates: GpuRates) -> float | None:
     if macs is None or None in shapes:
         return None
     read, right, made = (math.prod(shape or ()) for shape in shapes)
+    # The slower of arithmetic and memory decides.
     half_s = max(macs / rates.half_macs, 2 * (read + right + made) / rates.memory)
     int8_s = max(macs / rates.int8_macs, (read + right + 2 * made) / rates.memory)
     if layer.op_type not in CONVOLUTIONS:
@@ -83,6 +85,7 @@ def _border(
 ) -> Border:
     elements = math.prod(static_shape(value) or ())
     producer, maker = value.producer(), _convolution(value)
+    # A graph input is read once more.
     touched = 3 if producer is None else 1
     quantize_s = touched * elements / rates.memory
     others = any(reader not in chosen for reader in value.consumers())

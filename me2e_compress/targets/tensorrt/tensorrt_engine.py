@@ -52,6 +52,7 @@ def build_engine(path: Path, settings: EngineSettings) -> TensorRTEngine:
         PreconditionError: it lacks an option, or refuses the graph; the message names
             the node.
     """
+    # Parse the graph with the user's plugins.
     trt, begun = _tensorrt(), time.perf_counter()
     log = _log(trt)
     _load_plugins(trt, log, settings.plugins)
@@ -122,6 +123,7 @@ def _refusal(trt: Any, parser: Any) -> str:
 def _set_types(trt: Any, config: Any, model: ir.Model, precision: Precision) -> None:
     """Allow the types that TensorRT 10 may choose; 11 uses those of the graph."""
     flags = trt.BuilderFlag
+    # TensorRT 11 has no such flags.
     if not hasattr(flags, "FP16"):
         if precision == "fp16":
             raise PreconditionError(
@@ -129,6 +131,7 @@ def _set_types(trt: Any, config: Any, model: ir.Model, precision: Precision) -> 
                 " convert-float16 on it instead of --precision fp16"
             )
         return
+    # TensorRT 10 needs flags for the types in the graph.
     if any(node.op_type in PAIR for node in graph.nodes_of(model)):
         config.set_flag(flags.INT8)
     weights = model.graph.initializers.values()

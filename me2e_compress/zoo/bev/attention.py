@@ -128,8 +128,8 @@ def deformable_attention(
         for level, image in enumerate(images)
     ]
     sampled = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-    # Weight the samples and sum
     parts.clear()  # of UniAD's cameras they are 2 GB
+    # Weight the samples and sum
     weights = weights.transpose(1, 2).reshape(batch * heads, 1, queries, points)
     out = (sampled * weights).sum(-1).view(batch, heads * channels, queries)
     return out.transpose(1, 2)

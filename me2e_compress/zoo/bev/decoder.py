@@ -101,6 +101,7 @@ class Decoder(nn.Module):
         for layer, branch in zip(self.layers, branches, strict=True):
             query = layer(query, pos, bev, reference[..., :2], ignore)
             raw = branch(query)
+            # Move the reference in logit space
             moves = raw[..., :2]
             if self.height:
                 moves = torch.cat([moves, raw[..., 4:5]], -1)

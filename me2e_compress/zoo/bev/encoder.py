@@ -174,6 +174,7 @@ class BevEncoder(nn.Module):
         self.layers = nn.ModuleList(
             EncoderLayer(grid.hw, hws, sampling) for _ in range(layers)
         )
+        # Constant reference points
         points = pillars(grid.hw, grid.pc_range, PILLAR_POINTS)
         self.register_buffer("pillars", points, False)
         rows, columns = torch.meshgrid(
@@ -202,10 +203,12 @@ class BevEncoder(nn.Module):
         2], the ego translation relative to the grid, moves the reference points of both
         halves of the queue.
         """
+        # Project the pillars and shift the cells once per frame
         pillars_at, visible = project(self.pillars, lidar2img, self.image_hw)
         cells_at = self.cells + shift[:, None]
         start = query
         for layer in self.layers:
+            # Without a previous view, queries attend to themselves
             older = torch.where(first, query, previous)
             newer = torch.where(first, query, start)
             queue = torch.cat([older, newer], 0)

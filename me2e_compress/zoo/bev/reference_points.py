@@ -34,9 +34,11 @@ def project(
     cells, 1]: 1 where a camera sees any point of the pillar.
     """
     seen = torch.matmul(lidar2img[0][:, None, None], points.unsqueeze(0)).squeeze(-1)
+    # Divide by depth, and scale to 0..1
     depth = seen[..., 2:3]
     uv = seen[..., :2] / torch.maximum(depth, MIN_DEPTH)
     u, v = uv[..., 0:1] / image_hw[1], uv[..., 1:2] / image_hw[0]
+    # Visible: in front of the camera and within the image
     inside = (depth > MIN_DEPTH) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
     visible = inside.to(uv.dtype).amax(1)
     return torch.cat([u, v], -1).transpose(1, 2), visible
@@ -79,11 +81,13 @@ def turn(
     """
     height, width = grid.hw
     centre_column, centre_row = grid.rotation_centre
+    # Rotate the cell positions
     angle = can_bus[17:18] * (math.pi / 180)
     cos, sin = torch.cos(angle), torch.sin(angle)
     x, y = cells[:, 0], cells[:, 1]
     column = cos * x - sin * y + centre_column
     row = sin * x + cos * y + centre_row
+    # Sample the previous view there
     at = torch.stack([column * (2 / width) - 1, row * (2 / height) - 1], -1)
     image = bev.permute(1, 2, 0).view(1, -1, height, width)
     turned = sample(image, at.view(1, height, width, 2), sampling, mode="nearest")

@@ -46,11 +46,13 @@ class Tcp(nn.Module):
         self.heads: ActionHeads = heads
         self.config = config
         joint, hidden, measured = config.joint, config.hidden, config.measured
+        # Inputs of both branches
         self.perception = ImageTrunk(config)
         channels = self.perception.channels[-1]
         self.measurements = layers(STATE, measured, measured)
         self.join_traj = layers(measured + config.classes, joint, joint, hidden)
         self.join_ctrl = layers(measured + channels, joint, joint, hidden)
+        # Control branch
         self.policy_head = nn.Sequential(
             nn.Linear(hidden, hidden),
             nn.ReLU(),
@@ -61,8 +63,10 @@ class Tcp(nn.Module):
         self.decoder_ctrl = RecurrentCell(hidden + ACTION_SIZE[heads], hidden)
         self.output_ctrl = layers(hidden, hidden, hidden)
         self._add_action_head(hidden)
+        # Trajectory branch
         self.decoder_traj = RecurrentCell(2 + 2, hidden)
         self.output_traj = nn.Linear(hidden, 2)
+        # Attention of the control branch to the image
         self.init_att = MapReader(measured, config)
         self.wp_att = MapReader(2 * hidden, config)
         self.merge = nn.Sequential(
@@ -139,6 +143,7 @@ class Tcp(nn.Module):
         now = action = self._action(x)
         hidden = torch.zeros_like(x)
         later = []
+        # Attend to the image by the planned state
         for state in planned:
             hidden = self.decoder_ctrl(torch.cat([x, action], 1), hidden)
             seen = self.wp_att.read(features, torch.cat([hidden, state], 1))

@@ -159,6 +159,7 @@ def _view(model: UniadTiny, levels: list[Tensor], lidar2img: Tensor) -> Tensor:
 def _unit(module: nn.Module, x: Tensor) -> Tensor:
     (convolution,) = (m for m in module.modules() if isinstance(m, nn.Conv2d))
     out = convolution(x)
+    # Normalise the output per channel, keeping the bias
     scale = out.std((0, 2, 3)).reciprocal()
     own = convolution.bias
     if own is None:
@@ -176,6 +177,7 @@ def _balance_classes(model: UniadTiny, cells: Tensor, beginning: float) -> None:
     at = model.reference_points(pos).sigmoid()
     decoder = head.transformer.decoder
     states, _, _ = decoder(content, pos, cells, at, head.reg_branches)
+    # Same mean for all classes, then the wanted quantile
     for branch, state in zip(head.cls_branches, states, strict=True):
         bias = branch.get_submodule("6").get_parameter("bias")
         bias.add_(bias - branch(state).mean((0, 1)))

@@ -168,6 +168,7 @@ class MapHead(nn.Module):
         trained: bool = False,
     ) -> None:
         super().__init__()
+        # Unused levels are held only for published weights
         levels = config.map_levels if dead or trained else 1
         layers, things = config.decoder_layers, config.labels.things
         self.hw = config.head_hw
@@ -179,6 +180,7 @@ class MapHead(nn.Module):
         )
         self.reg_branches = nn.ModuleList(_boxes() for _ in range(layers))
         self.things_mask_head = MaskHead(THING_BLOCKS)
+        # Weights that inference never reads
         if dead:
             cells = config.head_hw[0] * config.head_hw[1]
             self.bev_embedding = nn.Embedding(cells, EMBED)

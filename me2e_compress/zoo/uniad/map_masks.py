@@ -27,7 +27,10 @@ class MaskAttention(nn.Module):
     def forward(
         self, query: Tensor, key: Tensor, value: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Map [1, Q, 256] and cells [1, K, 256] to [1, Q, 256] and masks [1, Q, K]."""
+        """Map [1, Q, 256] and cells [1, K, 256] to [1, Q, 256] and masks [1, Q, K].
+
+        The last layer, the tail, returns its query unchanged.
+        """
         q, k = _heads(self.q(query)), _heads(self.k(key))
         logits = torch.matmul(q, k.transpose(-2, -1)) * HEAD_SCALE
         mask = self.linear(self.linear_l1(logits.permute(0, 2, 3, 1))).squeeze(-1)

@@ -132,10 +132,12 @@ class MotionHead(nn.Module):
             AGENT_MODES * groups, EMBED
         )
         self.motionformer = MotionFormer(config, sampling)
+        # Embeddings of goals in three frames
         self.agent_level_embedding_layer = mlp(EMBED, 2 * EMBED, EMBED)
         self.scene_level_ego_embedding_layer = mlp(EMBED, 2 * EMBED, EMBED)
         self.scene_level_offset_embedding_layer = mlp(EMBED, 2 * EMBED, EMBED)
         self.boxes_query_embedding_layer = mlp(EMBED, 2 * EMBED, EMBED)
+        # One branch per layer
         self.traj_cls_branches = nn.ModuleList(
             nn.Sequential(
                 *projection(EMBED, EMBED),

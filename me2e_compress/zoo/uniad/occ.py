@@ -110,9 +110,11 @@ class OccHead(nn.Module):
         half = halved(self.hw)
         self.state_hw = halved(half)
         self.small_hw = halved(self.state_hw)
+        # From the view to the small state
         self.bev_sampler = AreaSampler(config.grid, self.hw, sampling)
         self.bev_light_proj = LightProjection()
         self.base_downscale = nn.Sequential(Downscale(self.hw), Downscale(half))
+        # One set of layers per step
         self.transformer_decoder = StateDecoder()
         self.temporal_mlps = nn.ModuleList(Layered(2) for _ in range(FUTURES))
         self.downscale_convs = nn.ModuleList(
@@ -122,6 +124,7 @@ class OccHead(nn.Module):
             UpsamplingAdd(self.state_hw) for _ in range(FUTURES)
         )
         self.dense_decoder = DenseDecoder(self.state_hw)
+        # From agents to mask queries
         self.mode_fuser = projection(EMBED, EMBED)
         self.multi_query_fuser = nn.Sequential(
             *projection(3 * EMBED, 2 * EMBED), nn.Linear(2 * EMBED, EMBED)
@@ -143,7 +146,7 @@ class OccHead(nn.Module):
         upsampled view [1, cells, 256], ``scores`` [A] those of tracks; empty slots and
         other classes than vehicles occupy nothing.
         """
-        # Which tracks are no vehicles
+        # Shrink the view; hide empty slots and other classes
         state = self.base_downscale(self.bev_light_proj(self.bev_sampler(bev)))
         hidden = agents.empty[:, :-1] | torch.logical_not(
             self.is_vehicle[agents.labels[:-1]]

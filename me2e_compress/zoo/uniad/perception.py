@@ -132,6 +132,7 @@ class TrackHead(nn.Module):
         self.positional_encoding = GridPosition(config.grid.hw)
         self.transformer = TrackTransformer(config, sampling)
         self.bev_embedding = nn.Embedding(config.grid.cells, EMBED)
+        # One branch per decoder layer
         self.cls_branches = nn.ModuleList(
             nn.Sequential(
                 *projection(EMBED, EMBED),
@@ -152,12 +153,14 @@ class TrackHead(nn.Module):
         self, levels: list[Tensor], motions: Motions, queries: Queries
     ) -> Found:
         """Encode the view and decode the queries."""
+        # Encode the view and decode the queries
         with region("bev_encoder"):
             pos = self.positional_encoding()
             cells = self.bev_embedding.weight.unsqueeze(0), pos
         bev, decoded = self.transformer(
             levels, cells, motions, queries, self.reg_branches
         )
+        # Apply the branches
         with region("track"):
             states, raw, at = decoded
             scores = [

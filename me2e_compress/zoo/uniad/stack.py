@@ -78,16 +78,19 @@ class UniadTiny(nn.Module):
     ) -> None:
         super().__init__()
         self.config = config
+        # Image branch
         self.img_backbone = CameraTrunk(config.stem, config.stages)
         self.img_neck = FeaturePyramid(
             self.img_backbone.read, len(config.hws) - len(config.stages), config.hws
         )
+        # Tracking
         self.query_embedding = nn.Embedding(config.queries, 2 * EMBED)
         self.reference_points = nn.Linear(EMBED, 3)
         self.velo_update = VelocityUpdate(config.grid.pc_range)
         self.track_base = TrackLife(config)
         self.query_interact = QueryInteraction()
         self.memory_bank = MemoryBank()
+        # Heads
         self.pts_bbox_head = TrackHead(config, sampling, dead=dead)
         self.seg_head = MapHead(config, sampling, dead=dead, trained=trained)
         self.motion_head = MotionHead(config, sampling, dead=dead)
@@ -192,6 +195,7 @@ class UniadTiny(nn.Module):
         new = self.query_embedding.weight
         at = self.reference_points(new[:, :EMBED])
         carried = self.velo_update(tracks.ref_pts, tracks.velocity, before, now)
+        # New queries are never empty
         empty = torch.cat([torch.zeros_like(at[:, 0]) > 0, tracks.obj_idxes == 0])
         return Queries(
             torch.cat([new, tracks.query])[None],
@@ -248,6 +252,7 @@ class UniadTiny(nn.Module):
         boxes, scores, labels = of_all
         behind = self.config.queries
         ego = behind - 1
+        # Hide empty slots and weak tracks
         score = scores[chosen]
         empty = (ids == 0) | (score < SLEEPS)
         label = labels[chosen]

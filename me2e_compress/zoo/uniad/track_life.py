@@ -69,6 +69,7 @@ class TrackLife(nn.Module):
         super().__init__()
         new, slots = config.queries, config.tracks
         self.slots = slots
+        # Rank old slots before new queries
         order = torch.cat([torch.arange(new) + slots, torch.arange(slots)])
         self.register_buffer("rank", (new + slots - order).float(), False)
         self.register_buffer("places", torch.tensor([float(new + slots)]), False)
@@ -120,9 +121,11 @@ class VelocityUpdate(nn.Module):
         self, ref_pts: Tensor, velocity: Tensor, before: LidarPose, now: LidarPose
     ) -> Tensor:
         """Map logits [slots, 3] and metres per second [slots, 2] to logits."""
+        # Metres in the old lidar frame
         points = precise_sigmoid(ref_pts) * self.extent + self.low
         seconds = now.seconds - before.seconds
         moved = torch.cat([velocity, torch.zeros_like(velocity[:, :1])], 1) * seconds
+        # Through the world into the new lidar frame
         world = torch.matmul(points + moved, before.rotation[0]) + before.position
         points = torch.matmul(world - now.position, now.rotation[0].transpose(0, 1))
         return inverse_sigmoid((points - self.low) / self.extent)

@@ -64,6 +64,7 @@ def rendered(spec: Stack, seed: int, step: int = 1) -> Tensor:
 
 
 def _calibrate(model: VadTiny, images: Tensor) -> None:
+    # The backbone first, then the neck layer by layer
     features = take_statistics(model.img_backbone, images)
     for conv in _convolutions(model.img_neck):
         out = conv(features)
@@ -72,6 +73,7 @@ def _calibrate(model: VadTiny, images: Tensor) -> None:
         bias = conv.bias
         if bias is None:
             raise TypeError("a convolution of the neck has no bias")
+        # Normalise the output per channel, keeping the bias
         own = bias.clone()
         conv.weight.mul_(scale[:, None, None, None])
         bias.copy_((own - mean) * scale + own)

@@ -101,6 +101,7 @@ class MotionHead(PerceptionHead):
     ) -> MotionOutputs:
         """Predict the motion of all agents in all modes."""
         with region("motion"):
+            # One query per agent and mode
             query = agents.queries.unsqueeze(2) + self.motion_mode_query.weight
             query = query.flatten(1, 2)
             centres = agents.centres.unsqueeze(2).expand(-1, -1, AGENT_MODES, -1)
@@ -108,6 +109,7 @@ class MotionHead(PerceptionHead):
             pos = self.pos_mlp_sa(centres)
             social = self.motion_decoder(query, query, pos, pos)
             aware = self._read_map(social, centres, vectors, lanes)
+            # Trajectories from social and map context
             both = torch.cat([social, aware], -1)
             both = both.view(1, self.config.agents, AGENT_MODES, 2 * EMBED)
             steps = self.traj_branches[0](both)

@@ -67,9 +67,11 @@ class PerceptionHead(nn.Module):
         self.positional_encoding = GridPosition(config.grid.hw)
         self.transformer = PerceptionTransformer(sampling, config)
         self.bev_embedding = nn.Embedding(config.grid.cells, EMBED)
+        # Queries of agents and map points
         self.query_embedding = nn.Embedding(config.agents, 2 * EMBED)
         self.map_instance_embedding = nn.Embedding(config.vectors, 2 * EMBED)
         self.map_pts_embedding = nn.Embedding(config.vector_points, 2 * EMBED)
+        # Branches per layer
         self.cls_branches = _repeat(classifier, heads.det_classes)
         self.reg_branches = _repeat(regressor, BOX_CODE)
         self.map_cls_branches = _repeat(classifier, heads.map_classes)

@@ -62,6 +62,7 @@ class PlanningHead(MotionHead):
             lane_query, lane_at = lanes
             ego = self.ego_query.weight.unsqueeze(0)
             origin = torch.zeros_like(ego[..., :2])
+            # Read the agents, then the map
             social = self.ego_agent_decoder(
                 ego,
                 self.agent_fus_mlp(motion.queries.flatten(2)),
@@ -74,6 +75,7 @@ class PlanningHead(MotionHead):
                 self.ego_map_pos_mlp(origin),
                 self.ego_map_pos_mlp(lane_at),
             )
+            # One plan per command
             deltas = self.ego_fut_decoder(torch.cat([social, aware], -1))
             out: Tensor = deltas.view(1, self.ego_modes, STEPS, 2)
             return out

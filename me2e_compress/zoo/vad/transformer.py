@@ -44,7 +44,9 @@ class PerceptionTransformer(nn.Module):
     ) -> Tensor:
         """Encode the cameras: [cameras, 256, h, w] to [1, cells, 256]."""
         tokens = features.flatten(2).transpose(1, 2)
+        # Mark tokens by camera and level
         tokens = tokens + self.cams_embeds[:, None] + self.level_embeds[0]
+        # The previous view, turned to the current heading
         first = torch.logical_not(torch.any(prev_bev != 0))
         previous = turn(prev_bev, can_bus, self.cells, self.grid, self.sampling)
         query = query + self.can_bus_mlp(can_bus.unsqueeze(0))

@@ -30,17 +30,15 @@ from me2e_compress.simulator.scene import RoutePath, Scene
 from me2e_compress.simulator.world.privileged import Privileged
 
 WAYPOINTS = np.searchsorted(TIMES_S, np.arange(0.5, 3.01, 0.5))
-"""[6] columns of the candidates that are handed out."""
+"""[6] columns of the candidates that become waypoints."""
 
 
 @dataclass(frozen=True)
 class Memory:
     """State that one decision passes to the next; empty by default.
 
-    Args:
-        at_m: Arc length at which the ego was last seen.
-        target_m: Lateral target of the last plan (hysteresis).
-        served: Stop signs at which the ego has stopped.
+    It holds the last arc length, the last lateral target (hysteresis), and the stop
+    signs at which the ego has stopped.
     """
 
     at_m: float | None = None
@@ -52,11 +50,8 @@ class Memory:
 class ExpertDecision:
     """A decision of the expert.
 
-    Args:
-        waypoints: [6, 2] metres in the ego frame, every 0.5 s.
-        acceleration_mps2: Initial acceleration of the chosen future.
-        target_m: Lateral target, metres left of the route.
-        cost: Cost of the chosen future.
+    The waypoints are [6, 2] metres in the ego frame, every 0.5 s; ``acceleration_mps2``
+    is the initial one, ``target_m`` the lateral target, metres left of the route.
     """
 
     waypoints: Plan

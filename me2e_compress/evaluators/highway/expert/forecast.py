@@ -13,30 +13,24 @@ from me2e_compress.simulator.world.privileged import Intent
 
 Flags = npt.NDArray[np.bool_]
 TIMES_S = np.concatenate([np.arange(0.25, 3.01, 0.25), np.arange(3.5, 6.01, 0.5)])
-"""[18] seconds: fine for the three seconds that are handed out, coarse after."""
+"""[18] seconds: fine for the three seconds of the plan, coarse after."""
 NOW_S = np.concatenate([[0.0], TIMES_S])
 REACH_M = 150.0
-"""Actors farther away than this do not matter; oncoming ones matter early."""
+"""Range of the actors that are considered; oncoming ones matter early."""
 ROUTE_SPAN_M = (-60.0, 160.0)
 """Part of the route, from the ego, onto which actors are projected."""
 EASY_MPS2 = 0.3
-"""An actor below its wanted speed gains at least this; most are held up."""
+"""Least acceleration of an actor below its desired speed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
     """Boxes of A actors now and at the 18 times of `TIMES_S` (T = 19 columns).
 
-    Positions and sizes are in metres, angles in radians.
-
-    Args:
-        goal_mps: [A] desired speed.
-        moves: [A] whether it can move at all.
-        yields: [A] whether it brakes for the ego.
-        walks: [A] whether it is a pedestrian.
-        along_m: [A, T] arc length on the route.
-        lateral_m: [A, T] metres left of the route.
-        away: [A, T] heading relative to the route's.
+    Positions, speeds and headings are [A, T], in SI units; ``along_m`` and
+    ``lateral_m`` (left) are relative to the route, and so is the heading ``away``. The
+    other arrays are [A]: ``goal_mps`` is the desired speed, ``yields`` tells whether an
+    actor brakes for the ego.
     """
 
     x: Floats
@@ -111,7 +105,7 @@ def _roll_out(actor: Actor, intent: Intent | None) -> Floats:
     first = 0.0 if intent is None else intent.acceleration_mps2
     briskest = max(first, EASY_MPS2)
     goal = _goal(actor, intent)
-    # people on foot or bicycle start and stop at once
+    # pedestrians and cyclists reach their speed at once
     if actor.kind in ON_FOOT:
         first = briskest = 4.0 if goal > actor.speed_mps else 0.0
     speed, travel = _speeds(actor.speed_mps, goal, first, briskest)

@@ -14,9 +14,9 @@ from me2e_compress.simulator.scene import Ego, RoutePath
 
 COLLISION, NEAR_MISS, CUT_OFF = 200.0, 8.0, 30.0
 FADE = np.exp(-TIMES_S / 3.0)
-"""[18] far futures weigh less."""
+"""[18] weights: later times weigh less."""
 MARGIN_M, NEAR_M = 0.35, 1.3
-"""Beyond contact: certainly avoided, and preferably avoided."""
+"""Clearances that are enforced, and that are preferred."""
 CORNER_M = 0.1
 """Added to the discs, which miss 0.41 m at the corners of the ego; less than
 `MARGIN_M` remains."""
@@ -108,13 +108,13 @@ PROGRESS_PER_M, SPEED_PER_MPS = 0.40, 0.8
 OFFSET_PER_M, NUDGE_PER_M, SWITCH = 0.6, 0.3, 3.0
 BRAKE_HARD, EFFORT, JERK = 3.0, 0.4, 0.15
 LANE_CHANGE_M = 1.6
-"""Targets farther apart than this are different lanes: the expert hesitates."""
+"""Targets farther apart than this are different lanes."""
 STANDOFF_M, GAP_S = 2.0, 0.8
-"""Distance kept to a leader: standing, and per m/s."""
+"""Distance kept to a leader: standing, and seconds of travel."""
 SWING_OUT_M = 8.0
 """Standing distance to an obstacle that has to be driven around."""
 BESIDE_M = 0.3
-"""A leader is an actor that is not passed with this much room."""
+"""An actor that is passed with less room than this is a leader."""
 EMERGENCY, EMERGENCY_PER_MPS, EMERGENCY_SHARE, EMERGENCY_M = 60.0, 4.0, 0.35, 60.0
 """Staying in the way of an emergency vehicle that is this near behind, or driving
 faster than this share of its speed."""
@@ -159,7 +159,7 @@ def headway_cost(
 
     On a passable road a slow leader is followed with room to swing out.
     """
-    # leaders: actors ahead that the ego cannot pass
+    # leaders: actors ahead in the ego's way
     along, lateral = seen.along_m[:, None, 1:], seen.lateral_m[:, None, 1:]
     ahead = along - future.along_m[None]
     room = seen.half_breadth[:, None, 1:] + ego.width / 2 + BESIDE_M

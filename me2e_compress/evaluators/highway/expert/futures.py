@@ -13,7 +13,7 @@ from me2e_compress.simulator.traffic.bodies import ACCELERATION_LAG_S
 
 ACCELERATIONS_MPS2 = (-7.5, -5.5, -4.0, -2.8, -1.8, -1.0, -0.4, 0.0, 0.6, 1.2, 2.0)
 HARDEST_EASE_MPS2 = 3.0
-"""Braking for the speed ceiling, never more."""
+"""Strongest braking for the speed ceiling."""
 CHANGE_S = 2.6
 """Duration of a whole lane change; shorter shifts take less."""
 SHORTEST_CHANGE_M = 9.0
@@ -22,16 +22,11 @@ FULL_CHANGE_M = 3.5
 
 @dataclass(frozen=True, eq=False)
 class SampledFutures:
-    """K futures at the 18 times of `TIMES_S`; positions in metres.
+    """K futures at the 18 times of `TIMES_S`; arrays are [K, T] or, from there on, [K].
 
-    Args:
-        heading: [K, T] radians, of the body: in a bend it differs from the direction of
-            travel by the slip angle.
-        along_m: [K, T] arc length.
-        lateral_m: [K, T] metres left of the route.
-        acceleration: [K] initial acceleration.
-        target_m: [K] lateral target.
-        oncoming: [K] whether the target is in the oncoming lane.
+    The heading is the body's: in a bend it differs from the direction of travel by the
+    slip angle. ``lateral_m`` and ``target_m`` are metres left of the route,
+    ``acceleration`` is the initial one, ``oncoming`` refers to the target's lane.
     """
 
     x: Floats

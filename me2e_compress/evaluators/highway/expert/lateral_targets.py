@@ -12,27 +12,24 @@ NUDGES_M = (0.5, -0.5, 1.0, -1.0)
 """Small shifts within the drivable width: past a door, away from a car that cuts the
 bend."""
 ASIDE_M = 0.7
-"""The same in the lane beside, away from what is passed."""
+"""Shift within the lane beside, away from what is passed."""
 JUNCTION = (int(Command.LEFT), int(Command.RIGHT), int(Command.STRAIGHT))
-"""No overtaking here."""
+"""Commands under which the expert does not overtake."""
 SLOW_MPS = 3.0
-"""What is slower than this in the own lane is passed, not followed."""
+"""Slower actors in the own lane are passed, not followed."""
 CHAIN_M = 14.0
 """Obstacles closer to each other than this are passed in one go."""
 CLEAR_S = 1.0
-"""Time that must be left between the return and the oncoming car."""
+"""Time to spare between the return and the oncoming car."""
 PASS_MPS2 = 1.8
-"""How the expert accelerates while it passes."""
+"""Acceleration while passing."""
 
 
 @dataclass(frozen=True)
 class Place:
     """The ego on its route; ``lateral_m`` is positive to the left.
 
-    Args:
-        slope: Metres to the left per metre of route, see `reentry.slope_of`.
-        acceleration_mps2: Acceleration along the route.
-        top_mps: Speed that the road ahead allows.
+    ``slope`` is that of `reentry.slope_of`, ``top_mps`` the speed that the road allows.
     """
 
     s_m: float
@@ -45,12 +42,9 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """Lateral targets.
+    """Lateral targets [L], metres left of the route.
 
-    Args:
-        target_m: [L] metres left of the route.
-        oncoming: [L] whether that is in the oncoming lane.
-        passable: Whether there is any lane beside the own one, now or later.
+    ``passable`` tells whether there is any lane beside the own one, now or later.
     """
 
     target_m: Floats

@@ -22,7 +22,7 @@ LATERAL_MPS2 = 2.2
 EASE_MPS2 = 1.8
 """Braking ahead of a bend or a lower limit."""
 SLOWEST_MPS = 2.5
-"""No bend is too tight for this."""
+"""Lowest speed that a bend demands."""
 
 
 def ceiling(path: RoutePath) -> Floats:
@@ -39,7 +39,7 @@ def ceiling(path: RoutePath) -> Floats:
 
 
 STANDING_MPS = 0.08
-"""Slower than this has stopped; Bench2Drive asks for less than 0.1 m/s."""
+"""Below this the ego has stopped; Bench2Drive asks for less than 0.1 m/s."""
 BEFORE_LINE_M = 1.0
 """Room left between the front bumper and the line."""
 SERVED_WITHIN_M = 4.0
@@ -49,19 +49,16 @@ YELLOW_MPS2 = 3.0
 GIVE_WAY_S = 2.4
 """No priority traffic is met within this time after crossing a give-way line."""
 CONFLICT_M, MEETING_M = 30.0, 2.0
-"""How far behind the line, and how near the route, priority is looked for."""
+"""Range behind the line, and beside the route, of priority traffic."""
 GIVE_WAY_MPS = 5.0
 """Speed at a give-way line: slow enough to stop for priority traffic."""
 
 
 @dataclass(frozen=True)
 class Stop:
-    """What the signals demand.
+    """Arc lengths where the ego's centre must stop, or slow to `GIVE_WAY_MPS`, if any.
 
-    Args:
-        line_m: Arc length that the ego's centre must not pass now, or None.
-        slow_m: Arc length at which only `GIVE_WAY_MPS` is allowed, or None.
-        served: Stop signs at which the ego has stopped.
+    ``served`` are the stop signs at which it has stopped.
     """
 
     line_m: float | None

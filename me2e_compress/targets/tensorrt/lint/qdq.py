@@ -146,6 +146,7 @@ def channel_scales(model: ir.Model) -> Iterator[LintFinding]:
     """Check that activations have one scale, and weights one or one per channel."""
     for node in pairs_of(model):
         scale = graph.static_shape(node.inputs[1])
+        # One scale is always allowed.
         if not scale or scale == (1,):
             continue
         if len(scale) > 1:
@@ -168,12 +169,14 @@ def _axis(node: ir.Node) -> Iterator[LintFinding]:
     axis = node.attributes.get_int("axis", 1)
     if shape is None or scale is None:
         return
+    # Scales must match the axis, and that the output channels.
     axis += len(shape) if axis < 0 else 0
     if axis >= len(shape) or shape[axis] != scale[0]:
         yield error(
             "weight-axis", node, f"{scale[0]} scales along axis {axis} of {list(shape)}"
         )
         return
+    # The axis must be that of each reader's channels.
     for reader in node.outputs[0].consumers():
         if reader.op_type in WEIGHTED and reader.inputs[1] is node.outputs[0]:
             wanted = graph.channel_axis(reader)
@@ -207,6 +210,7 @@ def branches(model: ir.Model) -> Iterator[LintFinding]:
     for node in nodes_of(model):
         if node.op_type != "Add" or not is_standard(node):
             continue
+        # One operand may be quantized: the residual.
         rounded = [_rounds_convolution(value) for value in node.inputs]
         if any(rounded) and not any(_is_convolution(value) for value in node.inputs):
             yield warning(

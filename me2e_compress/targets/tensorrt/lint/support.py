@@ -61,6 +61,7 @@ def element_types(model: ir.Model) -> Iterator[LintFinding]:
         kind = _data_type(node)
         if taken is None or kind is None or kind in taken:
             continue
+        # TensorRT casts float64 down by itself.
         if kind == ir.DataType.DOUBLE:
             yield warning(
                 "element-type", node, f"{node.op_type} of float64 is cast down"
@@ -80,6 +81,7 @@ def one_type(model: ir.Model) -> Iterator[LintFinding]:
     for node in nodes_of(model):
         if not is_standard(node) or node.op_type in (*PAIR, "CastLike", "Resize"):
             continue
+        # Integers do not matter, only float types.
         kinds = {each.dtype for each in node.inputs if each is not None}
         found = [each.name.lower() for each in floats if each in kinds]
         if len(found) > 1:
@@ -99,6 +101,7 @@ def plugins(model: ir.Model) -> Iterator[LintFinding]:
     for node in nodes_of(model):
         if not is_plugin(node):
             continue
+        # A local function makes an unknown operator acceptable.
         plugin = known.get(node.op_type)
         if plugin is not None:
             yield from _call(node, plugin)

@@ -1,12 +1,10 @@
 """Tables of the operators that TensorRT's ONNX parser supports, and of plugins.
 
-Operators are those of the support matrix of onnx-tensorrt, ``docs/operators.md``, of
-TensorRT 10.15; those that 10.1 (opset 20) did not support are listed apart. An operator
-in neither list is unknown, and reported.
-
-Names, inputs and attributes of plugins come from the dialects of the fused operators.
-TensorRT finds a plugin by the node's operator name, ``plugin_version`` and
-``plugin_namespace``.
+Operators are those of onnx-tensorrt's support matrix, ``docs/operators.md``, of
+TensorRT 10.15; those that 10.1 (opset 20) did not support are listed apart. Others are
+unknown, and reported. Names, inputs and attributes of plugins come from the dialects of
+the fused operators. TensorRT finds a plugin by the node's operator name,
+``plugin_version`` and ``plugin_namespace``.
 """
 
 import dataclasses
@@ -90,12 +88,8 @@ UNSUPPORTED = frozenset(
 class Plugin:
     """The inputs and attributes of a plugin.
 
-    Attributes:
-        inputs: least and most number of inputs.
-        attributes: required attributes.
-        types: element types of its first input.
-        rank: rank of its first input; None accepts any.
-        integers: indices of inputs that must be int32.
+    ``types`` and ``rank`` are those of its first input, where a rank of None accepts
+    any; ``integers`` are the indices of inputs that must be int32.
     """
 
     source: str
@@ -125,6 +119,7 @@ def known_plugins() -> Mapping[str, Plugin]:
 
 
 def _plugin(dialects: Sequence[Dialect]) -> Plugin:
+    # Libraries that share a name are merged to the widest form.
     first = dialects[0]
     least = min(sum(not each.optional for each in row.operands) for row in dialects)
     ranks = {row.operands[0].rank for row in dialects}

@@ -69,9 +69,7 @@ class BuildResult:
 
     Attributes:
         cut: nodes that were cut out, because it has no plugin library.
-        parsed: whether the parser accepted the graph.
-        built: whether the builder did; None if it was not run.
-        layers: number of layers of the parsed network.
+        built: whether the builder accepted the graph; None if it was not run.
         kernels: convolutions and products of the built plan.
         missing: convolutions (Conv) that the graph's quantization plan makes int8 and
             that no int8 kernel computes; None if the graph has no plan, or was not
@@ -139,6 +137,7 @@ def _ask(
     graph.save(part, model)
     words = [str(model), str(answer), str(sm), *([str(plan)] if build else [])]
     done = run_script(Path(__file__).with_name("rtx_main.py"), words)
+    # No answer file means that the process crashed.
     if not answer.is_file():
         last = done.stderr.strip().splitlines()[-1:] or ["no message"]
         if last[0].startswith(("ImportError", "ModuleNotFoundError")):

@@ -39,6 +39,7 @@ def _detach(where: ir.Graph, node: ir.Node) -> None:
             where.outputs.remove(value)
         if not value.uses():
             continue
+        # A new graph input needs a type and a shape.
         if value.dtype is None or graph.static_shape(value) is None:
             raise PreconditionError(
                 f"{node.op_type} {node.name!r}: the type or shape of its output"

@@ -29,6 +29,7 @@ def work(model: Path, sm: int, plan: Path | None) -> dict[str, object]:
     builder = trt.Builder(log)
     network = builder.create_network(0)
     parser = trt.OnnxParser(network, log)
+    # Parse, and collect what the parser reports.
     parsed = parser.parse_from_file(str(model))
     errors = [parser.get_error(index) for index in range(parser.num_errors)]
     answer: dict[str, object] = {
