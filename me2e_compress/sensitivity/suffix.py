@@ -9,8 +9,8 @@ import onnx_ir as ir
 
 from me2e_compress import graph, rewrite
 from me2e_compress.fidelity.compare import Reference
+from me2e_compress.graph.recurrence import RECURRENT
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.recurrence import RECURRENT
 from me2e_compress.runtime.session import DTYPES, Session, replay
 from me2e_compress.targets.quantized import PAIR
 

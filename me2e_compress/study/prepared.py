@@ -11,7 +11,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import Driver, driver_named
-from me2e_compress.errors import Me2eError, StudyError
+from me2e_compress.errors import GraphError, Me2eError, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.modules import ModuleMap
 from me2e_compress.recipe import to_text
@@ -21,8 +21,9 @@ from me2e_compress.study.workspace import Workspace
 from me2e_compress.version import __version__
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import beside
-from me2e_compress.workflows.first_opening import load_interface, try_file
+from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.stack_output import written_model
 from me2e_compress.zoo.weights_record import named_weights
 
 
@@ -99,7 +100,7 @@ def prepare_variant(
     origin = source.name, to_text(variant.passes)
     if not variant.passes:
         origin = _reported_beside(model, sha256) or origin
-    weights = named_weights(load_interface(model).metadata_props)
+    weights = named_weights(graph.load(model).metadata_props)
     size = graph.file_bytes(model)
     return PreparedVariant(
         variant, driver, model, *origin, sha256, size, weights=weights
@@ -118,7 +119,7 @@ def _unaltered(model: Path) -> bool:
     """Return whether a file still matches its report."""
     try:
         return _reported_beside(model, graph.sha256_of(model)) is not None
-    except (OSError, DecodeError):
+    except (OSError, DecodeError, GraphError):
         return False
 
 
@@ -149,7 +150,10 @@ def _compressed(
 ) -> Path:
     """Apply the passes, unless a file exists that still matches its report."""
     frames = None if study.frames is None else CalibrationSet(study.frames)
-    path = workspace.model(variant, _key(study, variant, source, frames))
+    output = workspace.model(variant, _key(study, variant, source, frames))
+    if graph.is_stack(source):  # several files in a folder
+        output = output.with_suffix("")
+    path = written_model(source, output)
     if path.is_file() and beside(path, "report").is_file():
         if _unaltered(path):
             return path
@@ -169,7 +173,7 @@ def _compressed(
         allow_empty=True,
     )
     heard = Listener(report, listener.on_warning)
-    compress(source, path, variant.passes, study.frames, options, heard)
+    compress(source, output, variant.passes, study.frames, options, heard)
     return path
 
 

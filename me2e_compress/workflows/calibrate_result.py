@@ -1,6 +1,7 @@
 """The result of a calibration: ranges, or the statistics of one shard."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 
 from me2e_compress.calibration.ranges import Ranges
@@ -12,12 +13,18 @@ _SHOWN = 5
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CalibrateResult(Result):
-    """The range of every tensor; or a shard's statistics, with `ranges` of None."""
+    """The range of every tensor; or a shard's statistics, with `ranges` of None.
+
+    Of a stack, `first_frames` has those of each file for first frames, by label.
+    """
 
     output: Path
     frames: int
     ranges: Ranges | None
     shard: str | None = None
+    first_frames: Mapping[str, "CalibrateResult"] = dataclasses.field(
+        default_factory=dict
+    )
 
     @property
     def headline(self) -> str:
@@ -37,6 +44,7 @@ class CalibrateResult(Result):
         worst = sorted(self.ranges.outliers.items(), key=lambda item: -item[1])
         outliers = [f"{name} (largest / rms {crest:.0f})" for name, crest in worst]
         return (
+            *(line for each in self.first_frames.values() for line in each.lines()),
             self.headline,
             *_first(list(self.ranges.dead), "always zero"),
             *_first(outliers, "a few elements make the range"),
@@ -58,7 +66,9 @@ class CalibrateResult(Result):
         """Return the ranges and the tensors that are always zero, or the shard."""
         if self.ranges is None:
             return {"shard": self.shard, "frames": self.frames}
-        return {**dataclasses.asdict(self.ranges), "dead": self.ranges.dead}
+        first = {name: each.to_json() for name, each in self.first_frames.items()}
+        own = {**dataclasses.asdict(self.ranges), "dead": self.ranges.dead}
+        return {**own, "first_frames": first}
 
 
 def _first(names: list[str], what: str) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.stack.stack_session import open_session
+from me2e_compress.runtime.stack_session import open_session
 from me2e_compress.workflows.evaluate import driver_of
 from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import SILENT, Listener

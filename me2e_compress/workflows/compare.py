@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import GraphError
 from me2e_compress.fidelity.compare import Fidelity, common_adapter
@@ -11,9 +12,9 @@ from me2e_compress.fidelity.matched_sets import SetFidelity
 from me2e_compress.fidelity.open_loop import OpenLoop, OpenLoopTally
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.stack.stack_session import open_session
+from me2e_compress.runtime.stack_session import open_session
 from me2e_compress.workflows.checks import adapted, model_path
-from me2e_compress.workflows.first_opening import load_interface, try_model
+from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, counted, table
 
@@ -120,7 +121,7 @@ def compare(
     said = dict[Path, dict[str, str]]()
     # each graph must take the frames, and open in another process first
     for path in dict.fromkeys(paths):
-        model = load_interface(path)
+        model = graph.load(path)
         said[path] = adapted(model, adapter)
         recording.check(model)
         try_model(model, path, recording, listener, provider)

@@ -1,7 +1,7 @@
 """Measure what lossy passes did to a model, on frames kept out of calibration."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -47,33 +47,24 @@ class SplitFrames:
     samples: CalibrationSet | None = None
 
     @classmethod
-    def read(
+    def of(
         cls,
-        folder: str | Path | None,
-        model: ir.Model,
-        passes: Iterable[Pass],
+        recording: CalibrationSet | None,
+        samples: CalibrationSet | None,
+        passes: Sequence[Pass],
         most: int,
-        shipped: Path | None = None,
     ) -> "SplitFrames":
-        """Read and check frames; for lossy passes up to `most` are kept to measure on.
+        """Keep up to `most` frames to measure on, where a pass is lossy.
 
-        Nothing is kept out of calibration where ranges are saved. Without a `folder`
-        the `shipped` frames are used, if there are any.
+        Nothing is kept out of calibration where ranges are saved.
         """
-        recording = samples = None
-        if folder is not None:
-            recording = CalibrationSet(Path(folder))
-            recording.check(model)
-        elif shipped is not None:
-            samples = CalibrationSet(shipped)
-        pipeline = tuple(passes)
-        if not most or all(each.exact for each in pipeline):
+        if not most or all(each.exact for each in passes):
             return cls(recording, None, NOT_ASKED, samples)
         if recording is None:
             reason = "no recorded frames" if samples is None else SHIPPED_FRAMES
             return cls(None, samples, reason, samples)
         calibration, measured = hold_out(recording, most)
-        if any(each.reads_ranges and not each.needs_frames for each in pipeline):
+        if any(each.reads_ranges and not each.needs_frames for each in passes):
             return cls(recording, measured, PERHAPS_SHARED)
         return cls(calibration, measured, SHARED if len(recording) == 1 else KEPT_OUT)
 

@@ -34,6 +34,7 @@ class CompressResult(Result):
         int8: what became int8 and what did not; None where no pass quantizes.
         loss: how true the graph stayed; None where every pass is exact.
         seconds: CPU time of everything but the writing.
+        first_frames: of a stack, how each file for first frames came to be, by label.
     """
 
     source: Path
@@ -45,6 +46,9 @@ class CompressResult(Result):
     int8: Int8Outcome | None = None
     loss: MeasuredLoss | None = None
     seconds: float = 0.0
+    first_frames: Mapping[str, "CompressResult"] = dataclasses.field(
+        default_factory=dict
+    )
 
     @property
     def report_path(self) -> Path:
@@ -80,11 +84,21 @@ class CompressResult(Result):
     def lines(self) -> tuple[str, ...]:
         """Return the verdict: int8, how far outputs and plan moved, time and size."""
         said = (*verdict(self.report, self.int8, self.loss), self._time, self.headline)
-        return (*said, *filter(None, [self.weights]))
+        first = (
+            f"{name}: {line}"
+            for name, each in self.first_frames.items()
+            for line in verdict(each.report, each.int8, each.loss)
+        )
+        return (*first, *said, *filter(None, [self.weights]))
 
     def alerts(self) -> tuple[str, ...]:
         """Return warnings: nothing became int8, or quality is below the floor."""
-        return tuple(alerts(self.int8, self.loss))
+        first = (
+            f"{name}: {said}"
+            for name, each in self.first_frames.items()
+            for said in each.alerts()
+        )
+        return (*alerts(self.int8, self.loss), *first)
 
     @property
     def _time(self) -> str:
@@ -110,7 +124,9 @@ class CompressResult(Result):
 
     def to_json(self) -> object:
         """Return the report file's content except the verdict, which `lines` has."""
-        return {key: each for key, each in self.record.items() if key != "verdict"}
+        held = {key: each for key, each in self.record.items() if key != "verdict"}
+        first = {name: each.to_json() for name, each in self.first_frames.items()}
+        return {**held, "first_frames": first}
 
 
 def beside(output: Path, what: str) -> Path:
@@ -165,7 +181,7 @@ def written_files(output: Path) -> tuple[Path, ...]:
 
 def write_result(
     report: Report,
-    source: Path,
+    loaded: graph.LoadedModel,
     output: Path,
     int8: Int8Outcome | None,
     loss: MeasuredLoss | None,
@@ -173,9 +189,12 @@ def write_result(
 ) -> CompressResult:
     """Write the graph and its plan, then the report, which vouches for both."""
     plan = plan_of(report.model)  # before writing: metadata may be malformed
-    weights = {"weights": named_weights(report.model.metadata_props)}
+    source, weights = (
+        loaded.path,
+        {"weights": named_weights(report.model.metadata_props)},
+    )
     with drafts.all_or_none():
-        graph.save(with_own_domains(report.model), output)
+        loaded.save(with_own_domains(report.model), output)
         if plan is not None:
             save_plan(plan, beside(output, "plan"))
         about = weights | loss_record(report, int8, loss)

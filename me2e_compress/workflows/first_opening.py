@@ -23,13 +23,13 @@ import platformdirs
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
+from me2e_compress.graph import JoinedStack, is_stack
 from me2e_compress.operators.kernels import why_not
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array, Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import compiled_or_expanded, unsupported
-from me2e_compress.runtime.stack.split_stack import SplitStack, is_stack
 from me2e_compress.workflows.listener import Listener
 
 STAGE = "first opening"
@@ -50,27 +50,23 @@ def try_first(
 ) -> None:
     """Open a graph in another process, if it is new here, and run its first frame.
 
-    `file` holds the same graph as `model`; without `frames` the graph is only opened.
-    The listener is told how long this took, since no other time includes it. Providers
-    other than the plain CPU are not tried: what they do to a graph does not follow from
-    it.
+    `file` holds the same graph as `model`, or is the stack that it was joined from;
+    without `frames` the graph is only opened. The listener is told how long this took,
+    since no other time includes it. Providers other than the plain CPU are not tried:
+    what they do to a graph does not follow from it.
 
     Raises:
         GraphError: onnxruntime crashes on the graph.
     """
     if provider != CPU:
         return
+    file = None if file is None or is_stack(file) else file
     first = None if frames is None else next(iter(frames), None)
     feeds = None if first is None else first.arrays
     begins = partial(listener.on_progress, STAGE, 0, 1, name)
     seconds = try_apart(model, name, file=file, feeds=feeds, on_begin=begins)
     if seconds:
         listener.on_progress(STAGE, 1, 1, f"{name}: {seconds:.1f} s")
-
-
-def load_interface(file: Path) -> ir.Model:
-    """Read an ONNX file; of a stack its inputs and outputs, without nodes."""
-    return SplitStack.load(file).interface() if is_stack(file) else graph.load(file)
 
 
 def try_model(
@@ -80,9 +76,9 @@ def try_model(
     listener: Listener,
     provider: Provider = CPU,
 ) -> None:
-    """Open a file, or each of a stack, in another process; see :func:`try_first`.
+    """Open the graph of a file in another process, and run it; see :func:`try_first`.
 
-    `model` comes from :func:`load_interface`.
+    Of a stack, what runs at first frames alone is opened too.
     """
     if is_stack(file):
         try_file(file, listener, provider)
@@ -91,18 +87,18 @@ def try_model(
 
 
 def try_file(file: Path, listener: Listener, provider: Provider = CPU) -> None:
-    """Open the graph of a file, or each of a stack, in another process.
+    """Open the graph of a file, or both of a stack, in another process.
 
     The graphs are not run.
     """
     if provider != CPU:
         return
-    # a stack's files are tried one by one
-    if is_stack(file):
-        for each in SplitStack.load(file).files.values():
-            try_file(each.path, listener, provider)
-        return
     try:
+        if is_stack(file):
+            stack = JoinedStack.load(file)
+            for each in filter(None, (stack.model, stack.first)):
+                try_first(each, file.name, listener)
+            return
         model = graph.load(file)
     except GraphError:
         return  # who opens it says what is wrong

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import onnx_ir as ir
 
-from me2e_compress import drafts
+from me2e_compress import drafts, graph
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.stack_frames import recording_of
 from me2e_compress.errors import EvaluationError, MissingExtraError, RecipeError
 from me2e_compress.metrics.deadlines import BUDGET_MS
 from me2e_compress.modules import assign
@@ -25,7 +26,6 @@ from me2e_compress.runtime.others_load import OthersLoad
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.stack.split_stack import is_stack
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
     adapted,
@@ -35,7 +35,7 @@ from me2e_compress.workflows.checks import (
 )
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.deadlines_table import check_budget
-from me2e_compress.workflows.first_opening import load_interface, try_model
+from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.profile_result import ProfileResult
 
@@ -114,22 +114,19 @@ def profile(
     figure = None if options.figure is None else figure_path(options.figure)
     joules = _energy_path(options, written)
     # refuse what cannot be measured before anything is
-    if is_stack(source) and (options.by_module or figure is not None):
-        raise EvaluationError(
-            f"{source}: nodes are timed in one graph at a time: profile one of its"
-            " files by module"
-        )
     if options.energy is not None:
         check_counter(options.energy)
     inputs = (source, frames, options.module_map, options.adapter)
     with writing([written, figure, joules], inputs, force=options.force):
         # each measurement has inferences of its own: the profiler takes time itself
-        loaded, recording = load_interface(source), CalibrationSet(Path(frames))
-        said = adapted(loaded, options.adapter)
-        trace = _measured(source, loaded, said, recording, options, listener)
+        recording = CalibrationSet(Path(frames))
+        loaded = graph.LoadedModel.load(source)
+        said = adapted(loaded.model, options.adapter)
+        trace = _measured(source, loaded.model, said, recording, options, listener)
         operators: Microseconds = {}
         if options.by_module or figure is not None:
-            found = _broken_down(loaded, recording, options, listener)
+            fed = recording_of(loaded, frames, options.provider)
+            found = _broken_down(loaded.model, fed, options, listener)
             trace = dataclasses.replace(trace, modules_us=found.modules_us)
             operators = found.operators_us
         energy = _energy(source, said, recording, options, listener)

@@ -56,7 +56,7 @@ def test_it_ends_in_one_line(
         time.sleep(60)  # another thread may have got it first
 
     monkeypatch.chdir(files)
-    monkeypatch.setattr("me2e_compress.graph.load", interrupted)
+    monkeypatch.setattr("me2e_compress.graph.files.load", interrupted)
     before = signal.getsignal(signal.SIGTERM)
 
     assert command(name, *words.split()) == code
@@ -90,7 +90,7 @@ def test_a_signal_that_python_loses_ends_the_run_all_the_same(
             time.sleep(0.01)
 
     monkeypatch.chdir(files)
-    monkeypatch.setattr("me2e_compress.graph.load", lose)
+    monkeypatch.setattr("me2e_compress.graph.files.load", lose)
     before, hook = sorted(files.iterdir()), sys.unraisablehook
 
     assert command("compress", "in.onnx", "-o", "out.onnx", "-r", "exact") == code

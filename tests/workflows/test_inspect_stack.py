@@ -1,18 +1,19 @@
-"""Inspection of a stack: what feeds what, and what each file holds."""
+"""Inspection of a stack: what feeds what, and what the joined graph holds."""
 
 from pathlib import Path
 
 import pytest
 
 import me2e_compress as me2e
-from me2e_compress.errors import RecipeError
-from tests.cli.conftest import Command, strict
+from tests.cli.conftest import Command, command, strict
 from tests.docs.documents import faults
-from tests.stacks import THREE_FILES, write_dense, write_stack
+from tests.stacks import THREE_FILES, dense_frames, write_dense, write_stack
+
+__all__ = ["command"]
 
 
 def test_what_feeds_every_input_of_every_file(tmp_path: Path) -> None:
-    found = me2e.inspect_stack(write_stack(tmp_path, THREE_FILES))
+    found = me2e.inspect(write_stack(tmp_path, THREE_FILES))
 
     assert [(each.file, each.input, each.source) for each in found.fed] == [
         ("backbone", "img", "frames"),
@@ -29,13 +30,11 @@ def test_one_map_serves_all_files(tmp_path: Path) -> None:
         '[modules.b]\nrole = "prediction"\npatterns = ["head"]\n'
     )
 
-    found = me2e.inspect_stack(write_dense(tmp_path), map_file)
+    found = me2e.inspect(write_dense(tmp_path), map_file)
 
-    held = {
-        name: [(each.module, each.nodes, each.parameters) for each in file.modules]
-        for name, file in found.files.items()
-    }
-    assert held == {"head": [("b", 3, 1024)], "backbone": [("a", 2, 512)]}
+    assert [(each.module, each.nodes, each.parameters) for each in found.modules] == [
+        *(("a", 2, 512), ("b", 3, 1024))
+    ]
 
 
 def test_the_document_says_it_all(
@@ -52,6 +51,10 @@ def test_the_document_says_it_all(
     assert found["first_values"] == {"prev_bev": "head.learned"}
 
 
-def test_time_is_that_of_one_file(tmp_path: Path) -> None:
-    with pytest.raises(RecipeError, match="inspect one of the files"):
-        me2e.inspect_stack(write_stack(tmp_path), trace=tmp_path / "trace.json")
+@pytest.mark.parametrize("toml", [None, THREE_FILES])
+def test_time_is_that_of_the_joined_graph(tmp_path: Path, toml: str | None) -> None:
+    stack = write_dense(tmp_path, toml) if toml else write_dense(tmp_path)
+
+    found = me2e.inspect(stack, frames=dense_frames(tmp_path))
+
+    assert found.latency_of

@@ -2,11 +2,11 @@
 
 import dataclasses
 import graphlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from me2e_compress.errors import GraphError
-from me2e_compress.runtime.stack.part_graph import PartGraph, misfit, told
+from me2e_compress.graph.stack.part_graph import PartGraph, misfit, told
 
 
 class FeedSource(NamedTuple):
@@ -83,9 +83,13 @@ def _check(
 
 @dataclasses.dataclass(frozen=True)
 class Names:
-    """The names of the parts' inputs and outputs in the stack."""
+    """The names of the parts' inputs and outputs in the stack.
+
+    ``taken`` has the stack's own inputs, whose names no output may have.
+    """
 
     files: Sequence[PartGraph]
+    taken: Collection[str] = ()
 
     def parts(self) -> tuple[str, ...]:
         """Return the parts, in the order of the file."""
@@ -110,7 +114,8 @@ class Names:
 
     def public(self, part: str, output: str) -> str:
         """Return the stack's name of an output, with its part if it is ambiguous."""
-        return output if len(self.givers(output)) == 1 else f"{part}.{output}"
+        alone = len(self.givers(output)) == 1 and output not in self.taken
+        return output if alone else f"{part}.{output}"
 
     def output(self, text: str, where: str) -> FeedSource:
         """Find the output of a text: ``PART.NAME``, or a name that one part gives."""

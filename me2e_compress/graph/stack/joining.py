@@ -7,21 +7,22 @@ from pathlib import Path
 
 from me2e_compress import documents
 from me2e_compress.errors import GraphError
-from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.recurrence import RECURRENT, SessionPort, recurrence
-from me2e_compress.runtime.stack.first_values import fitted, read_value
-from me2e_compress.runtime.stack.joints import FeedSource, Joints, Names, two_givers
-from me2e_compress.runtime.stack.part_graph import PartGraph, misfit, told
-from me2e_compress.runtime.stack.stack_file import ZEROS, StackFile, StateEntry
+from me2e_compress.graph.nodes import Array
+from me2e_compress.graph.recurrence import RECURRENT, SessionPort, recurrence
+from me2e_compress.graph.stack.first_values import fitted, read_value
+from me2e_compress.graph.stack.joints import FeedSource, Joints, Names, two_givers
+from me2e_compress.graph.stack.part_graph import PartGraph, misfit, told
+from me2e_compress.graph.stack.stack_file import ZEROS, StackFile, StateEntry
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Joined:
-    """The result of joining a stack's files; see ``SplitStack``."""
+    """The result of joining a stack's files; see ``JoinedStack``."""
 
     inputs: Mapping[str, SessionPort]
     outputs: Mapping[str, SessionPort]
     answers: Mapping[str, tuple[str, str]]
+    names: Names
     recurrent: Mapping[str, str]
     first_values: Mapping[str, Array]
     at_first: Joints
@@ -36,6 +37,7 @@ def join(content: StackFile, files: Sequence[PartGraph], folder: Path) -> Joined
     at_next = joiner.joints(first=False)
     at_first = joiner.joints(first=True)
     inputs = _inputs((at_next, at_first))
+    joiner.names = dataclasses.replace(joiner.names, taken=inputs)
     # Name the outputs of the stack.
     answers = dict(joiner.answers())
     ports = {each.label: each.outputs for each in files}
@@ -47,9 +49,12 @@ def join(content: StackFile, files: Sequence[PartGraph], folder: Path) -> Joined
     recurrent = joiner.recurrent(inputs, outputs)
     _check_joined(joiner.names.parts(), (at_next, at_first), recurrent, answers)
     first_values = joiner.first_values(inputs, at_first)
-    metadata = _merged(files) | content.said()
+    # files that run at most frames win over those for first frames
+    kept = [each.label for each in at_next.graphs.values()]
+    ranked = sorted(files, key=lambda each: each.label in kept)
+    metadata = _merged(ranked) | content.said()
     return Joined(
-        *(inputs, outputs, answers, recurrent, first_values),
+        *(inputs, outputs, answers, joiner.names, recurrent, first_values),
         *(at_first, at_next, metadata),
     )
 
