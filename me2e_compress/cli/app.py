@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from me2e_compress.cli import arguments as given
 from me2e_compress.cli.verbosity import Verbosity, set_verbosity
 from me2e_compress.extras import missing_module
 from me2e_compress.version import __version__
@@ -237,12 +238,15 @@ Verbose = Annotated[
         expose_value=False,
     ),
 ]
-COMMON = ("quiet", "verbose")
+COMMON = ("quiet", "verbose", "json")
 """Options that stand before or after the name of a command."""
 
 
 def _options(
-    version: Version = False, quiet: Quiet = False, verbose: Verbose = False
+    version: Version = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    json: given.Json = False,
 ) -> None:
     """Make modular end-to-end driving models small, and prove that they drive."""
 

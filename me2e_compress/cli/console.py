@@ -21,7 +21,7 @@ from rich.progress import (
 from rich.table import Table as Shown
 from rich.text import Text
 
-from me2e_compress.cli.verbosity import is_quiet, is_verbose
+from me2e_compress.cli.verbosity import is_json, is_quiet, is_verbose
 from me2e_compress.display import duration, printable
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Cell, Result, Table
@@ -83,14 +83,12 @@ def tell(line: str) -> None:
         errors.print(printable(line), soft_wrap=True, markup=False)
 
 
-def show(
-    found: Result, as_json: bool = False, tables: Sequence[Table] | None = None
-) -> None:
-    """Print a result as one JSON document, or as tables and lines.
+def show(found: Result, tables: Sequence[Table] | None = None) -> None:
+    """Print a result as tables and lines, or as one JSON document if asked to.
 
     `tables` are printed instead of the result's own.
     """
-    if as_json:
+    if is_json():
         print_json(found.document())
         return
     # tables first, so that the verdict stays in sight at the end

@@ -5,12 +5,9 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-import typer
 from typer.testing import CliRunner
 
-from me2e_compress.cli.commands.evaluate import evaluate
-from me2e_compress.cli.commands.profile import profile
-from me2e_compress.cli.commands.score import score
+from me2e_compress.cli.app import app
 from me2e_compress.errors import EvaluationError
 from me2e_compress.marks import IN_JSON
 from me2e_compress.runtime.latency_trace import LatencyTrace
@@ -23,10 +20,6 @@ Run = Callable[..., str]
 
 @pytest.fixture
 def run() -> Run:
-    app = typer.Typer()
-    for command in (evaluate, score, profile):
-        app.command()(command)
-
     def invoke(*words: str | Path) -> str:
         result = CliRunner().invoke(app, [str(word) for word in words])
         if result.exception is not None:
@@ -127,7 +120,7 @@ def test_a_route_is_drawn(run: Run, manifest: Path, tmp_path: Path) -> None:
     [
         (("--render", "nowhere"), "no route 'nowhere'"),
         (("--engine", "cloud"), "engine 'cloud'"),
-        (("--engine", "local", "--address", "a:1"), "engine 'local' with address a:1"),
+        (("--engine", "local:a:1"), "engine 'local' with address a:1"),
         (("--weather", "snow=1"), "weather option 'snow'"),
         (("--weather", "night=dark"), "weather option night"),
         (("--latency", "fast"), "no latency source 'fast'"),

@@ -88,6 +88,15 @@ def test_quiet_listeners_hear_nothing(capsys: pytest.CaptureFixture[str]) -> Non
     assert capsys.readouterr().err == ""
 
 
+def test_one_run_prints_json(
+    command: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("--json", "list", "targets") == 0
+    assert capsys.readouterr().out.startswith("{")
+    assert command("list", "targets") == 0
+    assert capsys.readouterr().out.startswith("targets")
+
+
 def test_a_run_is_quiet_only_once(
     command: Command, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -54,7 +54,6 @@ def test_a_number_that_is_none(
         ("frames vad-tiny -n 1 -o out", "--seed"),
         ("export vad-tiny -o out", "--seed"),
         ("evaluate blind --routes 1 -o out", "--seed"),
-        ("lint dense.onnx", "--shown"),
     ],
 )
 def test_a_count_below_zero(

@@ -119,11 +119,11 @@ def test_a_plan_is_shown_with_reasons(
 ) -> None:
     words = ("--scheme", "feature-ext", "--map", dense / "map.toml")
 
-    assert command("plan", dense / "dense.onnx", *words, "--all") == 0
+    assert command("plan", dense / "dense.onnx", *words, "--nodes") == 0
 
     said = capsys.readouterr().out
     assert "0 of 2 nodes int8; module 1" in said
-    assert "/backbone/Relu" in said
+    assert "/plan_head/MatMul" in said
 
 
 def test_what_is_decided_together_is_listed(
@@ -139,7 +139,7 @@ def test_what_is_decided_together_is_listed(
     (tmp_path / "map.toml").write_text(
         '[modules.head]\nrole = "prediction"\noptional = ["**"]\n'
     )
-    words = ("--map", tmp_path / "map.toml", "--all")
+    words = ("--map", tmp_path / "map.toml", "--nodes")
 
     assert command("plan", tmp_path / "two.onnx", *words) == 0
 
@@ -242,7 +242,7 @@ def test_a_close_decision_says_so_without_markup(
     save_plan(dataclasses.replace(made, decisions=close), dense / "close.plan.json")
     capsys.readouterr()
 
-    assert command("plan", dense / "close.plan.json", "--all") == 0
+    assert command("plan", dense / "close.plan.json", "--nodes") == 0
 
     said = " ".join(capsys.readouterr().out.split())
     assert "[8,8]" in said

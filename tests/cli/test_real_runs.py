@@ -4,10 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
-from me2e_compress.cli.commands.score import score
+from me2e_compress.cli.app import app
 from me2e_compress.errors import EvaluationError
 from tests.docs.documents import faults
 from tests.evaluators.bench2drive.files import (
@@ -34,12 +33,9 @@ FAILED = record(
 
 @pytest.fixture
 def run() -> Run:
-    app = typer.Typer()
-    app.command()(score)
-
     def invoke(*words: str | Path) -> str:
         result = CliRunner().invoke(
-            app, [str(word) for word in words], env={"COLUMNS": "300"}
+            app, ["score", *map(str, words)], env={"COLUMNS": "300"}
         )
         if result.exception is not None:
             raise result.exception

@@ -2,10 +2,9 @@ import json
 from pathlib import Path
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
-from me2e_compress.cli.commands.routes import routes
+from me2e_compress.cli.app import app
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.routes import load_routes, save_routes
 from tests.docs.documents import faults
@@ -13,12 +12,9 @@ from tests.simulator.world.driving import route_of
 
 STOP = "VanillaNonSignalizedTurnEncounterStopsign"
 
-app = typer.Typer()
-app.command()(routes)
-
 
 def run(*words: str | Path) -> tuple[int, str, BaseException | None]:
-    done = CliRunner().invoke(app, [str(word) for word in words])
+    done = CliRunner().invoke(app, ["routes", *map(str, words)])
     return done.exit_code, done.stdout, done.exception
 
 

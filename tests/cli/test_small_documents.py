@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.cli.console import show
+from me2e_compress.cli.console import print_json
 from me2e_compress.workflows.export import ExportResult
 from me2e_compress.workflows.frames import FramesOptions, FramesResult
 from me2e_compress.zoo.weights_record import WeightsRecord
@@ -31,7 +31,7 @@ def test_a_stack_of_a_checkpoint(
     output.write_bytes(b"1234")
     record = WeightsRecord("a.pth", "0" * 64, epoch=3, converted={"float16": 9})
 
-    show(ExportResult("tcp", output, 17, record), as_json=True)
+    print_json(ExportResult("tcp", output, 17, record).document())
 
     found = strict(capsys.readouterr().out)
     assert faults("export", found) == []
@@ -42,7 +42,7 @@ def test_recorded_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     for name in ("000000.npz", "000001.npz"):
         (tmp_path / name).touch()
 
-    show(FramesResult("vad-tiny", tmp_path, FramesOptions(count=3)), as_json=True)
+    print_json(FramesResult("vad-tiny", tmp_path, FramesOptions(count=3)).document())
 
     found = strict(capsys.readouterr().out)
     assert faults("frames", found) == []

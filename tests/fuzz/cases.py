@@ -30,7 +30,7 @@ MAPPED = ("--map", "../good/map.toml")
 OPENERS: Mapping[str, tuple[str, ...]] = {
     "inspect": ("inspect", "bad.onnx"),
     "inspect-mapped": ("inspect", "bad.onnx", *MAPPED, "--json"),
-    "plan": ("plan", "bad.onnx", "--all"),
+    "plan": ("plan", "bad.onnx", "--nodes"),
     "plan-against": ("plan", MODEL, "--against", "bad.onnx"),
     "lint": ("lint", "bad.onnx"),
     "lint-onnxruntime": ("lint", "bad.onnx", "--target", "onnxruntime"),
@@ -109,7 +109,7 @@ def _json_words(good: Path) -> dict[str, tuple[str, tuple[str, ...]]]:
     given = ("--frames", FRAMES, "-o", "out.onnx")
     return {
         "plan": ("plan.json", ("plan", MODEL, "--against", "bad.json")),
-        "plan-alone": ("plan.json", ("plan", "bad.json", "--all")),
+        "plan-alone": ("plan.json", ("plan", "bad.json", "--nodes")),
         "ranges": (
             "ranges.json",
             ("compress", MODEL, "--scheme", "full", "--ranges", "bad.json", *given),

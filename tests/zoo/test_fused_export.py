@@ -65,17 +65,12 @@ def test_a_layer_in_every_dialect_says_what_torch_says(
 
 def test_a_library_without_the_operator_is_an_error() -> None:
     with pytest.raises(RecipeError, match="--dialect sparsedrive: no library of"):
-        ExportOptions(operators="plugin", dialect="sparsedrive")
-
-
-def test_a_dialect_of_standard_operators_is_an_error() -> None:
-    with pytest.raises(RecipeError, match="needs --operators plugin"):
-        ExportOptions(dialect="tensorrt")
+        ExportOptions(dialect="sparsedrive")
 
 
 def test_the_driver_that_ships_is_one_file(tmp_path: Path) -> None:
-    options = ExportOptions(operators="plugin")
-    with pytest.raises(GraphError, match="--operators cannot be chosen"):
+    options = ExportOptions(dialect="me2e")
+    with pytest.raises(GraphError, match="--dialect cannot be chosen"):
         export_stack("highway", tmp_path / "h.onnx", options)
 
 

@@ -45,7 +45,6 @@ def calibrate(
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Measure the ranges of every tensor that any scheme, rule set or target needs.
 
@@ -62,4 +61,4 @@ def calibrate(
     )  # fmt: skip
     with listening() as listener:
         found = workflow.calibrate(model, frames, output, options, listener)
-    show(found, as_json)
+    show(found)

@@ -54,7 +54,6 @@ def compress(
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Apply passes to a graph, check each, and write the smaller graph and a report.
 
@@ -73,4 +72,4 @@ def compress(
     )  # fmt: skip
     with listening() as listener:
         found = workflow.compress(model, output, wanted, frames, options, listener)
-    show(found, as_json)
+    show(found)

@@ -24,7 +24,6 @@ def inspect(
     ] = None,
     frames: Annotated[Path | None, typer.Option(help="the recorded FRAMES")] = None,
     adapter: given.Adapter = None,
-    as_json: given.Json = False,
 ) -> None:
     """Show what a graph holds: interface, and nodes, parameters, MACs by module.
 
@@ -35,4 +34,4 @@ def inspect(
     with listening() as listener:
         read = module_map, dims, modelled_energy, trace, frames, listener, adapter
         found = workflow.inspect(model, *read)
-    show(found, as_json)
+    show(found)

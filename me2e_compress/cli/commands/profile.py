@@ -44,7 +44,6 @@ def profile(
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Measure a model alone and warm, and write its latencies as a trace.
 
@@ -69,7 +68,7 @@ def profile(
             raise EvaluationError("profile: give recorded FRAMES, or --import FILE")
         else:
             found = workflow.profile(model, frames, output, options, listener)
-    show(found, as_json)
+    show(found)
     # files besides the trace are named on stderr
     if found.figure is not None:
         tell(f"wrote {found.figure}")

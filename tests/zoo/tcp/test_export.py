@@ -87,10 +87,10 @@ def test_unknown_heads_are_an_error(tmp_path: Path) -> None:
 
 def test_plugins_are_an_error(tmp_path: Path) -> None:
     with pytest.raises(GraphError, match="tcp has no deformable attention"):
-        export_stack("tcp", tmp_path / "x.onnx", ExportOptions(operators="plugin"))
+        export_stack("tcp", tmp_path / "x.onnx", ExportOptions(dialect="me2e"))
 
 
 def test_plugins_and_the_dynamo_exporter_are_an_error(tmp_path: Path) -> None:
-    options = ExportOptions(operators="plugin", opset=18)
+    options = ExportOptions(dialect="me2e", opset=18)
     with pytest.raises(GraphError, match="opset 18 with plugins, which take up to 17"):
         export_stack("vad-tiny", tmp_path / "x.onnx", options)
