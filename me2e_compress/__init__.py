@@ -32,8 +32,11 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.compare import CompareResult, compare
     from me2e_compress.workflows.compress import CompressOptions, compress
     from me2e_compress.workflows.compress_result import CompressResult
-    from me2e_compress.workflows.evaluate import EvaluateOptions, evaluate
-    from me2e_compress.workflows.evaluate_result import EvaluateResult
+    from me2e_compress.workflows.evaluate import (
+        EvaluateOptions,
+        EvaluateResult,
+        evaluate,
+    )
     from me2e_compress.workflows.frames import FramesOptions, record_frames
     from me2e_compress.workflows.inspect import inspect
     from me2e_compress.workflows.inspect_result import InspectResult
@@ -142,8 +145,7 @@ _ROOMS = {
     "workflows.compare": ("CompareResult", "compare"),
     "workflows.compress": ("CompressOptions", "compress"),
     "workflows.compress_result": ("CompressResult",),
-    "workflows.evaluate": ("EvaluateOptions", "evaluate"),
-    "workflows.evaluate_result": ("EvaluateResult",),
+    "workflows.evaluate": ("EvaluateOptions", "EvaluateResult", "evaluate"),
     "workflows.frames": ("FramesOptions", "record_frames"),
     "workflows.inspect": ("inspect",),
     "workflows.inspect_result": ("InspectResult",),

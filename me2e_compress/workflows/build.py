@@ -17,7 +17,7 @@ from me2e_compress.targets.tensorrt.tensorrt_engine import (
 from me2e_compress.workflows.checks import model_path, output_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, counted, megabytes
+from me2e_compress.workflows.result import Result, counted, megabytes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,10 +50,6 @@ class EngineResult(Result):
             f" {found.version}, {counted(found.layers, 'layer')} parsed,"
             f" {found.seconds:.0f} s; it fits this GPU and this version"
         )
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return no table: the headline says everything."""
-        return ()
 
     def records(self) -> list[dict[str, object]]:
         """Return one row."""

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.workflows.result import Result, Table, counted
+from me2e_compress.workflows.result import Result, counted
 
 _SHOWN = 5
 """Number of tensors of a kind that are listed."""
@@ -49,10 +49,6 @@ class CalibrateResult(Result):
             *_first(list(self.ranges.dead), "always zero"),
             *_first(outliers, "a few elements make the range"),
         )
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return no table: the lines say what matters."""
-        return ()
 
     def records(self) -> list[dict[str, object]]:
         """Return one row per tensor."""

@@ -63,10 +63,6 @@ class ModelCheck(Result):
             return f"{self.policy} could not drive"
         return f"{self.policy} could drive, by {self.drives_by}"
 
-    def lines(self) -> tuple[str, ...]:
-        """Return the headline."""
-        return (self.headline,)
-
     def alerts(self) -> tuple[str, ...]:
         """Return the problems."""
         return self.problems
@@ -90,10 +86,7 @@ class ModelCheck(Result):
 
     def to_json(self) -> object:
         """Return everything."""
-        return {"fits": self.fits, **{f.name: getattr(self, f.name) for f in _FIELDS}}
-
-
-_FIELDS = dataclasses.fields(ModelCheck)
+        return {"fits": self.fits, **dataclasses.asdict(self)}
 
 
 def check_model(

@@ -10,7 +10,7 @@ from typing import TypeAlias
 from me2e_compress import graph
 from me2e_compress import recipe as recipes
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.stack_frames import StackFrames, recording_of
+from me2e_compress.calibration.stack_frames import StackFrames
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import SQNR_FLOOR_DB, Floor
 from me2e_compress.manager import PassManager, Report
@@ -32,6 +32,7 @@ from me2e_compress.workflows.checks import (
 from me2e_compress.workflows.compress_fidelity import (
     SplitFrames,
     measure_loss,
+    open_frames,
 )
 from me2e_compress.workflows.compress_result import (
     CompressResult,
@@ -45,7 +46,6 @@ from me2e_compress.workflows.stack_output import (
     writing_model,
     written_model,
 )
-from me2e_compress.zoo.shipped import sample_frames
 
 Recipe: TypeAlias = str | Path | Sequence[Pass]
 """A shipped recipe's name, a TOML file, or passes."""
@@ -200,23 +200,13 @@ def compress(
     ):
         loaded = read_graph(source, listener, options.adapter)
         modules = load_map(options.module_map, loaded.model)
-        seen = _frames(loaded, frames, options)
+        seen = open_frames(loaded, frames, options.provider)
         split = SplitFrames.of(*seen, passes, options.measure_frames)
         run = Compression(target, output.parent, options, listener)
         first = _first_frames(run, loaded, seen[0], recipe, modules)
         found = run.compress(loaded, passes, modules, split)
     written = written_model(source, output)
     return dataclasses.replace(found, output=written, first_frames=first)
-
-
-def _frames(
-    loaded: graph.LoadedModel, folder: str | Path | None, options: CompressOptions
-) -> tuple[CalibrationSet | None, CalibrationSet | None]:
-    """Open and check the recording, or the frames that ship with the model."""
-    if folder is not None:
-        return recording_of(loaded, folder, options.provider), None
-    shipped = sample_frames(loaded.path)
-    return None, None if shipped is None else CalibrationSet(shipped)
 
 
 def _first_frames(

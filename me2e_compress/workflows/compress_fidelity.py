@@ -1,7 +1,7 @@
 """Measure what lossy passes did to a model, on frames kept out of calibration."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,25 +11,39 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.sample import hold_out
+from me2e_compress.calibration.stack_frames import recording_of
 from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import EvaluationError, FramesError, GraphError, Me2eError
 from me2e_compress.fidelity.compare import Fidelity, Reference
-from me2e_compress.fidelity.floor import Floor, Shortfall, unsteady_outputs
+from me2e_compress.fidelity.floor import Floor, unsteady_outputs
+from me2e_compress.graph import LoadedModel
 from me2e_compress.manager import Report
 from me2e_compress.manager.report import LossyPass
 from me2e_compress.passes import Context, Pass
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.quantization.plan.overrides import Override, overrides_text
 from me2e_compress.runtime.frames import Frames
+from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
-from me2e_compress.sensitivity.remedy import Remedy, RemedyTrials, find_remedy
+from me2e_compress.sensitivity.remedy import RemedyTrials, find_remedy
 from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.measured_loss import NOT_ASKED, MeasuredLoss
+from me2e_compress.zoo.shipped import sample_frames
 
 KEPT_OUT = "kept out of calibration"
 SHARED = "calibrated on as well: there is no other"
 PERHAPS_SHARED = "that the saved ranges may have been measured on"
 SHIPPED_FRAMES = "that ship with the model"
-NOT_ASKED = "--measure-frames 0"
+
+
+def open_frames(
+    loaded: LoadedModel, folder: str | Path | None, provider: Provider
+) -> tuple[CalibrationSet | None, CalibrationSet | None]:
+    """Open and check the recording, or the frames that ship with the model."""
+    if folder is not None:
+        return recording_of(loaded, folder, provider), None
+    shipped = sample_frames(loaded.path)
+    return None, None if shipped is None else CalibrationSet(shipped)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,35 +81,6 @@ class SplitFrames:
         if any(each.reads_ranges and not each.needs_frames for each in passes):
             return cls(recording, measured, PERHAPS_SHARED)
         return cls(calibration, measured, SHARED if len(recording) == 1 else KEPT_OUT)
-
-
-@dataclasses.dataclass(frozen=True)
-class MeasuredLoss:
-    """How true a compressed model stayed, and where it did not.
-
-    Attributes:
-        fidelity: fidelity to the graph before the first lossy pass; None if not
-            measured.
-        on: which frames were used, or why nothing was measured, in words.
-        incomparable: whether an output is not finite, or of another shape than before.
-        unsteady: outputs that are not judged, with their dB or metres: the uncompressed
-            model itself falls that low when its largest input is rounded to int8.
-        shortfalls: outputs below the floor, the worst first.
-        guilty: the passes that cause the shortfalls.
-        remedy: what would restore the quality; None if nothing was searched, because
-            another pass is guilty, or the one that quantizes takes no overrides.
-        seconds: CPU time of measuring and searching.
-    """
-
-    fidelity: Fidelity | None
-    on: str
-    floor: Floor
-    unsteady: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    shortfalls: tuple[Shortfall, ...] = ()
-    guilty: tuple[str, ...] = ()
-    remedy: Remedy | None = None
-    seconds: float = 0.0
-    incomparable: bool = False
 
 
 def measure_loss(

@@ -20,7 +20,7 @@ from me2e_compress.passes.fold_constants.knowledge import Sweep
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.workflows.checks import check_count
 from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.result import Result, Table, megabytes
+from me2e_compress.workflows.result import Result, megabytes
 from me2e_compress.zoo import export as exporter
 from me2e_compress.zoo import shipped
 from me2e_compress.zoo.published_weights import PublishedWeights, published_weights
@@ -96,10 +96,6 @@ class ExportResult(Result):
         said = () if self.weights is None else self.weights.lines()
         images = (_IMAGES,) if said and self.stack == "vad-tiny" else ()
         return (self.headline, *said, *images)
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return no table: the lines say everything."""
-        return ()
 
     def records(self) -> list[dict[str, object]]:
         """Return one row: the file."""

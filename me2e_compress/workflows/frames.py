@@ -28,7 +28,7 @@ from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.logged_inputs import inputs_of_model, inputs_of_stack
-from me2e_compress.workflows.result import Result, Table, counted
+from me2e_compress.workflows.result import Result, counted
 from me2e_compress.zoo.stacks import STACKS, find
 from me2e_compress.zoo.synthetic_frames import frames as synthetic
 
@@ -85,10 +85,6 @@ class FramesResult(Result):
         log, seed = self.options.log, self.options.seed
         said = f"{self.output}: {counted(self.count, 'frame')} of {self.stack}"
         return f"{said}, {f'seed {seed}' if log is None else f'from {LOGS.text(log)}'}"
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return no table: the headline says everything."""
-        return ()
 
     def records(self) -> list[dict[str, object]]:
         """Return one row: the recording."""

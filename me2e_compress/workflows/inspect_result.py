@@ -162,10 +162,6 @@ class InspectResult(Result):
         """Return one row per module."""
         return [dataclasses.asdict(item) for item in self.modules]
 
-    def to_json(self) -> object:
-        """Return everything."""
-        return dataclasses.asdict(self)
-
 
 def _activations(item: Item) -> str:
     if item.activation_bytes is None:

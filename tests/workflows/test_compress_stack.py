@@ -18,7 +18,14 @@ from me2e_compress.graph import JoinedStack
 from me2e_compress.marks import IN_JSON
 from tests.cli.conftest import Command, strict
 from tests.docs.documents import faults
-from tests.stacks import THREE_FILES, TWO_PARTS, dense_frames, write_dense, write_stack
+from tests.stacks import (
+    THREE_FILES,
+    TWO_MODULES,
+    TWO_PARTS,
+    dense_frames,
+    write_dense,
+    write_stack,
+)
 
 NO_CHECKS = me2e.CompressOptions(verify_frames=0)
 
@@ -47,11 +54,18 @@ def test_every_file_becomes_int8_and_the_whole_is_measured(tmp_path: Path) -> No
     assert me2e.compare(stack, found.output, frames).fidelity.missing == ()
 
 
-def test_exact_passes_leave_the_whole_as_it_was(tmp_path: Path) -> None:
+def test_exact_passes_leave_the_whole_as_it_was_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stack, frames = write_dense(tmp_path), dense_frames(tmp_path)
+    read, load = list[Path](), JoinedStack.load
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            JoinedStack, "load", lambda path: (read.append(path), load(path))[1]
+        )
+        found = me2e.compress(stack, tmp_path / "small", "exact", frames)
 
-    found = me2e.compress(stack, tmp_path / "small", "exact", frames)
-
+    assert read == [stack]
     assert found.loss is None
     outputs = me2e.compare(stack, found.output, frames).fidelity.outputs
     assert {each.error for each in outputs} == {0.0}
@@ -100,10 +114,7 @@ def test_frames_that_do_not_fit_the_stack_are_named(tmp_path: Path) -> None:
 
 def test_a_map_must_match_in_one_of_the_files(tmp_path: Path) -> None:
     stack, map_file = write_dense(tmp_path), tmp_path / "map.toml"
-    map_file.write_text(
-        '[modules.a]\nrole = "feature"\npatterns = ["backbone"]\n'
-        '[modules.b]\nrole = "prediction"\npatterns = ["hat"]\n'
-    )
+    map_file.write_text(TWO_MODULES.replace("head", "hat"))
 
     with pytest.raises(ModuleMapError, match="'hat' of module b matches no"):
         me2e.compress(
@@ -114,10 +125,7 @@ def test_a_map_must_match_in_one_of_the_files(tmp_path: Path) -> None:
 
 def test_a_scheme_takes_the_modules_of_its_file(tmp_path: Path) -> None:
     stack, map_file = write_dense(tmp_path), tmp_path / "map.toml"
-    map_file.write_text(
-        '[modules.a]\nrole = "feature"\npatterns = ["backbone"]\n'
-        '[modules.b]\nrole = "prediction"\npatterns = ["head"]\n'
-    )
+    map_file.write_text(TWO_MODULES)
     options = me2e.CompressOptions(module_map=map_file, verify_frames=0)
 
     found = me2e.compress(
@@ -166,10 +174,7 @@ def test_the_small_stack_carries_its_plan(tmp_path: Path) -> None:
 
 def test_a_module_is_ablated_across_files(tmp_path: Path) -> None:
     stack, map_file = write_dense(tmp_path), tmp_path / "map.toml"
-    map_file.write_text(
-        '[modules.a]\nrole = "feature"\npatterns = ["backbone"]\n'
-        '[modules.b]\nrole = "prediction"\npatterns = ["head"]\n'
-    )
+    map_file.write_text(TWO_MODULES)
     options = me2e.CompressOptions(module_map=map_file, verify_frames=0)
     passes = recipe.parse("import-normalize,ablate-modules{drop=[b],drop_outputs=true}")
 

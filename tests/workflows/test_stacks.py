@@ -10,7 +10,7 @@ from me2e_compress import graph
 from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import Observation, Trajectory
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.errors import FramesError, GraphError, PreconditionError
+from me2e_compress.errors import GraphError, PreconditionError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.latency_trace import LatencyTrace
@@ -18,10 +18,12 @@ from me2e_compress.targets.tensorrt.tensorrt_engine import (
     EngineSettings,
     TensorRTEngine,
 )
+from tests.cli.conftest import Command, strict
+from tests.docs.documents import faults
 from tests.frames import record
 from tests.stacks import (
-    HEAD,
     THREE_FILES,
+    TWO_MODULES,
     TWO_PARTS,
     dense_frames,
     write_dense,
@@ -76,16 +78,6 @@ def test_what_drives_is_known_by_all_of_its_files(tmp_path: Path) -> None:
     assert OnnxDriver(path).fingerprint() == sha256_of(path)
 
 
-def test_compare_refuses_frames_that_lack_what_no_part_gives(tmp_path: Path) -> None:
-    loose = HEAD.replace("float[1,4] prev_bev)", "float[1,4] prev_bev, float[1] speed)")
-    path = write_stack(tmp_path, head=loose)
-
-    with pytest.raises(
-        FramesError, match=r"000000\.npz: speed is missing; there is img"
-    ):
-        me2e.compare(path, path, recording(tmp_path))
-
-
 def test_profile_times_all_files_together(tmp_path: Path) -> None:
     path, trace = write_stack(tmp_path), tmp_path / "trace.json"
 
@@ -104,6 +96,51 @@ def test_profile_by_module_times_the_joined_graph(tmp_path: Path) -> None:
     )
 
     assert found.trace.modules_us
+
+
+def test_what_feeds_every_input_of_every_file(tmp_path: Path) -> None:
+    found = me2e.inspect(write_stack(tmp_path, THREE_FILES))
+
+    assert [(each.file, each.input, each.source) for each in found.fed] == [
+        ("backbone", "img", "frames"),
+        ("head.first_frame", "feats", "backbone.feats"),
+        ("head", "feats", "backbone.feats"),
+        ("head", "prev_bev", "state: next_bev"),
+    ]
+
+
+def test_one_map_serves_all_files(tmp_path: Path) -> None:
+    map_file = tmp_path / "map.toml"
+    map_file.write_text(TWO_MODULES)
+
+    found = me2e.inspect(write_dense(tmp_path), map_file)
+
+    assert [(each.module, each.nodes, each.parameters) for each in found.modules] == [
+        *(("a", 2, 512), ("b", 3, 1024))
+    ]
+
+
+def test_the_document_says_it_all(
+    tmp_path: Path, command: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+    toml = THREE_FILES.replace("head_first", "head") + (
+        '[state]\nprev_bev = {first = "head.learned"}\n'
+    )
+
+    assert command("inspect", write_stack(tmp_path, toml), "--json") == 0
+
+    found = strict(capsys.readouterr().out)
+    assert faults("inspect", found) == []
+    assert found["first_values"] == {"prev_bev": "head.learned"}
+
+
+@pytest.mark.parametrize("toml", [None, THREE_FILES])
+def test_time_is_that_of_the_joined_graph(tmp_path: Path, toml: str | None) -> None:
+    stack = write_dense(tmp_path, toml) if toml else write_dense(tmp_path)
+
+    found = me2e.inspect(stack, frames=dense_frames(tmp_path))
+
+    assert found.latency_of
 
 
 def test_lint_and_plan_take_a_stack(tmp_path: Path) -> None:
