@@ -182,7 +182,7 @@ def _ready(
         loaded.model,
         source.name,
         listener,
-        file=source,
+        file=loaded.file,
         frames=part,
         provider=options.provider,
     )

@@ -3,13 +3,13 @@
 import dataclasses
 from pathlib import Path
 
-from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import GraphError
 from me2e_compress.fidelity.compare import Fidelity, common_adapter
 from me2e_compress.fidelity.compare import compare as measure
 from me2e_compress.fidelity.matched_sets import SetFidelity
 from me2e_compress.fidelity.open_loop import OpenLoop, OpenLoopTally
+from me2e_compress.graph import LoadedModel
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack_session import open_session
@@ -121,10 +121,10 @@ def compare(
     said = dict[Path, dict[str, str]]()
     # each graph must take the frames, and open in another process first
     for path in dict.fromkeys(paths):
-        model = graph.load(path)
-        said[path] = adapted(model, adapter)
-        recording.check(model)
-        try_model(model, path, recording, listener, provider)
+        loaded = LoadedModel.load(path)
+        said[path] = adapted(loaded.model, adapter)
+        recording.check(loaded.model)
+        try_model(loaded, listener, provider, recording)
     total = len(recording)
 
     def reported(frame: Frame) -> Frame:

@@ -258,7 +258,7 @@ class Compression:
         source, model = loaded.path, loaded.model
         seen = frames.calibration or frames.samples
         first = partial(try_first, listener=listener, provider=options.provider)
-        first(model, source.name, file=source, frames=seen)
+        first(model, source.name, file=loaded.file, frames=seen)
         # apply the passes, and refuse a result that is unproven or not int8
         context = Context(modules, frames.calibration, options.seed, options.provider)
         manager = PassManager(

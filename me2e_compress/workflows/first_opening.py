@@ -23,7 +23,7 @@ import platformdirs
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.graph import JoinedStack, is_stack
+from me2e_compress.graph import LoadedModel
 from me2e_compress.operators.kernels import why_not
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.children import run_script
@@ -50,17 +50,16 @@ def try_first(
 ) -> None:
     """Open a graph in another process, if it is new here, and run its first frame.
 
-    `file` holds the same graph as `model`, or is the stack that it was joined from;
-    without `frames` the graph is only opened. The listener is told how long this took,
-    since no other time includes it. Providers other than the plain CPU are not tried:
-    what they do to a graph does not follow from it.
+    `file` holds the same graph as `model`; without `frames` the graph is only opened.
+    The listener is told how long this took, since no other time includes it. Providers
+    other than the plain CPU are not tried: what they do to a graph does not follow from
+    it.
 
     Raises:
         GraphError: onnxruntime crashes on the graph.
     """
     if provider != CPU:
         return
-    file = None if file is None or is_stack(file) else file
     first = None if frames is None else next(iter(frames), None)
     feeds = None if first is None else first.arrays
     begins = partial(listener.on_progress, STAGE, 0, 1, name)
@@ -70,39 +69,33 @@ def try_first(
 
 
 def try_model(
-    model: ir.Model,
-    file: Path,
-    frames: Frames,
+    loaded: LoadedModel,
     listener: Listener,
     provider: Provider = CPU,
+    frames: Frames | None = None,
 ) -> None:
-    """Open the graph of a file in another process, and run it; see :func:`try_first`.
+    """Open a model in another process, and run its first frame; see :func:`try_first`.
 
-    Of a stack, what runs at first frames alone is opened too.
+    Of a stack the joined graph, and that for first frames, are opened and not run.
     """
-    if is_stack(file):
-        try_file(file, listener, provider)
+    name, stack = loaded.path.name, loaded.stack
+    opened = partial(try_first, listener=listener, provider=provider)
+    if stack is None:
+        opened(loaded.model, name, file=loaded.path, frames=frames)
         return
-    try_first(model, file.name, listener, file=file, frames=frames, provider=provider)
+    for each in filter(None, (stack.model, stack.first)):
+        opened(each, name)
 
 
 def try_file(file: Path, listener: Listener, provider: Provider = CPU) -> None:
-    """Open the graph of a file, or both of a stack, in another process.
-
-    The graphs are not run.
-    """
+    """Open the graph of a file, or both of a stack, in another process."""
     if provider != CPU:
         return
     try:
-        if is_stack(file):
-            stack = JoinedStack.load(file)
-            for each in filter(None, (stack.model, stack.first)):
-                try_first(each, file.name, listener)
-            return
-        model = graph.load(file)
+        loaded = LoadedModel.load(file)
     except GraphError:
         return  # who opens it says what is wrong
-    try_first(model, file.name, listener, file=file)
+    try_model(loaded, listener)
 
 
 def try_apart(

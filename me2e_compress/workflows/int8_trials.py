@@ -110,7 +110,7 @@ class TrialFiles:
             loaded,
             name,
             listener,
-            file=self.model,
+            file=read.file,
             frames=recording,
             provider=options.provider,
         )

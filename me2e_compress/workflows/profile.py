@@ -111,7 +111,7 @@ def profile(
     """
     options = options or ProfileOptions()
     source, written = model_path(model), None if output is None else Path(output)
-    figure = None if options.figure is None else figure_path(options.figure)
+    figure = None if options.figure is None else _figure_path(options.figure)
     joules = _energy_path(options, written)
     # refuse what cannot be measured before anything is
     if options.energy is not None:
@@ -122,7 +122,7 @@ def profile(
         recording = CalibrationSet(Path(frames))
         loaded = graph.LoadedModel.load(source)
         said = adapted(loaded.model, options.adapter)
-        trace = _measured(source, loaded.model, said, recording, options, listener)
+        trace = _measured(loaded, said, recording, options, listener)
         operators: Microseconds = {}
         if options.by_module or figure is not None:
             fed = recording_of(loaded, frames, options.provider)
@@ -133,7 +133,11 @@ def profile(
         # files are written all or none
         with drafts.all_or_none():
             if figure is not None:
-                draw(trace, source.stem, figure)
+                from me2e_compress.workflows.latency_figure import (  # matplotlib
+                    draw_modules,
+                )
+
+                draw_modules(trace, source.stem, figure)
             if written is not None:
                 trace.save(written)
             if energy is not None and joules is not None:
@@ -178,7 +182,7 @@ def _energy(
     return found[source.name]
 
 
-def figure_path(named: str | Path) -> Path:
+def _figure_path(named: str | Path) -> Path:
     """Return the file of a figure, if its kind is known and matplotlib is installed."""
     path = Path(named)
     if path.suffix not in KINDS:
@@ -186,13 +190,6 @@ def figure_path(named: str | Path) -> Path:
     if util.find_spec("matplotlib") is None:
         raise MissingExtraError("matplotlib", "highway")
     return path
-
-
-def draw(trace: LatencyTrace, name: str, path: Path) -> None:
-    """Draw what modules took, inference by inference; see :mod:`latency_figure`."""
-    from me2e_compress.workflows.latency_figure import draw_modules  # matplotlib
-
-    draw_modules(trace, name, path)
 
 
 def _broken_down(
@@ -217,17 +214,16 @@ def _broken_down(
 
 
 def _measured(
-    source: Path,
-    loaded: ir.Model,
+    loaded: graph.LoadedModel,
     said: Mapping[str, str],
     recording: CalibrationSet,
     options: ProfileOptions,
     listener: Listener,
 ) -> LatencyTrace:
-    try_model(loaded, source, recording, listener, options.provider)
+    try_model(loaded, listener, options.provider, recording)
     with OthersLoad() as others:
         trace = measure(
-            source,
+            loaded.path,
             recording,
             samples=options.samples,
             warm_up=options.warm_up,

@@ -10,8 +10,8 @@ from me2e_compress.errors import GraphError
 from me2e_compress.graph.nodes import Array
 from me2e_compress.graph.recurrence import RECURRENT, SessionPort, recurrence
 from me2e_compress.graph.stack.first_values import fitted, read_value
-from me2e_compress.graph.stack.joints import FeedSource, Joints, Names, two_givers
-from me2e_compress.graph.stack.part_graph import PartGraph, misfit, told
+from me2e_compress.graph.stack.joints import FeedSource, Joints, Names, ambiguous
+from me2e_compress.graph.stack.part_graph import PartGraph, form, misfit
 from me2e_compress.graph.stack.stack_file import ZEROS, StackFile, StateEntry
 
 
@@ -185,19 +185,19 @@ class _Joiner:
         if taker.recurrent().get(name) is not None:
             return FeedSource("", name)
         # An output of the same name feeds the input.
-        givers = [
+        giving = [
             part
             for part, each in graphs.items()
             if part != taker.part and name in each.outputs
         ]
-        if len(givers) > 1:
-            raise two_givers(f"{taker.label}.{name}", name, givers)
-        return FeedSource(givers[0] if givers else "", name)
+        if len(giving) > 1:
+            raise ambiguous(f"{taker.label}.{name}", name, giving)
+        return FeedSource(giving[0] if giving else "", name)
 
     def _given_first(self, entry: StateEntry) -> FeedSource | None:
         """Return the output that is a first value; None where it is something else."""
         part, _, name = entry.first.partition(".")
-        return FeedSource(part, name) if part in self.names.givers(name) else None
+        return FeedSource(part, name) if part in self.names.parts_giving(name) else None
 
     def _array(self, text: str, name: str, where: str) -> Array:
         path = self.folder / text
@@ -224,8 +224,8 @@ def _inputs(joints: Sequence[Joints]) -> dict[str, SessionPort]:
             other, known = found.setdefault(public, (taker, port))
             if misfit(known, port):
                 raise GraphError(
-                    f"{other.label} takes {public} as {told(known)}, {taker.label} as"
-                    f" {told(port)}; one that another part gives belongs into [edges]"
+                    f"{other.label} takes {public} as {form(known)}, {taker.label} as"
+                    f" {form(port)}; one that another part gives belongs into [edges]"
                 )
     return {name: port for name, (_, port) in found.items()}
 
@@ -240,8 +240,8 @@ def _check_answer(
         raise GraphError(f"[state] {name}: {answer} does not come at every frame")
     if name in inputs and misfit(outputs[answer], inputs[name]):
         raise GraphError(
-            f"[state] {name} takes {told(inputs[name])}, and {answer}, which is fed"
-            f" back to it, is {told(outputs[answer])}"
+            f"[state] {name} takes {form(inputs[name])}, and {answer}, which is fed"
+            f" back to it, is {form(outputs[answer])}"
         )
 
 

@@ -65,7 +65,7 @@ def misfit(given: SessionPort, taken: SessionPort) -> bool:
     )
 
 
-def told(port: SessionPort) -> str:
+def form(port: SessionPort) -> str:
     """Describe type and shape: ``float [1, 6, 2]``."""
     element = port.type.removeprefix("tensor(").removesuffix(")")
     return f"{element} {list(port.shape)}"

@@ -18,7 +18,7 @@ from me2e_compress.graph.nodes import Array
 from me2e_compress.graph.recurrence import RECURRENT, SessionPort, declared_pairs
 from me2e_compress.graph.stack.joining import Joined, join
 from me2e_compress.graph.stack.merge import merged
-from me2e_compress.graph.stack.part_graph import PartGraph, told
+from me2e_compress.graph.stack.part_graph import PartGraph, form
 from me2e_compress.graph.stack.split import split
 from me2e_compress.graph.stack.stack_file import StackFile, is_stack
 
@@ -108,7 +108,7 @@ class JoinedStack:
                         given = f"{source.part}.{source.name}"
                     elif source.name not in self.recurrent:
                         given = "frames"
-                    yield file.label, name, given, told(file.inputs[name])
+                    yield file.label, name, given, form(file.inputs[name])
 
     def saying(self, said: Mapping[str, str]) -> dict[str, str]:
         """Return metadata that override its own; pairs of state are added to it."""
@@ -128,25 +128,25 @@ class JoinedStack:
         )
         for part, each in parts.items():
             single.save(each, path.with_name(f"{part}.onnx"))
-        takers = {
+        inputs_taken = {
             (part, str(value.name))
             for part, each in parts.items()
             for value in each.graph.inputs
         }
-        takers |= {
+        inputs_taken |= {
             (each.part, name)
             for each in self.first_files.values()
             for name in each.inputs
         }
-        content = self._moved(path.parent, takers)
+        content = self._moved(path.parent, inputs_taken)
         path.write_text(f"{marks.IN_TOML}{content.text()}", "utf-8")
 
-    def _moved(self, folder: Path, takers: Set[tuple[str, str]]) -> StackFile:
+    def _moved(self, folder: Path, inputs_taken: Set[tuple[str, str]]) -> StackFile:
         """Return the content for files that stand beside it under the parts' names.
 
         What is said of inputs that no part has any more is left out.
         """
-        alive = {part for part, _ in takers}
+        alive = {part for part, _ in inputs_taken}
         parts = tuple(
             each.model_copy(
                 update={
@@ -161,12 +161,12 @@ class JoinedStack:
         edges = {
             text: output
             for text, output in self.content.edges.items()
-            if takers & {*self.joined.names.inputs(text, "")}
+            if inputs_taken & {*self.joined.names.inputs(text, "")}
         }
         state = {
             text: entry
             for text, entry in self.content.state.items()
-            if takers & {*self.joined.names.inputs(text, "")}
+            if inputs_taken & {*self.joined.names.inputs(text, "")}
         }
         for at, (name, entry) in enumerate(list(state.items())):
             value = self.first_values.get(name.partition(".")[2])
@@ -200,6 +200,11 @@ class LoadedModel:
             stack = JoinedStack.load(path)
             return cls(path, stack.model, stack)
         return cls(path, single.load(path))
+
+    @property
+    def file(self) -> Path | None:
+        """The file that holds this very graph; None of a stack."""
+        return self.path if self.stack is None else None
 
     @property
     def first_files(self) -> Mapping[str, PartGraph]:
@@ -237,10 +242,10 @@ def sha256_of(path: Path) -> str:
     """Hash a file, with its external data or, of a stack, with all its files."""
     if not is_stack(path):
         return single.sha256_of(path)
-    seal = hashlib.sha256()
+    digest = hashlib.sha256()
     for each in paths_of(path):
-        seal.update(single.sha256_of(each).encode())
-    return seal.hexdigest()
+        digest.update(single.sha256_of(each).encode())
+    return digest.hexdigest()
 
 
 def file_bytes(path: Path) -> int:
