@@ -72,18 +72,12 @@ Force = Annotated[
 ]
 
 
-def _print_json(context: typer.Context, wanted: bool) -> None:
-    """Set the form of results; before the command's name, for all of the call."""
-    if wanted or context.parent is None:
-        set_json(wanted)
-
-
 Json = Annotated[
     bool,
     typer.Option(
         "--json",
         help="print one JSON document",
-        callback=_print_json,
+        callback=set_json,
         expose_value=False,
     ),
 ]

@@ -2,6 +2,8 @@
 
 import enum
 
+import typer
+
 
 class Verbosity(enum.Enum):
     """How much is printed besides results and errors."""
@@ -21,10 +23,14 @@ def set_verbosity(wanted: Verbosity) -> None:
     _chosen = wanted
 
 
-def set_json(wanted: bool) -> None:
-    """Set whether results are printed as JSON, until the next call."""
+def set_json(context: typer.Context, wanted: bool) -> None:
+    """Set whether results are printed as JSON, until the next call.
+
+    The option stands before or after the name of a command.
+    """
     global _as_json
-    _as_json = wanted
+    if wanted or context.parent is None:
+        _as_json = wanted
 
 
 def is_json() -> bool:

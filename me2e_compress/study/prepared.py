@@ -20,10 +20,9 @@ from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.version import __version__
 from me2e_compress.workflows.compress import CompressOptions, compress
-from me2e_compress.workflows.compress_result import beside
+from me2e_compress.workflows.compress_result import beside, written_model
 from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import Listener
-from me2e_compress.workflows.stack_output import written_model
 from me2e_compress.zoo.weights_record import named_weights
 
 

@@ -25,7 +25,7 @@ from me2e_compress.graph.stack.part_graph import PartGraph
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.workflows.calibrate_result import CalibrateResult
+from me2e_compress.workflows.calibrate_result import CalibrateResult, beside_ranges
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
     Given,
@@ -39,7 +39,6 @@ from me2e_compress.workflows.claims import check_ours, writing
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
-from me2e_compress.workflows.stack_output import beside_ranges
 
 
 @dataclasses.dataclass(frozen=True)

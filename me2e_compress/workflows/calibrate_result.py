@@ -67,6 +67,11 @@ class CalibrateResult(Result):
         return {**own, "first_frames": first}
 
 
+def beside_ranges(ranges: Path, label: str) -> Path:
+    """Return where the ranges of a file for first frames stand."""
+    return ranges.with_name(f"{ranges.stem}.{label}.json")
+
+
 def _first(names: list[str], what: str) -> tuple[str, ...]:
     if not names:
         return ()

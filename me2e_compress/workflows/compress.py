@@ -21,6 +21,7 @@ from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.workflows.calibrate_result import beside_ranges
 from me2e_compress.workflows.checks import (
     check_count,
     check_number,
@@ -36,16 +37,13 @@ from me2e_compress.workflows.compress_fidelity import (
 )
 from me2e_compress.workflows.compress_result import (
     CompressResult,
+    in_place,
     write_result,
+    writing_model,
 )
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.stack_output import (
-    beside_ranges,
-    writing_model,
-    written_model,
-)
 
 Recipe: TypeAlias = str | Path | Sequence[Pass]
 """A shipped recipe's name, a TOML file, or passes."""
@@ -205,8 +203,7 @@ def compress(
         run = Compression(target, output.parent, options, listener)
         first = _first_frames(run, loaded, seen[0], recipe, modules)
         found = run.compress(loaded, passes, modules, split)
-    written = written_model(source, output)
-    return dataclasses.replace(found, output=written, first_frames=first)
+    return in_place(dataclasses.replace(found, first_frames=first), output)
 
 
 def _first_frames(

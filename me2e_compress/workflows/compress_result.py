@@ -1,15 +1,20 @@
 """The result of a compression: the graph, the report and their tables."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from me2e_compress import drafts, graph
+from me2e_compress.errors import GraphError
 from me2e_compress.manager import Report
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.quantization.plan import plan_of, save_plan
 from me2e_compress.runtime.atomic import write_document
+from me2e_compress.workflows.checks import Given, check_folder
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.measured_loss import MeasuredLoss
 from me2e_compress.workflows.result import Result, Table, megabytes, plain
@@ -174,7 +179,7 @@ def _proof(report: Report) -> Iterator[str]:
         yield from check.remarks
 
 
-def written_files(output: Path) -> tuple[Path, ...]:
+def _written_files(output: Path) -> tuple[Path, ...]:
     """Return every file that may be written for a compressed graph."""
     return (
         output,
@@ -182,6 +187,54 @@ def written_files(output: Path) -> tuple[Path, ...]:
         beside(output, "plan"),
         beside(output, "report"),
     )
+
+
+@contextmanager
+def writing_model(
+    source: Path, output: Path, inputs: Iterable[Given], *, force: bool
+) -> Iterator[Path]:
+    """Claim what is written of a model; yield where its graph goes.
+
+    Of a stack that is the TOML of a draft, which takes the place of a folder at the
+    end.
+
+    Raises:
+        GraphError: The output would harm an input, or is no folder for a stack.
+    """
+    if not graph.is_stack(source):
+        with writing(_written_files(output), inputs, force=force):
+            yield output
+        return
+    if output.suffix in (".onnx", ".toml"):
+        raise GraphError(f"{output}: a stack is written as a folder: name one")
+    check_folder(output, (*graph.paths_of(source), *inputs))
+    with writing(trees=[output], force=force):
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=output.parent, prefix=f".{output.name}.") as folder:
+            draft = Path(folder) / output.name
+            draft.mkdir()
+            try:
+                yield draft / source.name
+            except GraphError as error:
+                raise GraphError(str(error).replace(str(draft), str(output))) from error
+            drafts.put(draft, output)
+
+
+def written_model(source: Path, output: Path) -> Path:
+    """Return the file that opens what was written: of a stack, the TOML."""
+    return output / source.name if graph.is_stack(source) else output
+
+
+def in_place(found: CompressResult, output: Path) -> CompressResult:
+    """Return a result whose files are named where they are once the draft is put."""
+    if not graph.is_stack(found.source):
+        return found
+    first = {
+        label: dataclasses.replace(each, output=output / each.output.name)
+        for label, each in found.first_frames.items()
+    }
+    written = written_model(found.source, output)
+    return dataclasses.replace(found, output=written, first_frames=first)
 
 
 def write_result(

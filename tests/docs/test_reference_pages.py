@@ -11,7 +11,7 @@ import pytest
 import typer
 from typer.main import get_command
 
-from me2e_compress.cli.app import app
+from me2e_compress.cli.app import LazyGroup, app
 from me2e_compress.errors import GraphError
 from tests.docs.conftest import run
 from tests.docs.pages import PAGES, ROOT, WRITING, Block, blocks
@@ -72,6 +72,7 @@ def test_a_command_of_the_documents_is_one(line: str) -> None:
     """Its options exist and its values are of their types; nothing is run."""
     words = shlex.split(re.split(r"\s{3,}", line)[0], comments=True)[1:]
     group = get_command(app)
+    assert isinstance(group, LazyGroup)
     name, command, rest = group.resolve_command(typer.Context(group), words)
     if rest and "..." not in line and "…" not in line:
         with contextlib.suppress(GraphError):  # the model is not there

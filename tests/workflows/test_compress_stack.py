@@ -47,6 +47,7 @@ def test_every_file_becomes_int8_and_the_whole_is_measured(tmp_path: Path) -> No
     assert found.loss.fidelity is not None
     assert found.loss.fidelity.frames == 1
     (first,) = found.first_frames.values()
+    assert first.output == tmp_path / "small" / "head.first_frame.onnx"
     assert first.loss is not None
     assert first.loss.fidelity is not None
     outputs = (*found.loss.fidelity.outputs, *first.loss.fidelity.outputs)
@@ -59,10 +60,13 @@ def test_exact_passes_leave_the_whole_as_it_was_read_once(
 ) -> None:
     stack, frames = write_dense(tmp_path), dense_frames(tmp_path)
     read, load = list[Path](), JoinedStack.load
+
+    def noted(path: Path) -> JoinedStack:
+        read.append(path)
+        return load(path)
+
     with monkeypatch.context() as patch:
-        patch.setattr(
-            JoinedStack, "load", lambda path: (read.append(path), load(path))[1]
-        )
+        patch.setattr(JoinedStack, "load", noted)
         found = me2e.compress(stack, tmp_path / "small", "exact", frames)
 
     assert read == [stack]
