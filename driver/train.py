@@ -29,7 +29,7 @@ def command(
     output: Output,
     workers: given.Workers = 4,
     small: Small = False,
-    as_json: given.Json = False,
+    json: given.Json = False,
 ) -> None:
     """Train the driver from nothing: collect, learn, drive, learn again (hours)."""
     need_extra("zoo,highway", "training")
@@ -37,7 +37,7 @@ def command(
 
     with listening(stages=True) as listener:
         found = train(output, workers, listener, small=small)
-    show(found, as_json)
+    show(found)
 
 
 def main() -> int:

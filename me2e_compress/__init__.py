@@ -28,25 +28,18 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.build import BuildOptions, EngineResult, build
     from me2e_compress.workflows.calibrate import CalibrateOptions, calibrate
     from me2e_compress.workflows.calibrate_result import CalibrateResult
-    from me2e_compress.workflows.calibrate_stack import (
-        StackCalibrateResult,
-        calibrate_stack,
-    )
     from me2e_compress.workflows.check_model import ModelCheck, check_model
     from me2e_compress.workflows.compare import CompareResult, compare
     from me2e_compress.workflows.compress import CompressOptions, compress
     from me2e_compress.workflows.compress_result import CompressResult
-    from me2e_compress.workflows.compress_stack import compress_stack
-    from me2e_compress.workflows.compress_stack_result import StackCompressResult
-    from me2e_compress.workflows.evaluate import EvaluateOptions, evaluate
-    from me2e_compress.workflows.evaluate_result import EvaluateResult
+    from me2e_compress.workflows.evaluate import (
+        EvaluateOptions,
+        EvaluateResult,
+        evaluate,
+    )
     from me2e_compress.workflows.frames import FramesOptions, record_frames
     from me2e_compress.workflows.inspect import inspect
     from me2e_compress.workflows.inspect_result import InspectResult
-    from me2e_compress.workflows.inspect_stack import (
-        StackInspectResult,
-        inspect_stack,
-    )
     from me2e_compress.workflows.lint import LintOptions, LintResult, lint
     from me2e_compress.workflows.listener import Listener
     from me2e_compress.workflows.plan import PlanOptions, PlanResult, plan
@@ -98,24 +91,18 @@ __all__ = [
     "SearchResult",
     "SensitivityOptions",
     "SensitivityResult",
-    "StackCalibrateResult",
-    "StackCompressResult",
-    "StackInspectResult",
     "Step",
     "StudyResult",
     "Verification",
     "__version__",
     "build",
     "calibrate",
-    "calibrate_stack",
     "check_model",
     "compare",
     "compress",
-    "compress_stack",
     "evaluate",
     "graph",
     "inspect",
-    "inspect_stack",
     "lint",
     "load_study",
     "measure_sensitivity",
@@ -155,18 +142,13 @@ _ROOMS = {
     "workflows.calibrate": ("CalibrateOptions", "calibrate"),
     "workflows.calibrate_result": ("CalibrateResult",),
     "workflows.check_model": ("ModelCheck", "check_model"),
-    "workflows.calibrate_stack": ("StackCalibrateResult", "calibrate_stack"),
     "workflows.compare": ("CompareResult", "compare"),
     "workflows.compress": ("CompressOptions", "compress"),
     "workflows.compress_result": ("CompressResult",),
-    "workflows.compress_stack": ("compress_stack",),
-    "workflows.compress_stack_result": ("StackCompressResult",),
-    "workflows.evaluate": ("EvaluateOptions", "evaluate"),
-    "workflows.evaluate_result": ("EvaluateResult",),
+    "workflows.evaluate": ("EvaluateOptions", "EvaluateResult", "evaluate"),
     "workflows.frames": ("FramesOptions", "record_frames"),
     "workflows.inspect": ("inspect",),
     "workflows.inspect_result": ("InspectResult",),
-    "workflows.inspect_stack": ("StackInspectResult", "inspect_stack"),
     "workflows.lint": ("LintOptions", "LintResult", "lint"),
     "workflows.listener": ("Listener",),
     "workflows.plan": ("PlanOptions", "PlanResult", "plan"),

@@ -9,6 +9,8 @@ import json
 import re
 import stat
 import tomllib
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,6 +28,20 @@ LARGEST_TOML_BYTES = 4_000_000
 
 KEY_PARTS = 64
 """The most parts of a dotted TOML key."""
+
+UNREADABLE = (
+    OSError,
+    EOFError,
+    ValueError,  # pickled objects, headers that lie
+    SyntaxError,  # or are no Python
+    OverflowError,
+    RecursionError,
+    MemoryError,
+    RuntimeError,  # encrypted, or compressed as zipfile does not know
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What numpy and zipfile raise on a file that holds no valid arrays."""
 
 _DECODER = json.JSONDecoder(parse_constant=lambda word: _refuse(word))
 _ANY_NUMBER = json.JSONDecoder()

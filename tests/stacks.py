@@ -51,6 +51,17 @@ THREE_FILES = TWO_PARTS.replace(
 )
 
 
+TWO_MODULES = """
+[modules.a]
+role = "feature"
+patterns = ["backbone"]
+[modules.b]
+role = "prediction"
+patterns = ["head"]
+"""
+"""A map with a module for each part."""
+
+
 def write_stack(folder: Path, toml: str = TWO_PARTS, **texts: str) -> Path:
     """Write the three graphs, or others of these names, and a TOML; return that."""
     known = {"backbone": BACKBONE, "head": HEAD, "head_first": HEAD_FIRST}

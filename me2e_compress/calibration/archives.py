@@ -12,9 +12,9 @@ import numpy as np
 
 from me2e_compress import marks
 from me2e_compress.display import reason
-from me2e_compress.documents import check_regular
+from me2e_compress.documents import UNREADABLE, check_regular
 from me2e_compress.errors import FramesError
-from me2e_compress.runtime.frames import UNREADABLE, Array
+from me2e_compress.runtime.frames import Array
 
 LARGEST_BYTES = 2 << 30
 """The most bytes of all arrays of one file. Six full-size camera images have 0.1 GB."""

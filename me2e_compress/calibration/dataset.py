@@ -23,9 +23,9 @@ from me2e_compress.calibration.static_inputs import check_static, static_inputs
 from me2e_compress.display import Displayed, Table, counted, reason, table
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
+from me2e_compress.graph.recurrence import not_fed_back, recurrent_inputs, sides
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.recorded_future import RecordedFuture
-from me2e_compress.runtime.recurrence import not_fed_back, recurrent_inputs, sides
 
 FUTURE = ".future.json"
 """Suffix of the file beside a frame that holds its `RecordedFuture`."""

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from me2e_compress.cli import arguments as given
 from me2e_compress.cli.verbosity import Verbosity, set_verbosity
 from me2e_compress.extras import missing_module
 from me2e_compress.version import __version__
@@ -21,14 +22,17 @@ class CommandEntry:
         name: the command's name, also of its file and its function.
         help: the first line of its docstring.
         extra: extras of the package that its work needs, or empty.
-        function: the function, where it is not called like the command.
     """
 
     panel: str
     name: str
     help: str
     extra: str = ""
-    function: str = ""
+
+    @property
+    def function(self) -> str:
+        """The name of its function; ``list`` is Python's own."""
+        return "list_entries" if self.name == "list" else self.name
 
     def line(self) -> str:
         """Return the command's line in the list of commands."""
@@ -40,122 +44,85 @@ class CommandEntry:
         """Import the command as a Click command; its options need no extra."""
         alone = _app()
         home = importlib.import_module(f"me2e_compress.cli.commands.{self.name}")
-        alone.command(self.name)(getattr(home, self.function or self.name))
+        alone.command(self.name)(getattr(home, self.function))
         return typer.main.get_command(alone)
 
 
-START = "Start here"
-GRAPHS = "Graphs and frames"
-COMPRESS = "Compress"
-MEASURE = "Compare and measure"
-DRIVE = "Drive"
+_PANELS = {
+    "Start here": {
+        "demo": (
+            "Run the main job on what ships: compress, verify, compare, drive, report."
+        ),
+        "doctor": "Show what this machine can do, and what to install for the rest.",
+        "list": (
+            "Show what can be named: ours, and what other packages add by entry point."
+        ),
+    },
+    "Graphs and frames": {
+        "export": (
+            "Write a reference stack: random weights, a checkpoint's, or our driver."
+        ),
+        "inspect": (
+            "Show what a graph holds: interface, and nodes, parameters, MACs by module."
+        ),
+        "frames": "Write calibration frames, coherent in time, seen by six cameras.",
+    },
+    "Compress": {
+        "plan": (
+            "Show which nodes become int8, which stay float, by which rule, and why."
+        ),
+        "calibrate": (
+            "Measure the ranges of every tensor that any scheme, rule set or target"
+            " needs."
+        ),
+        "compress": (
+            "Apply passes to a graph, check each, and write the smaller graph and a"
+            " report."
+        ),
+        "lint": (
+            "Check a graph for the runtime that will run it; exit code 1 if it refuses."
+        ),
+        "build": "Build a TensorRT engine of a graph, for the GPU of this machine.",
+        "sensitivity": (
+            "Measure what int8 costs per module and node, and write a recipe within a"
+            " limit."
+        ),
+        "search": (
+            "Find the scheme within the budgets that costs the plan, or the road,"
+            " least."
+        ),
+    },
+    "Compare and measure": {
+        "compare": (
+            "Run two graphs over frames: SQNR of every output, plan displacement in"
+            " metres."
+        ),
+        "profile": (
+            "Measure a model alone and warm, and write its latencies as a trace."
+        ),
+    },
+    "Drive": {
+        "evaluate": "Drive a policy over routes of highway-env; run it again to go on.",
+        "score": (
+            "Print driving score, success rate, efficiency, comfort and abilities."
+        ),
+        "study": (
+            "Drive variants under conditions and compare them; run it again to go on."
+        ),
+        "routes": (
+            "Make a fresh set of admitted routes, or examine an existing set again."
+        ),
+    },
+}
+"""Commands with their first line of help, by the panel that lists them."""
+_DRIVING = ("evaluate", "study", "routes")
+"""Commands that need the extra ``highway``."""
 
-_ENTRIES = (
-    CommandEntry(
-        START,
-        "demo",
-        "Run the main job on what ships: compress, verify, compare, drive, report.",
-    ),
-    CommandEntry(
-        START,
-        "doctor",
-        "Show what this machine can do, and what to install for the rest.",
-    ),
-    CommandEntry(
-        START,
-        "list",
-        "Show what can be named: ours, and what other packages add by entry point.",
-        function="list_entries",
-    ),
-    CommandEntry(
-        GRAPHS,
-        "export",
-        "Write a reference stack: random weights, a checkpoint's, or our driver.",
-    ),
-    CommandEntry(
-        GRAPHS,
-        "inspect",
-        "Show what a graph holds: interface, and nodes, parameters, MACs by module.",
-    ),
-    CommandEntry(
-        GRAPHS,
-        "frames",
-        "Write calibration frames, coherent in time, seen by six cameras.",
-    ),
-    CommandEntry(
-        COMPRESS,
-        "plan",
-        "Show which nodes become int8, which stay float, by which rule, and why.",
-    ),
-    CommandEntry(
-        COMPRESS,
-        "calibrate",
-        "Measure the ranges of every tensor that any scheme, rule set or target needs.",
-    ),
-    CommandEntry(
-        COMPRESS,
-        "compress",
-        "Apply passes to a graph, check each, and write the smaller graph and a"
-        " report.",
-    ),
-    CommandEntry(
-        COMPRESS,
-        "lint",
-        "Check a graph for the runtime that will run it; exit code 1 if it refuses.",
-    ),
-    CommandEntry(
-        COMPRESS,
-        "build",
-        "Build a TensorRT engine of a graph, for the GPU of this machine.",
-    ),
-    CommandEntry(
-        COMPRESS,
-        "sensitivity",
-        "Measure what int8 costs per module and node, and write a recipe within a"
-        " limit.",
-    ),
-    CommandEntry(
-        COMPRESS,
-        "search",
-        "Find the scheme within the budgets that costs the plan, or the road, least.",
-    ),
-    CommandEntry(
-        MEASURE,
-        "compare",
-        "Run two graphs over frames: SQNR of every output, plan displacement in"
-        " metres.",
-    ),
-    CommandEntry(
-        MEASURE,
-        "profile",
-        "Measure a model alone and warm, and write its latencies as a trace.",
-    ),
-    CommandEntry(
-        DRIVE,
-        "evaluate",
-        "Drive a policy over routes of highway-env; run it again to go on.",
-        "highway",
-    ),
-    CommandEntry(
-        DRIVE,
-        "score",
-        "Print driving score, success rate, efficiency, comfort and abilities.",
-    ),
-    CommandEntry(
-        DRIVE,
-        "study",
-        "Drive variants under conditions and compare them; run it again to go on.",
-        "highway",
-    ),
-    CommandEntry(
-        DRIVE,
-        "routes",
-        "Make a fresh set of admitted routes, or examine an existing set again.",
-        "highway",
-    ),
-)
-
-COMMANDS = {entry.name: entry for entry in _ENTRIES}
+COMMANDS = {
+    name: CommandEntry(panel, name, line, "highway" if name in _DRIVING else "")
+    for panel, lines in _PANELS.items()
+    for name, line in lines.items()
+}
 """Commands in the order in which ``--help`` lists them."""
 
 
@@ -237,12 +204,15 @@ Verbose = Annotated[
         expose_value=False,
     ),
 ]
-COMMON = ("quiet", "verbose")
+COMMON = ("quiet", "verbose", "json")
 """Options that stand before or after the name of a command."""
 
 
 def _options(
-    version: Version = False, quiet: Quiet = False, verbose: Verbose = False
+    version: Version = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    json: given.Json = False,
 ) -> None:
     """Make modular end-to-end driving models small, and prove that they drive."""
 

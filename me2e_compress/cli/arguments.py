@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from me2e_compress.cli.verbosity import set_json
+
 Model = Annotated[str, typer.Argument(help="the ONNX file, or highway; not changed")]
 FloatModel = Annotated[str, typer.Argument(help="the ONNX file, or highway; float")]
 AnyModel = Annotated[
@@ -49,8 +51,15 @@ Plugins = Annotated[
 ]
 Threads = Annotated[int, typer.Option(min=0, help="of onnxruntime; 0 takes all")]
 Workers = Annotated[int, typer.Option(min=1, help="processes at a time")]
-Engine = Annotated[str, typer.Option(help="local or ray")]
-Address = Annotated[str | None, typer.Option(help="address of a Ray cluster")]
+Engine = Annotated[str, typer.Option(help="local, ray, or ray:ADDRESS of a cluster")]
+
+
+def engine_and_address(text: str) -> tuple[str, str | None]:
+    """Split ``ray:ADDRESS``; None stands for a cluster of its own, or for none."""
+    name, _, address = text.partition(":")
+    return name, address or None
+
+
 Adapter = Annotated[
     Path | None, typer.Option(help="adapts the model: A.toml, or see list")
 ]
@@ -61,7 +70,17 @@ SetDim = Annotated[
 Force = Annotated[
     bool, typer.Option("--force", help="replace what is there, whoever wrote it")
 ]
-Json = Annotated[bool, typer.Option("--json", help="print one JSON document")]
+
+
+Json = Annotated[
+    bool,
+    typer.Option(
+        "--json",
+        help="print one JSON document",
+        callback=set_json,
+        expose_value=False,
+    ),
+]
 RecipeOutput = Annotated[Path, typer.Option("-o", "--output", help="the RECIPE.toml")]
 TrialScheme = Annotated[
     str,

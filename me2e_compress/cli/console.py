@@ -1,13 +1,10 @@
 """Printing for all commands: results, tables, progress, JSON."""
 
-import dataclasses
 import json
-import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Literal
 
 from rich.console import Console
@@ -21,7 +18,7 @@ from rich.progress import (
 from rich.table import Table as Shown
 from rich.text import Text
 
-from me2e_compress.cli.verbosity import is_quiet, is_verbose
+from me2e_compress.cli.verbosity import is_json, is_quiet, is_verbose
 from me2e_compress.display import duration, printable
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Cell, Result, Table
@@ -83,14 +80,12 @@ def tell(line: str) -> None:
         errors.print(printable(line), soft_wrap=True, markup=False)
 
 
-def show(
-    found: Result, as_json: bool = False, tables: Sequence[Table] | None = None
-) -> None:
-    """Print a result as one JSON document, or as tables and lines.
+def show(found: Result, tables: Sequence[Table] | None = None) -> None:
+    """Print a result as tables and lines, or as one JSON document if asked to.
 
     `tables` are printed instead of the result's own.
     """
-    if as_json:
+    if is_json():
         print_json(found.document())
         return
     # tables first, so that the verdict stays in sight at the end
@@ -208,21 +203,8 @@ def _text(cell: Cell, wide: bool) -> Text:
 
 
 def print_json(data: object) -> None:
-    """Print one JSON document on stdout; numbers that are not finite become null."""
-    sys.stdout.write(json.dumps(_plain(data), indent=2, allow_nan=False) + "\n")
-
-
-def _plain(value: object) -> object:
-    """Turn dataclasses, paths, NaN and infinities into what JSON can hold."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _plain(dataclasses.asdict(value))
-    if isinstance(value, Mapping):
-        return {key: _plain(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(each) for each in value]
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    return str(value) if isinstance(value, Path) else value
+    """Print one JSON document on stdout."""
+    sys.stdout.write(json.dumps(data, indent=2, allow_nan=False) + "\n")
 
 
 EVERY_S = 10.0

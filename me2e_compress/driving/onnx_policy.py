@@ -16,7 +16,7 @@ from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.stack.stack_session import open_session
+from me2e_compress.runtime.stack_session import open_session
 
 
 @dataclass

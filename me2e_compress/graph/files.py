@@ -51,11 +51,6 @@ def load(path: str | Path) -> ir.Model:
     path = Path(path)
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
-    if path.suffix == ".toml":
-        raise GraphError(
-            f"{path}: a TOML file; where it describes a stack of several files, this"
-            " takes one of them"
-        )
     try:
         proto = onnx.load(path, format="protobuf", load_external_data=False)
     except DecodeError as error:

@@ -89,20 +89,44 @@ def _since(node: ir.Node, opset: int) -> int:
     return int(onnx.defs.get_schema(node.op_type, opset, "").since_version)
 
 
-def _rewrite(node: ir.Node, opset: int) -> str | None:
-    """Write a node as the older opset has it; return why that cannot be done."""
+def newer(model: ir.Model, opset: int) -> str | None:
+    """Write the nodes of a graph in a newer opset; return why that cannot be done.
+
+    The import stays as it is; functions keep the opset that they import.
+    """
+    before, known = opset_of(model), onnx.defs.onnx_opset_version()
+    if opset > known:
+        return f"onnx {onnx.__version__} converts to {known} at most"
+    changed = [
+        node
+        for node in model.graph.all_nodes()
+        if _since(node, before) != _since(node, opset)
+    ]
+    if changed:
+        infer_shapes(model)
+    for node in changed:
+        reason = _rewrite(node, before, opset)
+        if reason is not None:
+            called = f"{node.op_type} {node.name!r}"
+            return f"{called} cannot be written in {opset}: {reason}"
+    return None
+
+
+def _rewrite(node: ir.Node, opset: int, wanted: int = NEWEST_OPSET) -> str | None:
+    """Write a node as another opset has it; return why that cannot be done."""
     if has_subgraph(node):
         return "it holds a graph"
     try:
-        older = onnx.version_converter.convert_version(
-            _alone(node, opset), NEWEST_OPSET
-        )
+        older = onnx.version_converter.convert_version(_alone(node, opset), wanted)
     except (onnx.version_converter.ConvertError, RuntimeError) as error:
         return " ".join(str(error).split()).rpartition("failed: ")[2]
     written = older.graph.node
     if len(written) != 1 or written[0].op_type != node.op_type:
         return "it takes several operators"
-    schema = onnx.defs.get_schema(node.op_type, NEWEST_OPSET, "")
+    names = [value.name if value is not None else "" for value in node.inputs]
+    if list(written[0].input) != names:
+        return "its inputs are others"
+    schema = onnx.defs.get_schema(node.op_type, wanted, "")
     kept = {attribute.name for attribute in written[0].attribute}
     for name in list(node.attributes):
         if name not in kept:

@@ -6,8 +6,8 @@ from collections.abc import Collection, Iterator
 import onnx_ir as ir
 
 from me2e_compress.graph import WEIGHTED, static_shape
+from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.quantization.geometry import MATRICES
-from me2e_compress.runtime.recurrence import recurrent_inputs
 
 MOST_NUMBERS = 64
 """In a status: speed, acceleration, steering, pose, command; ``can_bus`` has 18."""

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
+from me2e_compress.graph.recurrence import SessionPort
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import Provider
-from me2e_compress.runtime.recurrence import SessionPort
 
 
 class AnySession(Protocol):

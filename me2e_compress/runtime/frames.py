@@ -1,8 +1,6 @@
 """Frames: the inputs of a model at one moment."""
 
 import dataclasses
-import zipfile
-import zlib
 from collections.abc import Iterator
 from typing import Protocol, TypeAlias
 
@@ -12,20 +10,6 @@ import numpy.typing as npt
 from me2e_compress.runtime.recorded_future import RecordedFuture
 
 Array: TypeAlias = npt.NDArray[np.generic]
-
-UNREADABLE = (
-    OSError,
-    EOFError,
-    ValueError,  # pickled objects, headers that lie
-    SyntaxError,  # or are no Python
-    OverflowError,
-    RecursionError,
-    MemoryError,
-    RuntimeError,  # encrypted, or compressed as zipfile does not know
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""What numpy and zipfile raise on a file that holds no valid arrays."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

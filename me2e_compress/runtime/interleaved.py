@@ -7,6 +7,7 @@ from pathlib import Path
 from statistics import median
 from time import perf_counter, process_time
 
+from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.latency_trace import LatencyTrace
@@ -19,7 +20,6 @@ from me2e_compress.runtime.profile import (
 )
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import replay
-from me2e_compress.runtime.stack.split_stack import digest_of_files
 
 BLOCK = 10
 """Inferences of one model in a row: caches stay warm, and noise that lasts a second
@@ -118,7 +118,7 @@ def record_traces(
     machine = describe_machine(threads, provider)
     return {
         name: LatencyTrace(
-            digest_of_files(path), machine, tuple(kept[name]), others=others.load
+            sha256_of(path), machine, tuple(kept[name]), others=others.load
         )
         for name, path in models.items()
     }

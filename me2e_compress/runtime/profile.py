@@ -8,12 +8,12 @@ from pathlib import Path
 
 from me2e_compress.display import counted
 from me2e_compress.errors import EvaluationError
+from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Array, Frames
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.runtime.session import replay
-from me2e_compress.runtime.stack.split_stack import digest_of_files
-from me2e_compress.runtime.stack.stack_session import open_session
+from me2e_compress.runtime.stack_session import open_session
 
 WARM_UP = 10
 
@@ -45,7 +45,7 @@ def profile(
         on_sample(max(0, done - warm_up), wanted)
     machine = machine_words(threads, provider)
     taken = tuple(session.taken_us[warm_up:])
-    return LatencyTrace(digest_of_files(model), machine, taken)
+    return LatencyTrace(sha256_of(model), machine, taken)
 
 
 def machine_words(threads: int, provider: Provider = CPU) -> str:

@@ -9,6 +9,7 @@ import onnx_ir as ir
 import onnxruntime as ort
 
 from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.graph.recurrence import SessionPort, not_fed_back, recurrence
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.opening import (
@@ -19,7 +20,6 @@ from me2e_compress.runtime.opening import (
     open_graph,
 )
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.recurrence import SessionPort, not_fed_back, recurrence
 
 __all__ = [
     "Level",

@@ -11,7 +11,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import Driver, driver_named
-from me2e_compress.errors import Me2eError, StudyError
+from me2e_compress.errors import GraphError, Me2eError, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.modules import ModuleMap
 from me2e_compress.recipe import to_text
@@ -20,8 +20,8 @@ from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.version import __version__
 from me2e_compress.workflows.compress import CompressOptions, compress
-from me2e_compress.workflows.compress_result import beside
-from me2e_compress.workflows.first_opening import load_interface, try_file
+from me2e_compress.workflows.compress_result import beside, written_model
+from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.zoo.weights_record import named_weights
 
@@ -99,7 +99,7 @@ def prepare_variant(
     origin = source.name, to_text(variant.passes)
     if not variant.passes:
         origin = _reported_beside(model) or origin
-    weights = named_weights(load_interface(model).metadata_props)
+    weights = named_weights(graph.load(model).metadata_props)
     size = graph.file_bytes(model)
     return PreparedVariant(
         variant, driver, model, *origin, sha256, size, weights=weights
@@ -112,7 +112,7 @@ def _reported_beside(model: Path) -> tuple[str, str] | None:
         report = _Report.model_validate_json(beside(model, "report").read_bytes())
         if report.output.sha256 != graph.sha256_of(model):
             return None
-    except (OSError, DecodeError, ValidationError):
+    except (OSError, DecodeError, GraphError, ValidationError):
         return None
     return report.source.file, report.pipeline
 
@@ -137,7 +137,10 @@ def _compressed(
 ) -> Path:
     """Apply the passes, unless a file exists that still matches its report."""
     frames = None if study.frames is None else CalibrationSet(study.frames)
-    path = workspace.model(variant, _key(study, variant, source, frames))
+    output = workspace.model(variant, _key(study, variant, source, frames))
+    if graph.is_stack(source):  # several files in a folder
+        output = output.with_suffix("")
+    path = written_model(source, output)
     if path.is_file() and beside(path, "report").is_file():
         if _reported_beside(path) is not None:
             return path
@@ -157,7 +160,7 @@ def _compressed(
         allow_empty=True,
     )
     heard = Listener(report, listener.on_warning)
-    compress(source, path, variant.passes, study.frames, options, heard)
+    compress(source, output, variant.passes, study.frames, options, heard)
     return path
 
 

@@ -1,8 +1,12 @@
 """Build a TensorRT engine of a graph, where TensorRT is installed."""
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.targets.tensorrt.tensorrt_engine import (
@@ -13,7 +17,7 @@ from me2e_compress.targets.tensorrt.tensorrt_engine import (
 from me2e_compress.workflows.checks import model_path, output_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, counted, megabytes
+from me2e_compress.workflows.result import Result, counted, megabytes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,10 +51,6 @@ class EngineResult(Result):
             f" {found.seconds:.0f} s; it fits this GPU and this version"
         )
 
-    def tables(self) -> tuple[Table, ...]:
-        """Return no table: the headline says everything."""
-        return ()
-
     def records(self) -> list[dict[str, object]]:
         """Return one row."""
         return [{"model": self.model, "output": self.output, **self.to_json()}]
@@ -73,10 +73,11 @@ def build(
 ) -> EngineResult:
     """Build a TensorRT engine of a graph for the GPU of this machine.
 
-    The model is an ONNX file or the name of one that ships.
+    The model is an ONNX file, the TOML of a stack or the name of one that ships.
 
     Raises:
-        GraphError: The model does not exist, or the output would harm an input.
+        GraphError: The model does not exist, the output would harm an input, or other
+            files of a stack run at first frames.
         MissingPackageError: TensorRT is not installed.
         PreconditionError: TensorRT lacks an option, or refuses the graph.
     """
@@ -85,7 +86,8 @@ def build(
     # the engine is written only when it is whole
     with writing([output], (source,), force=options.force):
         listener.on_progress("build", 0, 1, source.name)
-        engine = build_engine(source, options.settings)
+        with _one_file(source) as file:
+            engine = build_engine(file, options.settings)
         try:
             write_bytes(output, engine.content)
         except OSError as error:
@@ -94,3 +96,21 @@ def build(
             ) from error
         listener.on_progress("build", 1, 1, source.name)
     return EngineResult(source, output, engine)
+
+
+@contextmanager
+def _one_file(source: Path) -> Iterator[Path]:
+    """Yield a file of the graph: of a stack, of the joined one."""
+    if not graph.is_stack(source):
+        yield source
+        return
+    stack = graph.JoinedStack.load(source)
+    if stack.first is not None:
+        raise GraphError(
+            f"{source}: another graph runs where a scene begins, and an engine holds"
+            " one: build those of its files"
+        )
+    with TemporaryDirectory(prefix="me2e-build-") as folder:
+        file = Path(folder) / f"{source.stem}.onnx"
+        graph.save(stack.model, file)
+        yield file

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import onnx_ir as ir
 
-from me2e_compress import graph, recipe
+from me2e_compress import drafts, graph, recipe
 from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.exchange import (
     TABLE_FILES,
     read_foreign,
@@ -19,11 +18,14 @@ from me2e_compress.calibration.exchange import (
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import FrameSubset, draw, shard
+from me2e_compress.calibration.stack_frames import StackFrames, recording_of
 from me2e_compress.calibration.statistics import Statistics, merge
 from me2e_compress.errors import FramesError, RecipeError
+from me2e_compress.graph.stack.part_graph import PartGraph
+from me2e_compress.modules import ModuleMap
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.workflows.calibrate_result import CalibrateResult
+from me2e_compress.workflows.calibrate_result import CalibrateResult, beside_ranges
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
     Given,
@@ -33,7 +35,7 @@ from me2e_compress.workflows.checks import (
     output_path,
     read_graph,
 )
-from me2e_compress.workflows.claims import writing
+from me2e_compress.workflows.claims import check_ours, writing
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
@@ -106,9 +108,11 @@ def calibrate(
 ) -> CalibrateResult:
     """Measure the ranges of every tensor that any scheme, rule set or target needs.
 
-    The model is a float ONNX file or the name of one that ships; frames are None to
-    merge shards or to import another tool's ranges. The output is ``RANGES.json``, or
-    ``SHARD.npz`` for a shard. A run that was killed goes on from ``OUTPUT.checkpoint``.
+    The model is a float ONNX file, the TOML of a stack or the name of one that ships;
+    frames are None to merge shards or to import another tool's ranges. The output is
+    ``RANGES.json``, or ``SHARD.npz`` for a shard. A run that was killed goes on from
+    ``OUTPUT.checkpoint``. A file that runs at first frames alone has ranges of its own
+    beside it, ``RANGES.head.first_frame.json``.
 
     Raises:
         FramesError: There is not exactly one source, or frames do not fit.
@@ -124,33 +128,86 @@ def calibrate(
     if options.onnxruntime_table is not None:
         check_folder(Path(options.onnxruntime_table), inputs, TABLE_FILES)
     with writing(outputs, inputs, force=options.force):
-        return _calibrate(source, frames, output, options, listener)
+        ready, part, first = _ready(source, frames, output, options, listener)
+        gc.collect()  # 150 MB of VAD-tiny as it was read; graphs are cycles
+        with drafts.all_or_none():
+            of_first = {
+                label: _calibrate(
+                    _prepared(file.path, file.model, ready.modules.lenient(), options),
+                    _first_part(part, file),
+                    *(beside_ranges(output, label), options, listener),
+                )
+                for label, file in first.items()
+            }
+            found = _calibrate(ready, part, output, options, listener)
+    return dataclasses.replace(found, first_frames=of_first)
 
 
-def _calibrate(
+def _first_files(
+    loaded: graph.LoadedModel, output: Path, options: CalibrateOptions
+) -> Mapping[str, PartGraph]:
+    """Return the files of a stack that run at first frames alone, by label."""
+    found = loaded.first_files
+    check_ours([beside_ranges(output, each) for each in found], force=options.force)
+    if found and (options.shard or options.merge or options.imported):
+        raise FramesError(
+            f"{loaded.path}: --shard, --merge and --import are for one graph, and"
+            f" {', '.join(found)} runs where a scene begins"
+        )
+    return found
+
+
+def _first_part(part: FrameSubset | None, file: PartGraph) -> FrameSubset | None:
+    """Return the first frames of a recording, as a file is fed that runs at them."""
+    if part is None or not isinstance(part.whole, StackFrames):
+        return None
+    whole = part.whole.of_file(file)
+    return FrameSubset(whole, tuple(whole.places))
+
+
+def _ready(
     source: Path,
     frames: str | Path | None,
     output: Path,
     options: CalibrateOptions,
     listener: Listener,
-) -> CalibrateResult:
-    passes = with_sizes(recipe.load(options.recipe), options.dims)
+) -> tuple[PreparedGraph, FrameSubset | None, Mapping[str, PartGraph]]:
+    """Read the graph and its frames, and prepare it for int8."""
     loaded = read_graph(source, listener, options.adapter)
+    first = _first_files(loaded, output, options)
     # frames are read and the graph is opened before any pass runs
-    part = None if frames is None else _part(loaded, Path(frames), options)
+    part = None if frames is None else _part(loaded, frames, options)
     try_first(
-        loaded,
+        loaded.model,
         source.name,
         listener,
-        file=source,
+        file=loaded.file,
         frames=part,
         provider=options.provider,
     )
-    # ranges belong to the graph as the passes before int8 leave it
-    ready = PreparedGraph.of(source, loaded, options.module_map, passes)
+    ready = _prepared(source, loaded.model, options.module_map, options)
+    return ready, part, first
+
+
+def _prepared(
+    source: Path,
+    loaded: ir.Model,
+    modules: str | Path | ModuleMap | None,
+    options: CalibrateOptions,
+) -> PreparedGraph:
+    """Run the passes before int8: ranges belong to the graph as they leave it."""
+    passes = with_sizes(recipe.load(options.recipe), options.dims)
+    return PreparedGraph.of(source, loaded, modules, passes)
+
+
+def _calibrate(
+    ready: PreparedGraph,
+    part: FrameSubset | None,
+    output: Path,
+    options: CalibrateOptions,
+    listener: Listener,
+) -> CalibrateResult:
     tensors = ready.tensors()
-    del loaded  # 150 MB of VAD-tiny; graphs are cycles
-    gc.collect()
     # without frames the ranges come from another tool or from shards
     if part is None:
         found = _given(graph.digest(ready.model), tensors, options)
@@ -207,10 +264,11 @@ def _inputs(
     return (source, frames, *named, *options.merge)
 
 
-def _part(loaded: ir.Model, folder: Path, options: CalibrateOptions) -> FrameSubset:
+def _part(
+    loaded: graph.LoadedModel, folder: str | Path, options: CalibrateOptions
+) -> FrameSubset:
     """Draw frames that fit the model, or one shard of them."""
-    recording = CalibrationSet(folder)
-    recording.check(loaded)
+    recording = recording_of(loaded, folder, options.provider)
     drawn = draw(recording, options.count, options.seed)
     return drawn if options.shard is None else shard(drawn, *_fraction(options.shard))
 

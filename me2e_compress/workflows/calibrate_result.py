@@ -1,10 +1,11 @@
 """The result of a calibration: ranges, or the statistics of one shard."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.workflows.result import Result, Table, counted
+from me2e_compress.workflows.result import Result, counted
 
 _SHOWN = 5
 """Number of tensors of a kind that are listed."""
@@ -12,12 +13,18 @@ _SHOWN = 5
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CalibrateResult(Result):
-    """The range of every tensor; or a shard's statistics, with `ranges` of None."""
+    """The range of every tensor; or a shard's statistics, with `ranges` of None.
+
+    Of a stack, `first_frames` has those of each file for first frames, by label.
+    """
 
     output: Path
     frames: int
     ranges: Ranges | None
     shard: str | None = None
+    first_frames: Mapping[str, "CalibrateResult"] = dataclasses.field(
+        default_factory=dict
+    )
 
     @property
     def headline(self) -> str:
@@ -37,14 +44,11 @@ class CalibrateResult(Result):
         worst = sorted(self.ranges.outliers.items(), key=lambda item: -item[1])
         outliers = [f"{name} (largest / rms {crest:.0f})" for name, crest in worst]
         return (
+            *(line for each in self.first_frames.values() for line in each.lines()),
             self.headline,
             *_first(list(self.ranges.dead), "always zero"),
             *_first(outliers, "a few elements make the range"),
         )
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return no table: the lines say what matters."""
-        return ()
 
     def records(self) -> list[dict[str, object]]:
         """Return one row per tensor."""
@@ -58,7 +62,14 @@ class CalibrateResult(Result):
         """Return the ranges and the tensors that are always zero, or the shard."""
         if self.ranges is None:
             return {"shard": self.shard, "frames": self.frames}
-        return {**dataclasses.asdict(self.ranges), "dead": self.ranges.dead}
+        first = {name: each.to_json() for name, each in self.first_frames.items()}
+        own = {**dataclasses.asdict(self.ranges), "dead": self.ranges.dead}
+        return {**own, "first_frames": first}
+
+
+def beside_ranges(ranges: Path, label: str) -> Path:
+    """Return where the ranges of a file for first frames stand."""
+    return ranges.with_name(f"{ranges.stem}.{label}.json")
 
 
 def _first(names: list[str], what: str) -> tuple[str, ...]:

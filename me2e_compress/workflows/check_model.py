@@ -11,7 +11,7 @@ from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.stack.stack_session import open_session
+from me2e_compress.runtime.stack_session import open_session
 from me2e_compress.workflows.evaluate import driver_of
 from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
@@ -61,10 +61,6 @@ class ModelCheck(Result):
             return f"{self.policy} could not drive"
         return f"{self.policy} could drive, by {self.drives_by}"
 
-    def lines(self) -> tuple[str, ...]:
-        """Return the headline."""
-        return (self.headline,)
-
     def alerts(self) -> tuple[str, ...]:
         """Return the problems."""
         return self.problems
@@ -88,10 +84,7 @@ class ModelCheck(Result):
 
     def to_json(self) -> object:
         """Return everything."""
-        return {"fits": self.fits, **{f.name: getattr(self, f.name) for f in _FIELDS}}
-
-
-_FIELDS = dataclasses.fields(ModelCheck)
+        return {"fits": self.fits, **dataclasses.asdict(self)}
 
 
 def check_model(

@@ -14,9 +14,9 @@ from me2e_compress.driving.adapter.outputs import plan_of
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import EvaluationError, GraphError, RecipeError
 from me2e_compress.graph.opset import lowered
+from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.shapes import unshaped_plugins
 from me2e_compress.modules import ModuleMap, map_of
-from me2e_compress.runtime.recurrence import recurrent_inputs
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.zoo.shipped import SHIPPED, shipped
 
@@ -79,18 +79,21 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
 
 def read_graph(
     path: Path, listener: Listener, adapter: str | Path | None = None
-) -> ir.Model:
+) -> graph.LoadedModel:
     """Read a graph; warn of a lowered opset and of missing shapes.
 
     An adapter's statements become metadata of the graph; see :func:`adapted`.
     """
-    model = graph.load(path)
+    if adapter is not None and graph.is_stack(path):
+        raise RecipeError(f"--adapter is for one file: {path} says state and plan")
+    loaded = graph.LoadedModel.load(path)
+    model = loaded.model
     adapted(model, adapter)
     if said := lowered(model):
         listener.on_warning(f"{path}: {said}: onnxruntime reads no newer")
     if lack := lacking_shapes(model):
         listener.on_warning(f"{path}: {lack}")
-    return model
+    return loaded
 
 
 def lacking_shapes(model: ir.Model) -> str:
@@ -193,6 +196,8 @@ def _weights(given: Path) -> Iterator[Path]:
     """Yield the external weight files of a model; none for other files."""
     try:
         model = graph.load(given)
+        if graph.is_stack(given):
+            yield from graph.paths_of(given)
     except GraphError:  # not a model, or refused before anything is written
         return
     for each in model.graphs():

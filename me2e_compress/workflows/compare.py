@@ -9,11 +9,12 @@ from me2e_compress.fidelity.compare import Fidelity, common_adapter
 from me2e_compress.fidelity.compare import compare as measure
 from me2e_compress.fidelity.matched_sets import SetFidelity
 from me2e_compress.fidelity.open_loop import OpenLoop, OpenLoopTally
+from me2e_compress.graph import LoadedModel
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.stack.stack_session import open_session
+from me2e_compress.runtime.stack_session import open_session
 from me2e_compress.workflows.checks import adapted, model_path
-from me2e_compress.workflows.first_opening import load_interface, try_model
+from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, counted, table
 
@@ -120,10 +121,10 @@ def compare(
     said = dict[Path, dict[str, str]]()
     # each graph must take the frames, and open in another process first
     for path in dict.fromkeys(paths):
-        model = load_interface(path)
-        said[path] = adapted(model, adapter)
-        recording.check(model)
-        try_model(model, path, recording, listener, provider)
+        loaded = LoadedModel.load(path)
+        said[path] = adapted(loaded.model, adapter)
+        recording.check(loaded.model)
+        try_model(loaded, listener, provider, recording)
     total = len(recording)
 
     def reported(frame: Frame) -> Frame:

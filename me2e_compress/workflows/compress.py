@@ -1,4 +1,4 @@
-"""Compress one graph, from file to file."""
+"""Compress a model, from file to file."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -7,9 +7,10 @@ from pathlib import Path
 from time import process_time
 from typing import TypeAlias
 
-import onnx_ir as ir
-
+from me2e_compress import graph
 from me2e_compress import recipe as recipes
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.stack_frames import StackFrames
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import SQNR_FLOOR_DB, Floor
 from me2e_compress.manager import PassManager, Report
@@ -20,6 +21,7 @@ from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.workflows.calibrate_result import beside_ranges
 from me2e_compress.workflows.checks import (
     check_count,
     check_number,
@@ -28,20 +30,20 @@ from me2e_compress.workflows.checks import (
     output_path,
     read_graph,
 )
-from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.compress_fidelity import (
     SplitFrames,
     measure_loss,
+    open_frames,
 )
 from me2e_compress.workflows.compress_result import (
     CompressResult,
+    in_place,
     write_result,
-    written_files,
+    writing_model,
 )
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.zoo.shipped import sample_frames
 
 Recipe: TypeAlias = str | Path | Sequence[Pass]
 """A shipped recipe's name, a TOML file, or passes."""
@@ -169,9 +171,10 @@ def compress(
 ) -> CompressResult:
     """Apply passes to a graph, check each, and write the smaller graph and a report.
 
-    The model is an ONNX file, which is not changed, or the name of one that ships.
-    Without frames exact passes are checked on seeded inputs; a model that ships has its
-    own frames.
+    The model is an ONNX file, which is not changed, the TOML of a stack, or the name of
+    a model that ships. A stack becomes a folder, with a TOML of the same name and the
+    parts' files. Without frames exact passes are checked on seeded inputs; a model that
+    ships has its own frames.
 
     Raises:
         GraphError: The model does not exist, or the output would harm an input.
@@ -190,53 +193,84 @@ def compress(
     # claim the outputs first; Python's cycle collector would walk every node
     inputs = (source, named, frames, options.module_map, options.adapter, *read)
     with (
-        writing(written_files(output), inputs, force=options.force),
+        writing_model(source, output, inputs, force=options.force) as target,
         collector_paused(),
     ):
         loaded = read_graph(source, listener, options.adapter)
-        modules = load_map(options.module_map, loaded)
-        shipped = sample_frames(source) if frames is None else None
-        most = options.measure_frames
-        split = SplitFrames.read(frames, loaded, passes, most, shipped)
-        files = source, output, output.parent
-        return compress_graph(loaded, files, passes, modules, split, options, listener)
+        modules = load_map(options.module_map, loaded.model)
+        seen = open_frames(loaded, frames, options.provider)
+        split = SplitFrames.of(*seen, passes, options.measure_frames)
+        run = Compression(target, output.parent, options, listener)
+        first = _first_frames(run, loaded, seen[0], recipe, modules)
+        found = run.compress(loaded, passes, modules, split)
+    return in_place(dataclasses.replace(found, first_frames=first), output)
 
 
-def compress_graph(
-    loaded: ir.Model,
-    files: tuple[Path, Path, Path],
-    passes: tuple[Pass, ...],
+def _first_frames(
+    run: "Compression",
+    loaded: graph.LoadedModel,
+    seen: CalibrationSet | None,
+    recipe: Recipe | None,
     modules: ModuleMap,
-    frames_of: SplitFrames,
-    options: CompressOptions,
-    listener: Listener,
-) -> CompressResult:
-    """Try, compress, measure and write one graph, whose outputs are claimed already.
+) -> dict[str, CompressResult]:
+    """Compress the files of a stack that run at first frames alone, one by one."""
+    found, options = dict[str, CompressResult](), run.options
+    for label, file in loaded.first_files.items():
+        # each has its own frames, ranges and output
+        fed = seen.of_file(file) if isinstance(seen, StackFrames) else None
+        ranges = options.ranges and beside_ranges(Path(options.ranges), label)
+        own = dataclasses.replace(options, ranges=ranges, allow_empty=True)
+        passes, draft = own.passes(recipe), run.output.with_name(f"{label}.onnx")
+        split = SplitFrames.of(fed, None, passes, options.measure_frames)
+        each = dataclasses.replace(run, output=draft, options=own)
+        model = graph.LoadedModel(file.path, file.model)
+        found[label] = each.compress(model, passes, modules.lenient(), split)
+    return found
 
-    `files` are the source, the output and the folder for the reproducer of a failing
-    pass; `passes` come from :meth:`CompressOptions.passes`. Errors are those of
-    :func:`compress`.
+
+@dataclasses.dataclass(frozen=True)
+class Compression:
+    """One graph to compress, whose outputs are claimed already.
+
+    `reproducers` is the folder for the reproducer of a failing pass.
     """
-    start = process_time()
-    source, output, reproducers = files
-    seen = frames_of.calibration or frames_of.samples
-    first = partial(try_first, listener=listener, provider=options.provider)
-    first(loaded, source.name, file=source, frames=seen)
-    # apply the passes, and refuse a result that is unproven or not int8
-    context = Context(modules, frames_of.calibration, options.seed, options.provider)
-    manager = PassManager(
-        passes, options.verify_frames, reproducers, frames_of.samples, first
-    )
-    report = manager.run(loaded, context, partial(listener.on_progress, "passes"))
-    _refuse_unproven(report, options)
-    int8 = Int8Outcome.of(report, context)
-    _refuse_empty(int8, options, listener)
-    # measure what lossy passes cost, on the frames kept for it
-    if report.lossy and frames_of.measured is not None:
-        first(report.model, output.name)
-    loss = measure_loss(report, context, frames_of, Floor(options.floor), listener)
-    seconds = process_time() - start
-    return write_result(report, source, output, int8, loss, seconds)
+
+    output: Path
+    reproducers: Path
+    options: CompressOptions
+    listener: Listener
+
+    def compress(
+        self,
+        loaded: graph.LoadedModel,
+        passes: tuple[Pass, ...],
+        modules: ModuleMap,
+        frames: SplitFrames,
+    ) -> CompressResult:
+        """Try, compress, measure and write; errors are those of :func:`compress`.
+
+        `passes` come from :meth:`CompressOptions.passes`.
+        """
+        start, options, listener = process_time(), self.options, self.listener
+        source, model = loaded.path, loaded.model
+        seen = frames.calibration or frames.samples
+        first = partial(try_first, listener=listener, provider=options.provider)
+        first(model, source.name, file=loaded.file, frames=seen)
+        # apply the passes, and refuse a result that is unproven or not int8
+        context = Context(modules, frames.calibration, options.seed, options.provider)
+        manager = PassManager(
+            passes, options.verify_frames, self.reproducers, frames.samples, first
+        )
+        report = manager.run(model, context, partial(listener.on_progress, "passes"))
+        _refuse_unproven(report, options)
+        int8 = Int8Outcome.of(report, context)
+        _refuse_empty(int8, options, listener)
+        # measure what lossy passes cost, on the frames kept for it
+        if report.lossy and frames.measured is not None:
+            first(report.model, self.output.name)
+        loss = measure_loss(report, context, frames, Floor(options.floor), listener)
+        seconds = process_time() - start
+        return write_result(report, loaded, self.output, int8, loss, seconds)
 
 
 def _refuse_unproven(report: Report, options: CompressOptions) -> None:

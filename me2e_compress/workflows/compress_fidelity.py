@@ -1,7 +1,7 @@
 """Measure what lossy passes did to a model, on frames kept out of calibration."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,25 +11,39 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.sample import hold_out
+from me2e_compress.calibration.stack_frames import recording_of
 from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import EvaluationError, FramesError, GraphError, Me2eError
 from me2e_compress.fidelity.compare import Fidelity, Reference
-from me2e_compress.fidelity.floor import Floor, Shortfall, unsteady_outputs
+from me2e_compress.fidelity.floor import Floor, unsteady_outputs
+from me2e_compress.graph import LoadedModel
 from me2e_compress.manager import Report
 from me2e_compress.manager.report import LossyPass
 from me2e_compress.passes import Context, Pass
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.quantization.plan.overrides import Override, overrides_text
 from me2e_compress.runtime.frames import Frames
+from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
-from me2e_compress.sensitivity.remedy import Remedy, find_remedy
+from me2e_compress.sensitivity.remedy import find_remedy
 from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.measured_loss import NOT_ASKED, MeasuredLoss
+from me2e_compress.zoo.shipped import sample_frames
 
 KEPT_OUT = "kept out of calibration"
 SHARED = "calibrated on as well: there is no other"
 PERHAPS_SHARED = "that the saved ranges may have been measured on"
 SHIPPED_FRAMES = "that ship with the model"
-NOT_ASKED = "--measure-frames 0"
+
+
+def open_frames(
+    loaded: LoadedModel, folder: str | Path | None, provider: Provider
+) -> tuple[CalibrationSet | None, CalibrationSet | None]:
+    """Open and check the recording, or the frames that ship with the model."""
+    if folder is not None:
+        return recording_of(loaded, folder, provider), None
+    shipped = sample_frames(loaded.path)
+    return None, None if shipped is None else CalibrationSet(shipped)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,64 +61,26 @@ class SplitFrames:
     samples: CalibrationSet | None = None
 
     @classmethod
-    def read(
+    def of(
         cls,
-        folder: str | Path | None,
-        model: ir.Model,
-        passes: Iterable[Pass],
+        recording: CalibrationSet | None,
+        samples: CalibrationSet | None,
+        passes: Sequence[Pass],
         most: int,
-        shipped: Path | None = None,
     ) -> "SplitFrames":
-        """Read and check frames; for lossy passes up to `most` are kept to measure on.
+        """Keep up to `most` frames to measure on, where a pass is lossy.
 
-        Nothing is kept out of calibration where ranges are saved. Without a `folder`
-        the `shipped` frames are used, if there are any.
+        Nothing is kept out of calibration where ranges are saved.
         """
-        recording = samples = None
-        if folder is not None:
-            recording = CalibrationSet(Path(folder))
-            recording.check(model)
-        elif shipped is not None:
-            samples = CalibrationSet(shipped)
-        pipeline = tuple(passes)
-        if not most or all(each.exact for each in pipeline):
+        if not most or all(each.exact for each in passes):
             return cls(recording, None, NOT_ASKED, samples)
         if recording is None:
             reason = "no recorded frames" if samples is None else SHIPPED_FRAMES
             return cls(None, samples, reason, samples)
         calibration, measured = hold_out(recording, most)
-        if any(each.reads_ranges and not each.needs_frames for each in pipeline):
+        if any(each.reads_ranges and not each.needs_frames for each in passes):
             return cls(recording, measured, PERHAPS_SHARED)
         return cls(calibration, measured, SHARED if len(recording) == 1 else KEPT_OUT)
-
-
-@dataclasses.dataclass(frozen=True)
-class MeasuredLoss:
-    """How true a compressed model stayed, and where it did not.
-
-    Attributes:
-        fidelity: to the graph before the first lossy pass; None if not
-            measured.
-        on: which frames, or why nothing was measured; in words.
-        incomparable: whether an output is not finite; or of another shape than before.
-        unsteady: outputs that are not judged, with their dB or metres: the uncompressed
-            model itself falls that low when its largest input is rounded to int8.
-        shortfalls: outputs below the floor; the worst first.
-        guilty: the passes that cause the shortfalls.
-        remedy: what would restore the quality; None if nothing was searched, because
-            another pass is guilty, or the one that quantizes takes no overrides.
-        seconds: CPU time of measuring and searching.
-    """
-
-    fidelity: Fidelity | None
-    on: str
-    floor: Floor
-    unsteady: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    shortfalls: tuple[Shortfall, ...] = ()
-    guilty: tuple[str, ...] = ()
-    remedy: Remedy | None = None
-    seconds: float = 0.0
-    incomparable: bool = False
 
 
 def measure_loss(

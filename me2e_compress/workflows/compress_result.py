@@ -1,24 +1,23 @@
 """The result of a compression: the graph, the report and their tables."""
 
 import dataclasses
-import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 from me2e_compress import drafts, graph
+from me2e_compress.errors import GraphError
 from me2e_compress.manager import Report
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.quantization.plan import plan_of, save_plan
 from me2e_compress.runtime.atomic import write_document
-from me2e_compress.workflows.compress_fidelity import MeasuredLoss
-from me2e_compress.workflows.compress_verdict import (
-    alerts,
-    fidelity_table,
-    verdict,
-    weights_table,
-)
+from me2e_compress.workflows.checks import Given, check_folder
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.int8_outcome import Int8Outcome
-from me2e_compress.workflows.result import Result, Table, megabytes
+from me2e_compress.workflows.measured_loss import MeasuredLoss
+from me2e_compress.workflows.result import Result, Table, megabytes, plain
 from me2e_compress.zoo.weights_record import named_weights
 
 
@@ -34,6 +33,7 @@ class CompressResult(Result):
         int8: what became int8 and what did not; None where no pass quantizes.
         loss: how true the graph stayed; None where every pass is exact.
         seconds: CPU time of everything but the writing.
+        first_frames: of a stack, how each file for first frames came to be, by label.
     """
 
     source: Path
@@ -45,6 +45,9 @@ class CompressResult(Result):
     int8: Int8Outcome | None = None
     loss: MeasuredLoss | None = None
     seconds: float = 0.0
+    first_frames: Mapping[str, "CompressResult"] = dataclasses.field(
+        default_factory=dict
+    )
 
     @property
     def report_path(self) -> Path:
@@ -69,22 +72,42 @@ class CompressResult(Result):
 
     def tables(self) -> tuple[Table, ...]:
         """Return each pass with its changes and its check, then the fidelity."""
-        measured = None if self.loss is None else fidelity_table(self.loss)
+        measured = None if self.loss is None else self.loss.table()
         return (*self.report.tables(), *filter(None, [measured]))
 
     def details(self) -> tuple[Table, ...]:
         """Return the largest weights that stay float."""
-        weights = None if self.int8 is None else weights_table(self.int8)
+        weights = None if self.int8 is None else self.int8.table()
         return tuple(filter(None, [weights]))
 
     def lines(self) -> tuple[str, ...]:
         """Return the verdict: int8, how far outputs and plan moved, time and size."""
-        said = (*verdict(self.report, self.int8, self.loss), self._time, self.headline)
-        return (*said, *filter(None, [self.weights]))
+        first = (
+            f"{name}: {line}"
+            for name, each in self.first_frames.items()
+            for line in each.verdict()
+        )
+        said = (*first, *self.verdict(), self._time, self.headline, self.weights)
+        return tuple(filter(None, said))
 
     def alerts(self) -> tuple[str, ...]:
         """Return warnings: nothing became int8, or quality is below the floor."""
-        return tuple(alerts(self.int8, self.loss))
+        first = (
+            f"{name}: {said}"
+            for name, each in self.first_frames.items()
+            for said in each.alerts()
+        )
+        empty = "" if self.int8 is None else self.int8.empty
+        lost = () if self.loss is None else self.loss.alerts()
+        return (*filter(None, [empty]), *lost, *first)
+
+    def verdict(self) -> Iterator[str]:
+        """Yield what became int8, what is proven, and how far the outputs moved."""
+        if self.int8 is not None:
+            yield self.int8.line
+        yield from _proof(self.report)
+        if self.loss is not None:
+            yield from self.loss.lines()
 
     @property
     def _time(self) -> str:
@@ -108,9 +131,24 @@ class CompressResult(Result):
             for step in self.report.steps
         ]
 
+    def findings(self) -> dict[str, Any]:
+        """Return weights, int8, fidelity and verdict for the report, without times.
+
+        The same run thus writes the same file; numbers that are not finite become null.
+        """
+        found = {
+            "weights": self.weights,
+            "int8": self.int8,
+            "fidelity": None if self.loss is None else self.loss.record(),
+            "verdict": [*self.verdict(), *self.alerts()],
+        }
+        return {name: plain(each) for name, each in found.items()}
+
     def to_json(self) -> object:
         """Return the report file's content except the verdict, which `lines` has."""
-        return {key: each for key, each in self.record.items() if key != "verdict"}
+        held = {key: each for key, each in self.record.items() if key != "verdict"}
+        first = {name: each.to_json() for name, each in self.first_frames.items()}
+        return {**held, "first_frames": first}
 
 
 def beside(output: Path, what: str) -> Path:
@@ -118,42 +156,30 @@ def beside(output: Path, what: str) -> Path:
     return output.with_name(f"{output.stem}.{what}.json")
 
 
-def loss_record(
-    report: Report, int8: Int8Outcome | None, loss: MeasuredLoss | None
-) -> dict[str, object]:
-    """Return the report's int8, fidelity and verdict, without times.
-
-    The same run thus writes the same file; numbers that are not finite become null.
-    """
-    return {
-        "int8": None if int8 is None else dataclasses.asdict(int8),
-        "fidelity": None if loss is None else fidelity_record(loss),
-        "verdict": [*verdict(report, int8, loss), *alerts(int8, loss)],
-    }
-
-
-def fidelity_record(loss: MeasuredLoss) -> dict[str, object]:
-    """Return the report's fidelity; numbers that are not finite become null."""
-    remedy = loss.remedy
-    found = dataclasses.asdict(dataclasses.replace(loss, remedy=None))
-    del found["seconds"]
-    if remedy is not None:
-        found["remedy"] = dataclasses.asdict(remedy) | {"overrides": remedy.overrides()}
-    return {name: _finite(value) for name, value in found.items()}
-
-
-def _finite(value: object) -> object:
-    """Replace numbers that are not finite, at any depth, by None."""
-    if isinstance(value, Mapping):
-        return {key: _finite(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(each) for each in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+def _proof(report: Report) -> Iterator[str]:
+    """Say how far exact passes moved the outputs, and what is not proven."""
+    judged = [
+        (check.errors[name], check.fed)
+        for check in report.verifications
+        for name in check.judged
+    ]
+    # with lossy passes in the pipeline, sameness is not the claim
+    if judged and not report.lossy:
+        worst, inputs = max(judged)
+        near = f" to within {worst:.1e} of its largest value" if worst else ""
+        yield f"every output is the same{near} ({inputs})"
+    if not any(step.changes for step in report.steps):
+        yield "every output is the same: no pass changed anything"
+    # what could not be proven is said too
+    for check in report.verifications:
+        if check.unproven is not None:
+            yield f"not proven: {', '.join(check.passes)}: {check.unproven}"
+        elif check.left_out:
+            yield f"not proven of every output: {check.left_out}"
+        yield from check.remarks
 
 
-def written_files(output: Path) -> tuple[Path, ...]:
+def _written_files(output: Path) -> tuple[Path, ...]:
     """Return every file that may be written for a compressed graph."""
     return (
         output,
@@ -163,9 +189,57 @@ def written_files(output: Path) -> tuple[Path, ...]:
     )
 
 
+@contextmanager
+def writing_model(
+    source: Path, output: Path, inputs: Iterable[Given], *, force: bool
+) -> Iterator[Path]:
+    """Claim what is written of a model; yield where its graph goes.
+
+    Of a stack that is the TOML of a draft, which takes the place of a folder at the
+    end.
+
+    Raises:
+        GraphError: The output would harm an input, or is no folder for a stack.
+    """
+    if not graph.is_stack(source):
+        with writing(_written_files(output), inputs, force=force):
+            yield output
+        return
+    if output.suffix in (".onnx", ".toml"):
+        raise GraphError(f"{output}: a stack is written as a folder: name one")
+    check_folder(output, (*graph.paths_of(source), *inputs))
+    with writing(trees=[output], force=force):
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=output.parent, prefix=f".{output.name}.") as folder:
+            draft = Path(folder) / output.name
+            draft.mkdir()
+            try:
+                yield draft / source.name
+            except GraphError as error:
+                raise GraphError(str(error).replace(str(draft), str(output))) from error
+            drafts.put(draft, output)
+
+
+def written_model(source: Path, output: Path) -> Path:
+    """Return the file that opens what was written: of a stack, the TOML."""
+    return output / source.name if graph.is_stack(source) else output
+
+
+def in_place(found: CompressResult, output: Path) -> CompressResult:
+    """Return a result whose files are named where they are once the draft is put."""
+    if not graph.is_stack(found.source):
+        return found
+    first = {
+        label: dataclasses.replace(each, output=output / each.output.name)
+        for label, each in found.first_frames.items()
+    }
+    written = written_model(found.source, output)
+    return dataclasses.replace(found, output=written, first_frames=first)
+
+
 def write_result(
     report: Report,
-    source: Path,
+    loaded: graph.LoadedModel,
     output: Path,
     int8: Int8Outcome | None,
     loss: MeasuredLoss | None,
@@ -173,13 +247,13 @@ def write_result(
 ) -> CompressResult:
     """Write the graph and its plan, then the report, which vouches for both."""
     plan = plan_of(report.model)  # before writing: metadata may be malformed
-    weights = {"weights": named_weights(report.model.metadata_props)}
+    source = loaded.path
     with drafts.all_or_none():
-        graph.save(with_own_domains(report.model), output)
+        loaded.save(with_own_domains(report.model), output)
         if plan is not None:
             save_plan(plan, beside(output, "plan"))
-        about = weights | loss_record(report, int8, loss)
-        record = report.record(source, output) | about
+        sizes = graph.file_bytes(source), graph.file_bytes(output)
+        made = CompressResult(source, output, report, {}, *sizes, int8, loss, seconds)
+        record = report.record(source, output) | made.findings()
         write_document(beside(output, "report"), record, indent=2)
-    sizes = graph.file_bytes(source), graph.file_bytes(output)
-    return CompressResult(source, output, report, record, *sizes, int8, loss, seconds)
+    return dataclasses.replace(made, record=record)

@@ -10,7 +10,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.interleaved import RunTimes, time_interleaved
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.runtime.session import Session
-from me2e_compress.workflows.checks import MOST_THREADS, check_count, check_folder
+from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.compare import CompareResult, compare
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import CompressResult
@@ -23,6 +23,8 @@ from me2e_compress.workflows.result import Result, Table, megabytes, table
 CALIBRATION_FRAMES, HELD_OUT_FRAMES = 8, 4
 SCENE_LENGTH = 4
 CALIBRATION_SEED, HELD_OUT_SEED = 0, 1
+ROUNDS, THREADS = 4, 2
+"""How latencies are measured: rounds of all files, and threads of onnxruntime."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -116,15 +118,12 @@ class StackDemo:
     stack: str
     out: Path
     recipe_name: str = "full-fused"
-    rounds: int = 4
-    threads: int = 2
     provider: Provider = CPU
     force: bool = False
     _compared: list[CompareResult] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
         recipe.load(self.recipe_name)
-        check_count("--threads", self.threads, most=MOST_THREADS)
         check_folder(self.out, ())
 
     @property
@@ -187,19 +186,17 @@ class StackDemo:
         paths = {path.name: path for path in (self._source, exact, self._small)}
         # all files run in turn on one frame, so that noise meets each alike
         sessions = {
-            name: Session(
-                path, threads=self.threads, release=True, provider=self.provider
-            )
+            name: Session(path, threads=THREADS, release=True, provider=self.provider)
             for name, path in paths.items()
         }
         frame = CalibrationSet(self._held_out)[0]
         progress = partial(listener.on_progress, "latency")
-        times = time_interleaved(sessions, [frame], self.rounds, progress)
+        times = time_interleaved(sessions, [frame], ROUNDS, progress)
         report = self._small.with_name(self._small.stem + ".report.json")
         return FilesResult(
             {paths[name]: each for name, each in times.items()},
-            self.threads,
-            self.rounds,
+            THREADS,
+            ROUNDS,
             f"{self._small} and {report} are yours.",
             self._compared[-1].headline if self._compared else "plan: not measured",
             self.provider,

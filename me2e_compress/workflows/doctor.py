@@ -69,10 +69,6 @@ class DoctorResult(Result):
         """Return one row per thing."""
         return [dataclasses.asdict(each) for each in self.checkups]
 
-    def to_json(self) -> object:
-        """Return all checkups."""
-        return {"checkups": self.records()}
-
 
 def doctor() -> DoctorResult:
     """Look for everything that the toolkit can make use of."""

@@ -1,14 +1,15 @@
 """Weights and scales of EER_AV in a file, for later calls to score alike."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field, TypeAdapter, with_config
 
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.eer import MEASURES, EerScale, Normalization
+from me2e_compress.metrics.eer import MEASURES, EerResult, EerScale, Normalization
 from me2e_compress.runtime.atomic import write_json
 
 Kind = Literal["measured", "modelled"]
@@ -58,17 +59,19 @@ class SavedWeights:
         )
         return EerScale(self.normalization, weights, offset, span)
 
-    def save(self, path: Path) -> None:
-        """Write the weights; raise EvaluationError if that fails."""
-        try:
-            write_json(path, self.to_json(), indent=1)
-        except OSError as error:
-            said = f"{path}: cannot be written: {error.strerror}"
-            raise EvaluationError(said) from error
 
-    def to_json(self) -> dict[str, Any]:
-        """Return every attribute by name."""
-        return dataclasses.asdict(self)
+def save_weights(path: Path, found: Mapping[Kind, EerResult]) -> None:
+    """Write the scale of measured joules, or of modelled ones where there are none."""
+    kind, result = next(iter(found.items()))
+    if result.scale is None:
+        reason = next(iter(result.scores.values())).measure.reason
+        raise EvaluationError(f"{path}: there are no weights to save: {reason}")
+    saved = SavedWeights.of(result.scale, kind)
+    try:
+        write_json(path, dataclasses.asdict(saved), indent=1)
+    except OSError as error:
+        said = f"{path}: cannot be written: {error.strerror}"
+        raise EvaluationError(said) from error
 
 
 _FILE = TypeAdapter(SavedWeights)

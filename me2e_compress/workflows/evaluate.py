@@ -11,13 +11,14 @@ from me2e_compress.evaluators.highway.evaluator import DrivingOptions, DrivingPr
 from me2e_compress.evaluators.highway.results import MANIFEST, log_beside
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.extras import need_extra
-from me2e_compress.metrics.deadlines import charged
+from me2e_compress.metrics.deadlines import Deadlines, charged
+from me2e_compress.metrics.scores import Scores
 from me2e_compress.metrics.scores import score as score_episodes
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.workflows.checks import check_folder, check_number, model_path
 from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.evaluate_result import EvaluateResult
+from me2e_compress.workflows.deadlines_table import deadlines_table
 from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.other_evaluators import (
@@ -29,7 +30,8 @@ from me2e_compress.workflows.other_evaluators import (
     is_highway,
     keep,
 )
-from me2e_compress.workflows.result import number
+from me2e_compress.workflows.result import Result, Table, number
+from me2e_compress.workflows.score import driving_score, score_records, scores_table
 from me2e_compress.zoo.shipped import SHIPPED
 
 _FLAGS = {"frame_limit_s": "frame-limit"}
@@ -67,6 +69,50 @@ class EvaluateOptions(DrivingOptions):
                     f"--{option} is highway's: give {self.evaluator} options of its "
                     "own, name{option=value}; `list evaluators` names them"
                 )
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class EvaluateResult(Result):
+    """How a policy drives.
+
+    Attributes:
+        policy: the policy as named, or the evaluator where that drives none.
+        late: latencies charged to decisions, against the frame time; None if none were.
+    """
+
+    policy: str
+    output: Path
+    scores: Scores
+    pictures: tuple[Path, ...] = ()
+    late: Deadlines | None = None
+
+    @property
+    def headline(self) -> str:
+        """The policy, its driving score and the routes."""
+        return f"{self.policy}: {driving_score(self.scores)}"
+
+    def lines(self) -> tuple[str, ...]:
+        """Return no line: the table says everything."""
+        return ()
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return the routes that ended by a failure."""
+        return tuple(filter(None, [self.scores.failed]))
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return every score with its interval, and the latencies charged."""
+        late = None if self.late is None else deadlines_table(self.policy, self.late)
+        scores = scores_table(self.policy, self.scores)
+        return (scores,) if late is None else (scores, late)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return one row per score."""
+        return score_records(self.scores)
+
+    def to_json(self) -> object:
+        """Return the scores, and the latencies charged to decisions."""
+        late = None if self.late is None else self.late.to_json()
+        return {**self.scores.to_json(), "deadlines": late}
 
 
 def evaluate(

@@ -3,7 +3,6 @@
 import dataclasses
 import tempfile
 from pathlib import Path
-from typing import Literal
 
 import onnx_ir as ir
 
@@ -11,7 +10,6 @@ from me2e_compress import graph, rewrite
 from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.graph import file_bytes
 from me2e_compress.operators import (
-    OWN_DOMAIN,
     dialect_of,
     fused_nodes,
     import_domains,
@@ -22,7 +20,7 @@ from me2e_compress.passes.fold_constants.knowledge import Sweep
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.workflows.checks import check_count
 from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.result import Result, Table, megabytes
+from me2e_compress.workflows.result import Result, megabytes
 from me2e_compress.zoo import export as exporter
 from me2e_compress.zoo import shipped
 from me2e_compress.zoo.published_weights import PublishedWeights, published_weights
@@ -42,9 +40,8 @@ class ExportOptions:
             ``bench2drive`` or ``beta`` of tcp; None is the first.
         seed: seed of the initial weights; None is 0.
         force: replace outputs that we did not write, too.
-        operators: ``plugin`` writes deformable attention as one node.
-        dialect: plugin library whose form that node has; None is the toolkit's own
-            form.
+        dialect: plugin library in whose form deformable attention is one node, or the
+            toolkit's own, ``me2e``; None writes it in standard operators.
         weights: checkpoint of the stack's original; None draws weights from the seed.
         ema: take the checkpoint's moving averages (``ema_...``), not its parameters.
     """
@@ -53,7 +50,6 @@ class ExportOptions:
     heads: str | None = None
     seed: int | None = None
     force: bool = False
-    operators: Literal["standard", "plugin"] = "standard"
     dialect: str | None = None
     weights: Path | None = None
     ema: bool = False
@@ -65,8 +61,6 @@ class ExportOptions:
         if self.ema and self.weights is None:
             raise RecipeError("--ema needs --weights")
         names = [each.name for each in DeformableAttention().all_dialects()]
-        if self.dialect is not None and self.operators != "plugin":
-            raise RecipeError(f"--dialect {self.dialect} needs --operators plugin")
         if self.dialect is not None and self.dialect not in names:
             raise RecipeError(
                 f"--dialect {self.dialect}: no library of deformable attention; there"
@@ -102,10 +96,6 @@ class ExportResult(Result):
         said = () if self.weights is None else self.weights.lines()
         images = (_IMAGES,) if said and self.stack == "vad-tiny" else ()
         return (self.headline, *said, *images)
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return no table: the lines say everything."""
-        return ()
 
     def records(self) -> list[dict[str, object]]:
         """Return one row: the file."""
@@ -151,10 +141,10 @@ def export_stack(
 def _exported(stack: str, output: Path, options: ExportOptions) -> ExportResult:
     weights = _read(stack, options)
     # torch writes our own operator, which is translated to the dialect afterwards
-    if options.operators == "plugin":
+    if options.dialect is not None:
         with tempfile.TemporaryDirectory(prefix="me2e-export-") as folder:
             own = _written(stack, Path(folder, "own.onnx"), options, weights)
-            model = in_dialect(graph.load(own), options.dialect or OWN_DOMAIN)
+            model = in_dialect(graph.load(own), options.dialect)
             output.parent.mkdir(parents=True, exist_ok=True)
             graph.save(model, output)
     else:
@@ -180,7 +170,7 @@ def _written(
         opset=options.opset,
         seed=options.seed or 0,
         heads=options.heads,
-        fused=options.operators == "plugin",
+        fused=options.dialect is not None,
         weights=weights,
     )
 
@@ -236,7 +226,7 @@ def _refuse(stack: str, options: ExportOptions) -> None:
         "--seed": options.seed is not None,
         "--heads": options.heads is not None,
         "--weights": options.weights is not None,
-        "--operators": options.operators == "plugin",
+        "--dialect": options.dialect is not None,
         f"--opset {options.opset}": options.opset != OPSET,
     }
     given = [option for option, is_given in chosen.items() if is_given]

@@ -23,13 +23,13 @@ import platformdirs
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
+from me2e_compress.graph import LoadedModel
 from me2e_compress.operators.kernels import why_not
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array, Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import compiled_or_expanded, unsupported
-from me2e_compress.runtime.stack.split_stack import SplitStack, is_stack
 from me2e_compress.workflows.listener import Listener
 
 STAGE = "first opening"
@@ -68,45 +68,34 @@ def try_first(
         listener.on_progress(STAGE, 1, 1, f"{name}: {seconds:.1f} s")
 
 
-def load_interface(file: Path) -> ir.Model:
-    """Read an ONNX file; of a stack its inputs and outputs, without nodes."""
-    return SplitStack.load(file).interface() if is_stack(file) else graph.load(file)
-
-
 def try_model(
-    model: ir.Model,
-    file: Path,
-    frames: Frames,
+    loaded: LoadedModel,
     listener: Listener,
     provider: Provider = CPU,
+    frames: Frames | None = None,
 ) -> None:
-    """Open a file, or each of a stack, in another process; see :func:`try_first`.
+    """Open a model in another process, and run its first frame; see :func:`try_first`.
 
-    `model` comes from :func:`load_interface`.
+    Of a stack the joined graph, and that for first frames, are opened and not run.
     """
-    if is_stack(file):
-        try_file(file, listener, provider)
+    name, stack = loaded.path.name, loaded.stack
+    opened = partial(try_first, listener=listener, provider=provider)
+    if stack is None:
+        opened(loaded.model, name, file=loaded.path, frames=frames)
         return
-    try_first(model, file.name, listener, file=file, frames=frames, provider=provider)
+    for each in filter(None, (stack.model, stack.first)):
+        opened(each, name)
 
 
 def try_file(file: Path, listener: Listener, provider: Provider = CPU) -> None:
-    """Open the graph of a file, or each of a stack, in another process.
-
-    The graphs are not run.
-    """
+    """Open the graph of a file, or both of a stack, in another process."""
     if provider != CPU:
         return
-    # a stack's files are tried one by one
-    if is_stack(file):
-        for each in SplitStack.load(file).files.values():
-            try_file(each.path, listener, provider)
-        return
     try:
-        model = graph.load(file)
+        loaded = LoadedModel.load(file)
     except GraphError:
         return  # who opens it says what is wrong
-    try_first(model, file.name, listener, file=file)
+    try_model(loaded, listener)
 
 
 def try_apart(

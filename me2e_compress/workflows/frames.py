@@ -18,9 +18,9 @@ from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.extras import need_extra
+from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.stack.split_stack import digest_of_files
 from me2e_compress.version import __version__
 from me2e_compress.workflows.adapted_log import AdaptedInputs
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
@@ -28,7 +28,7 @@ from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.logged_inputs import inputs_of_model, inputs_of_stack
-from me2e_compress.workflows.result import Result, Table, counted
+from me2e_compress.workflows.result import Result, counted
 from me2e_compress.zoo.stacks import STACKS, find
 from me2e_compress.zoo.synthetic_frames import frames as synthetic
 
@@ -85,10 +85,6 @@ class FramesResult(Result):
         log, seed = self.options.log, self.options.seed
         said = f"{self.output}: {counted(self.count, 'frame')} of {self.stack}"
         return f"{said}, {f'seed {seed}' if log is None else f'from {LOGS.text(log)}'}"
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return no table: the headline says everything."""
-        return ()
 
     def records(self) -> list[dict[str, object]]:
         """Return one row: the recording."""
@@ -150,7 +146,7 @@ def _recorded(
     elif _drives(source, options):
         model = model_path(source)
         try_file(model, listener, options.provider)
-        make, of = _driven(model, options), digest_of_files(model)
+        make, of = _driven(model, options), sha256_of(model)
     else:
         make, of = _synthetic(str(source), options), str(source)
     # a recording is continued only if the sources and the adapter are the same
@@ -177,12 +173,12 @@ def _logged(
     # the model's inputs follow from its adapter, its metadata or the zoo
     if options.adapter is not None and _drives(source, options):
         path = model_path(source)
-        model, of = AdaptedInputs(_policy(path, options)), digest_of_files(path)
+        model, of = AdaptedInputs(_policy(path, options)), sha256_of(path)
         log = model.log_for(log)
     elif Path(source).is_file():
         model, of = (
             inputs_of_model(Path(source), log.size),
-            digest_of_files(Path(source)),
+            sha256_of(Path(source)),
         )
     else:
         model, of = inputs_of_stack(find(str(source))), str(source)

@@ -19,6 +19,7 @@ from me2e_compress.quantization.plan import (
     plan_of,
     savable_bytes,
 )
+from me2e_compress.workflows.result import Table, counted, megabytes, table
 
 LEAST_BYTES = 1024
 """Smaller constants are not worth a word."""
@@ -91,8 +92,10 @@ def _float_weight(value: ir.Value, decision: Decision, kept: str | None) -> Floa
     )
 
 
-LISTED = 10
-"""Number of float weights that a report lists."""
+LISTED, SHOWN = 10, 5
+"""Numbers of float weights that a report lists, and that a table shows."""
+LEAST_SHOWN = 10_000
+"""Bytes of float weights from which on a rule is named."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,6 +149,34 @@ class Int8Outcome:
         )
 
     @property
+    def line(self) -> str:
+        """How many nodes became int8, and which weights did not."""
+        said = f"int8: {counted(self.nodes, 'node')}"
+        if self.float_bytes:
+            rules = ", ".join(
+                f"{rule} {megabytes(count)}"
+                for rule, count in self.float_bytes.items()
+                if count >= LEAST_SHOWN
+            )
+            total = megabytes(sum(self.float_bytes.values()))
+            said += f"; {total} MB of weights stay float, by rule: {rules}"
+        if self.weight_only_bytes:
+            saved = megabytes(self.weight_only_bytes)
+            said += f"; --weight-only-gemv would save {saved} MB"
+        return said
+
+    def table(self) -> Table | None:
+        """Return the largest weights that stayed float, and why; None without any."""
+        if not self.weights:
+            return None
+        rows = [
+            (each.name, each.op, f"{each.rule}: {each.reason}", megabytes(each.bytes))
+            for each in self.weights[:SHOWN]
+        ]
+        columns = ("weight", "read by", "rule", "MB")
+        return table("Largest weights that stay float", columns, rows, words=3)
+
+    @property
     def empty(self) -> str:
         """Why nothing became int8, in one line; empty if something did."""
         if self.nodes:
@@ -154,7 +185,8 @@ class Int8Outcome:
         found = [f"{self.by} made nothing int8"]
         if self.layers is not None:
             found.append(f"{self.layers} convolutions and matrix products in the graph")
-        found += [f"{count} by rule {why}" for why, count in self._first_kept()]
+        most = list(self.kept.items())[:2]
+        found += [f"{count} by rule {why}" for why, count in most]
         if self.weights:
             largest = self.weights[0]
             found.append(
@@ -162,9 +194,6 @@ class Int8Outcome:
                 f" {largest.node!r}, rule {largest.rule}: {largest.reason}"
             )
         return "; ".join(found)
-
-    def _first_kept(self) -> list[tuple[str, int]]:
-        return list(self.kept.items())[:2]
 
 
 def _by_rule(weights: Iterable[FloatWeight]) -> dict[str, int]:

@@ -10,6 +10,7 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import draw
+from me2e_compress.calibration.stack_frames import recording_of
 from me2e_compress.passes import Pass
 from me2e_compress.passes.fix_shapes import FixShapes, with_sizes
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
@@ -98,10 +99,10 @@ class TrialFiles:
         """Prepare the graph, calibrate once, and name the modules to try."""
         # check names and frames before anything is run
         rules, place = RULE_SETS.parse(options.rules), TARGETS.parse(target)
-        recording = CalibrationSet(self.frames)
-        loaded = graph.load(self.model)
+        read = graph.LoadedModel.load(self.model)
+        loaded = read.model
         adapted(loaded, options.adapter)
-        recording.check(loaded)
+        recording = recording_of(read, self.frames, options.provider)
         scheme = QuantScheme.named(options.scheme, load_map(options.module_map, loaded))
         # the graph is opened and prepared once; every trial starts from there
         name = self.model.name
@@ -109,7 +110,7 @@ class TrialFiles:
             loaded,
             name,
             listener,
-            file=self.model,
+            file=read.file,
             frames=recording,
             provider=options.provider,
         )

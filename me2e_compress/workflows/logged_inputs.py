@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import onnx_ir as ir
 
+from me2e_compress import graph
 from me2e_compress.calibration.logs.log_frames import InputForm, LoggedInputs
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.driving.adapter import ImageNormalization
 from me2e_compress.driving.adapter.image_inputs import Triple
 from me2e_compress.errors import EvaluationError, FramesError
-from me2e_compress.runtime.recurrence import recurrent_inputs
-from me2e_compress.workflows.first_opening import load_interface
+from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.zoo.stacks import STACKS, Stack
 
 STACK = "me2e.stack"
@@ -48,7 +48,7 @@ def inputs_of_model(path: Path, size: tuple[int, int] | None) -> LoggedInputs:
     Raises:
         FramesError: The image's metadata are malformed, or its size is open.
     """
-    model = load_interface(path)
+    model = graph.load(path)
     fed_back = recurrent_inputs(model)
     forms = {
         str(each.name): _form(each, path)

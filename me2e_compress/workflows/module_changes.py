@@ -72,10 +72,6 @@ class ModuleChanges(Result):
             for item, now in self._pairs()
         ]
 
-    def to_json(self) -> object:
-        """Return both sides."""
-        return {"before": self.before, "after": self.after}
-
     def _pairs(self) -> list[tuple[Item, Item | None]]:
         held = {item.module: item for item in self.after}
         return [(item, held.get(item.module)) for item in self.before]

@@ -81,17 +81,14 @@ class PlanResult(Result):
         """Return how many nodes of each module became what, by which rule."""
         return () if self.changes is not None else self.plan.tables()
 
-    def details(self, *, every: bool = False) -> tuple[Table, ...]:
-        """Return one row per node that could be int8, or per node if `every` is set.
-
-        A second table shows what was decided together.
-        """
+    def details(self) -> tuple[Table, ...]:
+        """Return one row per node that could be int8, and what was decided together."""
         if self.changes is not None:
             return ()
         rows = [
             (each.node or each.output, _what(each))
             for each in self.plan.decisions
-            if every or each.could_be_int8
+            if each.could_be_int8
         ]
         shown = table("Decisions", ("node", "what, by which rule, why"), rows, words=2)
         return shown, *self._groups()

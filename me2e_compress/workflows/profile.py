@@ -7,8 +7,9 @@ from pathlib import Path
 
 import onnx_ir as ir
 
-from me2e_compress import drafts
+from me2e_compress import drafts, graph
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.stack_frames import recording_of
 from me2e_compress.errors import EvaluationError, MissingExtraError, RecipeError
 from me2e_compress.metrics.deadlines import BUDGET_MS
 from me2e_compress.modules import assign
@@ -25,7 +26,6 @@ from me2e_compress.runtime.others_load import OthersLoad
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.stack.split_stack import is_stack
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
     adapted,
@@ -35,7 +35,7 @@ from me2e_compress.workflows.checks import (
 )
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.deadlines_table import check_budget
-from me2e_compress.workflows.first_opening import load_interface, try_model
+from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.profile_result import ProfileResult
 
@@ -111,32 +111,33 @@ def profile(
     """
     options = options or ProfileOptions()
     source, written = model_path(model), None if output is None else Path(output)
-    figure = None if options.figure is None else figure_path(options.figure)
+    figure = None if options.figure is None else _figure_path(options.figure)
     joules = _energy_path(options, written)
     # refuse what cannot be measured before anything is
-    if is_stack(source) and (options.by_module or figure is not None):
-        raise EvaluationError(
-            f"{source}: nodes are timed in one graph at a time: profile one of its"
-            " files by module"
-        )
     if options.energy is not None:
         check_counter(options.energy)
     inputs = (source, frames, options.module_map, options.adapter)
     with writing([written, figure, joules], inputs, force=options.force):
         # each measurement has inferences of its own: the profiler takes time itself
-        loaded, recording = load_interface(source), CalibrationSet(Path(frames))
-        said = adapted(loaded, options.adapter)
-        trace = _measured(source, loaded, said, recording, options, listener)
+        recording = CalibrationSet(Path(frames))
+        loaded = graph.LoadedModel.load(source)
+        said = adapted(loaded.model, options.adapter)
+        trace = _measured(loaded, said, recording, options, listener)
         operators: Microseconds = {}
         if options.by_module or figure is not None:
-            found = _broken_down(loaded, recording, options, listener)
+            fed = recording_of(loaded, frames, options.provider)
+            found = _broken_down(loaded.model, fed, options, listener)
             trace = dataclasses.replace(trace, modules_us=found.modules_us)
             operators = found.operators_us
         energy = _energy(source, said, recording, options, listener)
         # files are written all or none
         with drafts.all_or_none():
             if figure is not None:
-                draw(trace, source.stem, figure)
+                from me2e_compress.workflows.latency_figure import (  # matplotlib
+                    draw_modules,
+                )
+
+                draw_modules(trace, source.stem, figure)
             if written is not None:
                 trace.save(written)
             if energy is not None and joules is not None:
@@ -181,7 +182,7 @@ def _energy(
     return found[source.name]
 
 
-def figure_path(named: str | Path) -> Path:
+def _figure_path(named: str | Path) -> Path:
     """Return the file of a figure, if its kind is known and matplotlib is installed."""
     path = Path(named)
     if path.suffix not in KINDS:
@@ -189,13 +190,6 @@ def figure_path(named: str | Path) -> Path:
     if util.find_spec("matplotlib") is None:
         raise MissingExtraError("matplotlib", "highway")
     return path
-
-
-def draw(trace: LatencyTrace, name: str, path: Path) -> None:
-    """Draw what modules took, inference by inference; see :mod:`latency_figure`."""
-    from me2e_compress.workflows.latency_figure import draw_modules  # matplotlib
-
-    draw_modules(trace, name, path)
 
 
 def _broken_down(
@@ -220,17 +214,16 @@ def _broken_down(
 
 
 def _measured(
-    source: Path,
-    loaded: ir.Model,
+    loaded: graph.LoadedModel,
     said: Mapping[str, str],
     recording: CalibrationSet,
     options: ProfileOptions,
     listener: Listener,
 ) -> LatencyTrace:
-    try_model(loaded, source, recording, listener, options.provider)
+    try_model(loaded, listener, options.provider, recording)
     with OthersLoad() as others:
         trace = measure(
-            source,
+            loaded.path,
             recording,
             samples=options.samples,
             warm_up=options.warm_up,

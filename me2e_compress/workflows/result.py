@@ -2,7 +2,9 @@
 
 import abc
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 from me2e_compress.display import (
@@ -36,6 +38,7 @@ __all__ = [
     "megabytes",
     "not_measured",
     "number",
+    "plain",
     "significant",
     "table",
 ]
@@ -51,13 +54,17 @@ Status = Literal["ok", "warning", "refused"]
 class Result(Displayed):
     """The result of a workflow."""
 
+    def tables(self) -> tuple[Table, ...]:
+        """Return no table where the lines say everything."""
+        return ()
+
     @abc.abstractmethod
     def records(self) -> list[dict[str, object]]:
         """Return flat rows of one kind, to compute with."""
 
-    @abc.abstractmethod
     def to_json(self) -> object:
-        """Return everything, as JSON data."""
+        """Return everything, as JSON data: by default what the fields hold."""
+        return plain(self)
 
     @property
     def status(self) -> Status:
@@ -67,12 +74,10 @@ class Result(Displayed):
     def document(self) -> dict[str, object]:
         """Return the ``--json`` document: version, status, the lines said, everything.
 
-        Values may be dataclasses, paths and numbers that are not finite, which JSON
-        writes as objects, strings and null.
+        Dataclasses and paths become objects and strings, numbers that are not finite
+        null.
         """
-        found = self.to_json()
-        if dataclasses.is_dataclass(found) and not isinstance(found, type):
-            found = dataclasses.asdict(found)
+        found = plain(self.to_json())
         if not isinstance(found, Mapping):
             raise TypeError(f"{type(self).__name__}.to_json: not an object")
         said = [*(self.lines() or (self.headline,)), *self.alerts()]
@@ -90,6 +95,19 @@ class Result(Displayed):
         """Show the tables in a notebook, or the records where there are none."""
         records = () if self.tables() else _table_of(self.records())
         return "".join(each.html() for each in records) + super()._repr_html_()
+
+
+def plain(value: object) -> object:
+    """Turn dataclasses, paths, NaN and infinities into what JSON can hold."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return plain(dataclasses.asdict(value))
+    if isinstance(value, Mapping):
+        return {key: plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(each) for each in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
 
 
 def _table_of(records: Sequence[Mapping[str, object]]) -> tuple[Table, ...]:

@@ -29,7 +29,12 @@ from me2e_compress.workflows.score_bench2drive import (
     score_real_run,
     some_of,
 )
-from me2e_compress.workflows.score_eer import EerOptions, EerScores, score_eer
+from me2e_compress.workflows.score_eer import (
+    EerOptions,
+    EerScores,
+    estimate_cells,
+    score_eer,
+)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -224,16 +229,5 @@ def _each(scores: Scores) -> Iterator[tuple[str, Estimate]]:
 
 
 def _cells(estimate: Estimate) -> Sequence[str]:
-    measure = estimate.measure
-    form = ".2f" if measure.unit == "%" else ".3f"
-    if measure.value is None:
-        return "-", "-", "-", str(estimate.n), measure.unit
-    here = _between(estimate.low, estimate.high, form)
-    anew = _between(estimate.anew_low, estimate.anew_high, form)
-    return number(measure.value, form), here, anew, str(estimate.n), measure.unit
-
-
-def _between(low: float | None, high: float | None, form: str) -> str:
-    if low is None or high is None:
-        return "-"
-    return f"{number(low, form)} to {number(high, form)}"
+    unit = estimate.measure.unit
+    return *estimate_cells(estimate, ".2f" if unit == "%" else ".3f"), unit

@@ -13,8 +13,7 @@ from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.runtime.energy import EnergyResult
-from me2e_compress.workflows.eer_weights import Kind, SavedWeights
-from me2e_compress.workflows.paired_drives import UNPAIRED, paired_drives
+from me2e_compress.workflows.eer_weights import Kind, SavedWeights, save_weights
 from me2e_compress.workflows.result import (
     Table,
     counted,
@@ -29,6 +28,9 @@ HEADS: Mapping[Kind, str] = {
     "modelled": "EER_AV, modelled energy",
 }
 UNITS = ("%", "%", "ratio", "J")
+
+UNPAIRED = "a drive in each"
+"""Why a route is left out, listed beside the measures that may be missing."""
 
 Joules = Mapping[str, str | Path | float]
 
@@ -78,7 +80,8 @@ class EerScores:
         return {
             kind: {
                 "scores": {n: each.to_json() for n, each in found.scores.items()},
-                "scale": _scale_json(found, kind),
+                "scale": found.scale
+                and dataclasses.asdict(SavedWeights.of(found.scale, kind)),
                 "left_out": dict(found.left_out),
                 "rankings": {k: list(v) for k, v in self.rankings[kind].items()},
             }
@@ -94,7 +97,7 @@ class EerScores:
         for kind, result in self.found.items():
             columns += [HEADS[kind], "95 %", "95 %, other types", "n"]
             for row, name in zip(rows, names, strict=True):
-                row += _cells(result.scores[name])
+                row += estimate_cells(result.scores[name], ".2f")
         why = {
             f"{HEADS[kind]} of {name}": each.measure.reason
             for kind, result in self.found.items()
@@ -156,7 +159,15 @@ def score_eer(
     if not asked:
         asked["measured"] = {}
     # saved weights are for one kind of joules
-    scales = _scales(options.weights, asked)
+    scales = dict[Kind, EerScale]()
+    if options.weights is not None:
+        saved = SavedWeights.load(Path(options.weights))
+        if saved.energy not in asked:
+            raise EvaluationError(
+                f"{options.weights}: the weights are for {saved.energy} energy, the"
+                f" joules given are {', '.join(asked)}"
+            )
+        scales = {saved.energy: saved.scale()}
     paired, others = paired_drives(folders)
     types, found = _types(paired), dict[Kind, EerResult]()
     orders = dict[Kind, dict[str, tuple[str, ...]]]()
@@ -168,22 +179,37 @@ def score_eer(
         found[kind] = dataclasses.replace(result, left_out=left_out)
         orders[kind] = {str(n): order for n, order in rankings(variants).items()}
     if options.save_weights is not None:
-        _save(Path(options.save_weights), found)
+        save_weights(Path(options.save_weights), found)
     return EerScores(found, orders)
 
 
-def _scales(
-    weights: str | Path | None, asked: Mapping[Kind, Joules]
-) -> dict[Kind, EerScale]:
-    if weights is None:
-        return {}
-    saved = SavedWeights.load(Path(weights))
-    if saved.energy not in asked:
-        raise EvaluationError(
-            f"{weights}: the weights are for {saved.energy} energy, the joules given "
-            f"are {', '.join(asked)}"
-        )
-    return {saved.energy: saved.scale()}
+def paired_drives(
+    folders: Mapping[str, Sequence[Episode]],
+) -> tuple[dict[str, list[Episode]], int]:
+    """Return the episodes on shared routes by folder, and the number of other routes.
+
+    The routes are in the first folder's order. Only real runs may lack routes, on which
+    CARLA crashed; other folders must hold the same, or EvaluationError is raised.
+    """
+    by_route = {
+        name: {each.route: each for each in episodes}
+        for name, episodes in folders.items()
+    }
+    first = next(iter(by_route.values()), {})
+    shared = [each for each in first if all(each in own for own in by_route.values())]
+    # differing routes are an error unless every folder is a real run
+    real = all(each.given for episodes in folders.values() for each in episodes)
+    for name, own in by_route.items():
+        unpaired = sorted({*own} ^ {*first})
+        if unpaired and not (real and shared):
+            raise EvaluationError(
+                f"{name}: route {unpaired[0]} is in one of the folders only: EER_AV "
+                "compares the same routes"
+            )
+    # count the routes that not all folders hold
+    every = {route for own in by_route.values() for route in own}
+    paired = {name: [own[each] for each in shared] for name, own in by_route.items()}
+    return paired, len(every) - len(shared)
 
 
 def joules_named(words: Sequence[str]) -> dict[str, str | float]:
@@ -255,29 +281,16 @@ def _types(folders: Mapping[str, Sequence[Episode]]) -> list[str]:
     return [episode.scenario for episode in next(iter(folders.values()), ())]
 
 
-def _save(path: Path, found: Mapping[Kind, EerResult]) -> None:
-    """Write the scale of measured joules, or of modelled ones where there are none."""
-    kind, result = next(iter(found.items()))
-    if result.scale is None:
-        reason = next(iter(result.scores.values())).measure.reason
-        raise EvaluationError(f"{path}: there are no weights to save: {reason}")
-    SavedWeights.of(result.scale, kind).save(path)
+def estimate_cells(estimate: Estimate, form: str) -> tuple[str, str, str, str]:
+    """Return a value, its intervals and its number of routes, as a table shows them."""
+    if estimate.value is None:
+        return "-", "-", "-", str(estimate.n)
+    here = _between(estimate.low, estimate.high, form)
+    anew = _between(estimate.anew_low, estimate.anew_high, form)
+    return number(estimate.value, form), here, anew, str(estimate.n)
 
 
-def _scale_json(found: EerResult, kind: Kind) -> dict[str, Any] | None:
-    return None if found.scale is None else SavedWeights.of(found.scale, kind).to_json()
-
-
-def _cells(estimate: Estimate) -> list[str]:
-    measure = estimate.measure
-    if measure.value is None:
-        return ["-", "-", "-", str(estimate.n)]
-    here = _between(estimate.low, estimate.high)
-    anew = _between(estimate.anew_low, estimate.anew_high)
-    return [f"{measure.value:.2f}", here, anew, str(estimate.n)]
-
-
-def _between(low: float | None, high: float | None) -> str:
+def _between(low: float | None, high: float | None, form: str) -> str:
     if low is None or high is None:
         return "-"
-    return f"{number(low, '.2f')} to {number(high, '.2f')}"
+    return f"{number(low, form)} to {number(high, form)}"

@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.driving.policies import opened
 from me2e_compress.errors import EvaluationError, RecipeError
 from me2e_compress.extras import need_extra
 from me2e_compress.sensitivity import (
@@ -213,21 +214,14 @@ def _on_routes(
     keeps the episodes of each variant, which are not driven again.
     """
     need_extra("highway", "driving a variant")
-    from me2e_compress.evaluators.highway.conditions import Conditions
-    from me2e_compress.evaluators.highway.drivers import image_size_of
-    from me2e_compress.evaluators.highway.engine import LocalEngine
-    from me2e_compress.evaluators.highway.evaluator import (
-        HighwayEvaluator,
-        routes_named,
-    )
-    from me2e_compress.evaluators.highway.worker import Job
+    from me2e_compress.evaluators.highway.evaluator import DrivingOptions
     from me2e_compress.metrics.scores import score
     from me2e_compress.workflows.evaluate import driver_of
 
     # open the model before hours are spent on variants
-    picked, set_size = routes_named(routes)
-    adapter, provider = options.adapter, options.provider
-    size = image_size_of(driver_of(str(model), adapter, provider).open())
+    asked = DrivingOptions(routes=routes, workers=options.workers)
+    _, set_size = asked.picked
+    opened(driver_of(str(model), options.adapter, options.provider))
 
     def drive(choice: Int8Choice, variant: ir.Model) -> float:
         results = folder / _name_of(choice, variant)
@@ -235,11 +229,9 @@ def _on_routes(
         with TemporaryDirectory() as scratch:
             path = Path(scratch) / "variant.onnx"
             graph.save(variant, path)
-            driver = driver_of(str(path), adapter, provider)
-            job = Job(driver, Conditions(image_size=size))
-            engine = LocalEngine(options.workers)
-            evaluator = HighwayEvaluator(job, picked, results, set_size, engine)
-            found = score(tuple(evaluator.episodes()), set_size).driving_score
+            driver = driver_of(str(path), options.adapter, options.provider)
+            episodes = tuple(asked.driven_by(driver, results).episodes())
+            found = score(episodes, set_size).driving_score
         if found.value is None:
             raise EvaluationError(f"{results}: {found.measure.reason}")
         return found.value

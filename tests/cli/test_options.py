@@ -34,7 +34,7 @@ class Parameter:
 def parameters() -> Iterator[Parameter]:
     for name, entry in COMMANDS.items():
         home = importlib.import_module(f"me2e_compress.cli.commands.{name}")
-        function = getattr(home, entry.function or name)
+        function = getattr(home, entry.function)
         hints = typing.get_type_hints(function, include_extras=True)
         for given, hint in hints.items():
             if typing.get_origin(hint) is Annotated:

@@ -35,14 +35,6 @@ def test_the_page_is_what_the_classes_say() -> None:
     assert PAGE.read_text("utf-8") == page()
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_prints_json_and_the_page_says_what(name: str) -> None:
-    options = {option for each in COMMANDS[name].load().params for option in each.opts}
-
-    assert "--json" in options
-    assert name in sections()
-
-
 def test_the_page_has_no_other_section() -> None:
     assert set(sections()) == {EVERY, *COMMANDS}
 

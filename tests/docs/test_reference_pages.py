@@ -8,8 +8,10 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import typer
+from typer.main import get_command
 
-from me2e_compress.cli.app import COMMANDS
+from me2e_compress.cli.app import LazyGroup, app
 from me2e_compress.errors import GraphError
 from tests.docs.conftest import run
 from tests.docs.pages import PAGES, ROOT, WRITING, Block, blocks
@@ -69,8 +71,9 @@ def test_toml_is_toml(block: Block) -> None:
 def test_a_command_of_the_documents_is_one(line: str) -> None:
     """Its options exist and its values are of their types; nothing is run."""
     words = shlex.split(re.split(r"\s{3,}", line)[0], comments=True)[1:]
-    name, *rest = words
-    command = COMMANDS[name].load()
+    group = get_command(app)
+    assert isinstance(group, LazyGroup)
+    name, command, rest = group.resolve_command(typer.Context(group), words)
     if rest and "..." not in line and "…" not in line:
         with contextlib.suppress(GraphError):  # the model is not there
             command.make_context(name, rest)

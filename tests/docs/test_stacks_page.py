@@ -8,7 +8,7 @@ import pytest
 from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import Observation, Trajectory
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.runtime.stack.stack_file import StackFile
+from me2e_compress.graph.stack.stack_file import StackFile
 from me2e_compress.simulator.cameras import CameraRig
 from me2e_compress.zoo.shipped import shipped
 from tests.cli.conftest import Command, command

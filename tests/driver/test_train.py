@@ -16,7 +16,7 @@ from driver.curriculum import FULL
 from driver.options import claim
 from driver.train import main
 from driver.workflow import TrainResult
-from me2e_compress.cli.console import show
+from me2e_compress.cli.console import print_json
 from me2e_compress.metrics.scores import score
 from tests.docs.pages import ROOT
 from tests.metrics.drives import drive
@@ -87,7 +87,7 @@ def test_what_came_of_it_is_one_document(
 ) -> None:
     made = RoundResult(tmp_path / "m.onnx", score((drive(),)), tmp_path / "log")
 
-    show(TrainResult((made,)), as_json=True)
+    print_json(TrainResult((made,)).document())
 
     (found,) = json.loads(capsys.readouterr().out)["rounds"]
     assert found["driver"] == str(tmp_path / "m.onnx")

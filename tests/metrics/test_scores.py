@@ -9,7 +9,7 @@ from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.metrics.scores import score
-from me2e_compress.workflows.evaluate_result import EvaluateResult
+from me2e_compress.workflows.evaluate import EvaluateResult
 from me2e_compress.workflows.result import Result
 from me2e_compress.workflows.score import ScoreResult, scores_table
 from tests.metrics.drives import cruise, drive, infraction

@@ -11,15 +11,12 @@ from me2e_compress import graph
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.errors import EvaluationError, FramesError, RecipeError
 from me2e_compress.runtime.plan_adapter import PlanAdapter
-from me2e_compress.runtime.stack.stack_session import open_session
+from me2e_compress.runtime.stack_session import open_session
 from me2e_compress.workflows.calibrate import CalibrateOptions, calibrate
-from me2e_compress.workflows.calibrate_stack import calibrate_stack
 from me2e_compress.workflows.checks import adapted
 from me2e_compress.workflows.compare import compare
 from me2e_compress.workflows.compress import CompressOptions, compress
-from me2e_compress.workflows.compress_stack import compress_stack
 from me2e_compress.workflows.inspect import inspect
-from me2e_compress.workflows.inspect_stack import inspect_stack
 from me2e_compress.workflows.profile import ProfileOptions, profile
 from me2e_compress.workflows.sensitivity import SensitivityOptions, measure_sensitivity
 from tests.stacks import write_stack
@@ -156,11 +153,9 @@ def test_files_of_a_stack_take_no_adapter(
     stack, out = write_stack(tmp_path), tmp_path / "out"
 
     with pytest.raises(RecipeError, match="--adapter is for one file"):
-        inspect_stack(stack, adapter=adapter)
+        compress(stack, out, "exact", frames, CompressOptions(adapter=adapter))
     with pytest.raises(RecipeError, match="--adapter is for one file"):
-        compress_stack(stack, out, "exact", frames, CompressOptions(adapter=adapter))
-    with pytest.raises(FramesError, match="--adapter is for one file"):
-        calibrate_stack(stack, frames, out, CalibrateOptions(adapter=adapter))
+        calibrate(stack, frames, out, CalibrateOptions(adapter=adapter))
 
 
 def test_what_is_said_of_a_stack_wins_over_its_own(tmp_path: Path) -> None:

@@ -11,7 +11,9 @@ from me2e_compress.errors import GraphError
 from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array
 from me2e_compress.workflows import first_opening
-from me2e_compress.workflows.first_opening import try_apart
+from me2e_compress.workflows.first_opening import try_apart, try_file
+from me2e_compress.workflows.listener import SILENT
+from tests.stacks import write_stack
 
 pytestmark = pytest.mark.opens_apart
 
@@ -62,3 +64,15 @@ def test_how_it_died(
 
     assert str(caught.value) == f"driver.onnx: onnxruntime {said}"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_crash_of_a_stack_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def dies(*_: object, **__: object) -> None:
+        raise GraphError("stack.toml: onnxruntime dies of it")
+
+    monkeypatch.setattr(first_opening, "try_apart", dies)
+
+    with pytest.raises(GraphError, match="dies of it"):
+        try_file(write_stack(tmp_path), SILENT)

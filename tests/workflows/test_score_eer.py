@@ -6,10 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
-from me2e_compress.cli.commands.score import score as command
+from me2e_compress.cli.app import app
 from me2e_compress.errors import EnergyError, EvaluationError
 from me2e_compress.evaluators.highway.results import ResultsFolder
 from me2e_compress.evaluators.highway.worker import Driven
@@ -220,9 +219,13 @@ def test_the_command_prints_what_the_page_says(tmp_path: Path) -> None:
         folder = ResultsFolder.create(path, {"routes": ["a", "b"], "set_size": 2})
         for each in episodes:
             folder.save(Driven(each, 0.0, 0))
-    app = typer.Typer()
-    app.command()(command)
-    words = [str(tmp_path / "fast"), str(tmp_path / "slow"), "--joules", "fast=2"]
+    words = [
+        "score",
+        str(tmp_path / "fast"),
+        str(tmp_path / "slow"),
+        "--joules",
+        "fast=2",
+    ]
 
     result = CliRunner().invoke(app, [*words, "--joules", "slow=3", "--json"])
 

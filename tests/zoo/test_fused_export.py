@@ -65,12 +65,7 @@ def test_a_layer_in_every_dialect_says_what_torch_says(
 
 def test_a_library_without_the_operator_is_an_error() -> None:
     with pytest.raises(RecipeError, match="--dialect sparsedrive: no library of"):
-        ExportOptions(operators="plugin", dialect="sparsedrive")
-
-
-def test_a_dialect_of_standard_operators_is_an_error() -> None:
-    with pytest.raises(RecipeError, match="needs --operators plugin"):
-        ExportOptions(dialect="tensorrt")
+        ExportOptions(dialect="sparsedrive")
 
 
 @pytest.fixture(scope="module", params=[13, 17])

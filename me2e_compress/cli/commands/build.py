@@ -27,7 +27,6 @@ def build(
     tactic_source: TacticSource = None,
     plugins: given.Plugins = None,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Build a TensorRT engine of a graph, for the GPU of this machine."""
     settings = EngineSettings(
@@ -36,4 +35,4 @@ def build(
     with listening() as listener:
         options = workflow.BuildOptions(settings, force)
         found = workflow.build(model, output, options, listener)
-    show(found, as_json)
+    show(found)

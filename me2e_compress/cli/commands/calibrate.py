@@ -8,9 +8,7 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.runtime.providers import provider_named
-from me2e_compress.runtime.stack.split_stack import is_stack
 from me2e_compress.workflows import calibrate as workflow
-from me2e_compress.workflows.calibrate_stack import calibrate_stack
 from me2e_compress.workflows.checks import sizes
 
 Frames = Annotated[
@@ -47,7 +45,6 @@ def calibrate(
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Measure the ranges of every tensor that any scheme, rule set or target needs.
 
@@ -63,6 +60,5 @@ def calibrate(
         dims=sizes(set_dim or ()), provider=provider_named(provider, plugins or ()),
     )  # fmt: skip
     with listening() as listener:
-        do = calibrate_stack if is_stack(model) else workflow.calibrate
-        found = do(model, frames, output, options, listener)
-    show(found, as_json)
+        found = workflow.calibrate(model, frames, output, options, listener)
+    show(found)

@@ -24,7 +24,6 @@ def compare(
     adapter: given.Adapter = None,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
-    as_json: given.Json = False,
 ) -> None:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres."""
     with listening() as listener:
@@ -37,4 +36,4 @@ def compare(
             provider=provider_named(provider, plugins or ()),
             adapter=adapter,
         )
-    show(found, as_json)
+    show(found)

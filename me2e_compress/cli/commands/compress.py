@@ -11,10 +11,8 @@ from me2e_compress.cli.console import listening, show
 from me2e_compress.errors import RecipeError
 from me2e_compress.fidelity.floor import SQNR_FLOOR_DB
 from me2e_compress.runtime.providers import provider_named
-from me2e_compress.runtime.stack.split_stack import is_stack
 from me2e_compress.workflows import compress as workflow
 from me2e_compress.workflows.checks import sizes
-from me2e_compress.workflows.compress_stack import compress_stack
 
 Output = Annotated[
     Path, typer.Option("-o", "--output", help="the smaller graph; of a stack a folder")
@@ -56,7 +54,6 @@ def compress(
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Apply passes to a graph, check each, and write the smaller graph and a report.
 
@@ -74,6 +71,5 @@ def compress(
         provider=provider_named(provider, plugins or ()),
     )  # fmt: skip
     with listening() as listener:
-        do = compress_stack if is_stack(model) else workflow.compress
-        found = do(model, output, wanted, frames, options, listener)
-    show(found, as_json)
+        found = workflow.compress(model, output, wanted, frames, options, listener)
+    show(found)

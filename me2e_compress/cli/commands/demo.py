@@ -8,7 +8,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, say, show
-from me2e_compress.cli.verbosity import is_verbose
+from me2e_compress.cli.verbosity import is_json, is_verbose
 from me2e_compress.extras import need_extra
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows.demo_result import DemoResult, figure
@@ -25,8 +25,6 @@ Stack = Annotated[
 ]
 Recipe = Annotated[str, typer.Option("-r", "--recipe", "--scheme", help=given.RECIPE)]
 Routes = Annotated[str, typer.Option(help=f"{given.ROUTES}; highway")]
-Rounds = Annotated[int, typer.Option(min=1, help="latency rounds of vad-tiny")]
-Threads = Annotated[int, typer.Option(min=0, help="of onnxruntime; for vad-tiny")]
 
 
 def demo(
@@ -35,12 +33,9 @@ def demo(
     recipe: Recipe = "full-fused",
     routes: Routes = "5",
     workers: given.Workers = 2,
-    rounds: Rounds = 4,
-    threads: Threads = 2,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Run the main job on what ships: compress, verify, compare, drive, report.
 
@@ -55,7 +50,7 @@ def demo(
 
         steps = DriverDemo(stack, output, recipe, routes, workers, runs, force).steps
     else:
-        steps = StackDemo(stack, output, recipe, rounds, threads, runs, force).steps
+        steps = StackDemo(stack, output, recipe, runs, force).steps
     # each step says what it found as soon as it is done
     output.mkdir(parents=True, exist_ok=True)
     found = dict[str, Result]()
@@ -63,14 +58,12 @@ def demo(
         begun = time.monotonic()
         with listening() as listener:
             found[name] = step(listener)
-        if not as_json:
+        if not is_json():
             seconds = time.monotonic() - begun
             say(f"{name:<10}{seconds:4.0f} s   {figure(found[name])}")
             if is_verbose():
                 show(found[name])
     # with -v every step was shown in full already
     whole = DemoResult(found)
-    if as_json:
-        show(whole, as_json)
-    elif not is_verbose():
+    if is_json() or not is_verbose():
         show(whole)

@@ -64,13 +64,11 @@ def evaluate(
     weather: Weather = "",
     frame_limit: Limit = FRAME_LIMIT_S,
     engine: given.Engine = "local",
-    address: given.Address = None,
     render: Render = None,
     evaluator: Evaluator = "highway",
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Drive a policy over routes of highway-env; run it again to go on.
 
@@ -81,31 +79,30 @@ def evaluate(
     runs = provider_named(provider, plugins or ())
     # --check drives nothing, and needs no folder
     if check:
-        _check(policy, adapter, runs, as_json)
+        _check(policy, adapter, runs)
         return
     if output is None:
         raise typer.BadParameter("driving needs -o RESULTS/", param_hint="-o")
+    engine_name, address = given.engine_and_address(engine)
     options = workflow.EvaluateOptions(
         routes=routes, latency=latency, latency_scale=latency_scale,
         latency_model=latency_model, in_order=in_order, seed=seed, workers=workers,
         dt_ms=dt_ms, adapter=adapter, host_stage=host_stage, weather=weather,
-        frame_limit_s=frame_limit, engine=engine, address=address, render=render,
+        frame_limit_s=frame_limit, engine=engine_name, address=address, render=render,
         provider=runs, force=force,
         evaluator=evaluator,
     )  # fmt: skip
     with listening() as listener:
         found = workflow.evaluate(policy, output, options, listener)
-    show(found, as_json)
+    show(found)
     for file in found.pictures:
         tell(f"wrote {file}")
 
 
-def _check(
-    policy: str | None, adapter: Path | None, runs: Provider, as_json: bool
-) -> None:
+def _check(policy: str | None, adapter: Path | None, runs: Provider) -> None:
     if policy is None:
         raise typer.BadParameter("--check needs a policy", param_hint="POLICY")
     with listening() as listener:
         found = check_model(policy, adapter, runs, listener)
-    show(found, as_json)
+    show(found)
     found.check()

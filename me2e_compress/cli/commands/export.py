@@ -1,7 +1,7 @@
 """``me2e-compress export``."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -24,13 +24,12 @@ Seed = Annotated[
     typer.Option(min=0, help="seed of everything random: the weights; default 0"),
 ]
 
-Operators = Annotated[
-    Literal["standard", "plugin"],
-    typer.Option(help="plugin: deformable attention (not of tcp) as one node"),
-]
 DialectName = Annotated[
     str | None,
-    typer.Option(help="dialect of that node's plugin library; default me2e, our own"),
+    typer.Option(
+        help="deformable attention (not of tcp) as one node of this plugin library, or"
+        " of our own, me2e"
+    ),
 ]
 Weights = Annotated[
     Path | None,
@@ -51,18 +50,14 @@ def export(
     opset: Opset = workflow.OPSET,
     heads: Heads = None,
     seed: Seed = None,
-    operators: Operators = "standard",
     dialect: DialectName = None,
     weights: Weights = None,
     ema: Ema = False,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Write a reference stack: random weights, a checkpoint's, or our driver."""
-    options = workflow.ExportOptions(
-        opset, heads, seed, force, operators, dialect, weights, ema
-    )
+    options = workflow.ExportOptions(opset, heads, seed, force, dialect, weights, ema)
     with listening() as listener:
         listener.on_progress(f"exporting {stack}", 0, 1, "")
         found = workflow.export_stack(stack, output, options)
-    show(found, as_json)
+    show(found)

@@ -40,7 +40,6 @@ def frames(
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Write calibration frames, coherent in time, seen by six cameras.
 
@@ -60,4 +59,4 @@ def frames(
     )
     with listening() as listener:
         workflow.record_frames(stack, output, options, listener)
-    show(workflow.FramesResult(stack, output, options), as_json)
+    show(workflow.FramesResult(stack, output, options))

@@ -7,10 +7,8 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
-from me2e_compress.runtime.stack.split_stack import is_stack
 from me2e_compress.workflows import inspect as workflow
 from me2e_compress.workflows.checks import sizes
-from me2e_compress.workflows.inspect_stack import inspect_stack
 
 
 def inspect(
@@ -26,7 +24,6 @@ def inspect(
     ] = None,
     frames: Annotated[Path | None, typer.Option(help="the recorded FRAMES")] = None,
     adapter: given.Adapter = None,
-    as_json: given.Json = False,
 ) -> None:
     """Show what a graph holds: interface, and nodes, parameters, MACs by module.
 
@@ -35,7 +32,6 @@ def inspect(
     """
     dims = sizes(set_dim or ())
     with listening() as listener:
-        do = inspect_stack if is_stack(model) else workflow.inspect
         read = module_map, dims, modelled_energy, trace, frames, listener, adapter
-        found = do(model, *read)
-    show(found, as_json)
+        found = workflow.inspect(model, *read)
+    show(found)

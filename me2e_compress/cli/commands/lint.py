@@ -26,14 +26,12 @@ def lint(
     set_dim: given.SetDim = None,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
-    shown: Annotated[int, typer.Option(min=0, help="nodes shown for each rule")] = 3,
-    as_json: given.Json = False,
 ) -> None:
     """Check a graph for the runtime that will run it; exit code 1 if it refuses."""
     runs = provider_named(provider, plugins or ())
     options = workflow.LintOptions(target, trt_check, sm, sizes(set_dim or ()), runs)
     with listening() as listener:
         found = workflow.lint(model, options, listener)
-    most = len(found.findings) if is_verbose() else shown
-    show(found, as_json, found.tables(shown=most))
+    every = found.tables(shown=len(found.findings)) if is_verbose() else None
+    show(found, every)
     found.check()

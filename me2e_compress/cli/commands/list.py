@@ -4,7 +4,6 @@ from typing import Annotated
 
 import typer
 
-from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import show
 from me2e_compress.workflows.listing import KINDS
 from me2e_compress.workflows.listing import list_entries as workflow
@@ -12,6 +11,6 @@ from me2e_compress.workflows.listing import list_entries as workflow
 Kind = Annotated[str | None, typer.Argument(help=", ".join(KINDS))]
 
 
-def list_entries(kind: Kind = None, as_json: given.Json = False) -> None:
+def list_entries(kind: Kind = None) -> None:
     """Show what can be named: ours, and what other packages add by entry point."""
-    show(workflow(kind), as_json)
+    show(workflow(kind))

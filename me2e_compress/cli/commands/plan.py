@@ -18,7 +18,6 @@ Against = Annotated[
 ]
 Output = Annotated[Path | None, typer.Option("-o", "--output", help="the plan as JSON")]
 Nodes = Annotated[bool, typer.Option("--nodes", help="a row a node that could be int8")]
-Every = Annotated[bool, typer.Option("--all", help="a row a node, every node")]
 
 
 def plan(
@@ -32,9 +31,7 @@ def plan(
     against: Against = None,
     output: Output = None,
     nodes: Nodes = False,
-    every: Every = False,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Show which nodes become int8, which stay float, by which rule, and why."""
     options = workflow.PlanOptions(
@@ -47,5 +44,4 @@ def plan(
         force,
     )
     found = workflow.plan(model, output, against, options)
-    listed = (*found.tables(), *found.details(every=every))
-    show(found, as_json, listed if nodes or every else None)
+    show(found, (*found.tables(), *found.details()) if nodes else None)

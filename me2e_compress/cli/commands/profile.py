@@ -9,7 +9,6 @@ from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show, tell
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.deadlines import BUDGET_MS
-from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import profile as workflow
 from me2e_compress.workflows.import_profile import import_profile, refuse_both
@@ -23,7 +22,6 @@ def profile(
     ] = None,
     imported: given.Import = None,
     samples: Annotated[int | None, typer.Option(help="number of latencies")] = None,
-    warm_up: Annotated[int, typer.Option(help="inferences before")] = WARM_UP,
     threads: given.Threads = 1,
     by_module: Annotated[
         bool, typer.Option("--by-module", help="modules and operators too")
@@ -44,7 +42,6 @@ def profile(
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Measure a model alone and warm, and write its latencies as a trace.
 
@@ -53,7 +50,13 @@ def profile(
     # a measurement and an import share the options that both understand
     device = provider_named(provider, plugins or ())
     options = workflow.ProfileOptions(
-        *(samples, warm_up, threads, device, by_module, module_map, figure, force),
+        samples,
+        threads=threads,
+        provider=device,
+        by_module=by_module,
+        module_map=module_map,
+        figure=figure,
+        force=force,
         energy=energy,
         energy_output=energy_out,
         budget_ms=budget_ms,
@@ -69,7 +72,7 @@ def profile(
             raise EvaluationError("profile: give recorded FRAMES, or --import FILE")
         else:
             found = workflow.profile(model, frames, output, options, listener)
-    show(found, as_json)
+    show(found)
     # files besides the trace are named on stderr
     if found.figure is not None:
         tell(f"wrote {found.figure}")

@@ -33,13 +33,12 @@ def routes(
     examine: Examine = None,
     picked: Picked = "all",
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Make a fresh set of admitted routes, or examine an existing set again."""
     if examine is not None:
         with listening() as listener:
             examined = workflow.examine_routes(examine, picked, listener)
-        show(examined, as_json)
+        show(examined)
         examined.check()
         return
     if output is None:
@@ -47,4 +46,4 @@ def routes(
     options = workflow.RoutesOptions(seed, variants, scenarios, workers, force)
     with listening() as listener:
         made = workflow.make_routes(output, options, listener)
-    show(made, as_json)
+    show(made)

@@ -54,7 +54,6 @@ def score(
     weights: Weights = None,
     save_weights: SaveWeights = None,
     budget_ms: given.Budget = BUDGET_MS,
-    as_json: given.Json = False,
 ) -> None:
     """Print driving score, success rate, efficiency, comfort and abilities.
 
@@ -82,4 +81,4 @@ def score(
             ),
             budget_ms=budget_ms,
         )
-    show(found, as_json)
+    show(found)

@@ -1,7 +1,6 @@
 """``me2e-compress search``."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -26,9 +25,6 @@ MaxJoules = Annotated[float | None, typer.Option(help=MAX_JOULES)]
 OnRoad = Annotated[
     bool, typer.Option("--on-road", help="judge by driving; float, int8 or no module")
 ]
-Drives = Annotated[
-    Path | None, typer.Option(help=f"folder to go on in: RECIPE.drives; {ROAD}")
-]
 Modules = Annotated[
     str | None, typer.Option(help=f"groups that are int8 or float: A+B,C; {ROAD}")
 ]
@@ -42,9 +38,6 @@ Latency = Annotated[
 ]
 BaselineMedian = Annotated[
     float | None, typer.Option(help=f"seconds of float on the device; {ROAD}")
-]
-FirstRung = Annotated[
-    int | None, typer.Option(min=1, help=f"routes that all drive: 22; {ROAD}")
 ]
 Seed = Annotated[
     int | None, typer.Option(min=0, help=f"seed of everything random: 0; {ROAD}")
@@ -62,14 +55,12 @@ def search(
     max_ms: MaxMs = None,
     max_joules: MaxJoules = None,
     on_road: OnRoad = False,
-    drives: Drives = None,
     modules: Modules = None,
     ablate: Ablate = None,
     most_ablated: MostAblated = None,
     routes: Routes = None,
     latency: Latency = None,
     baseline_median_s: BaselineMedian = None,
-    first_rung: FirstRung = None,
     seed: Seed = None,
     adapter: given.Adapter = None,
     workers: Workers = None,
@@ -84,7 +75,6 @@ def search(
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Find the scheme within the budgets that costs the plan, or the road, least."""
     check_budgets(max_mb, max_ms, max_joules)
@@ -92,10 +82,9 @@ def search(
     # without --on-road nothing drives: the loss is judged by the plan
     if not on_road:
         _refuse_the_road({
-            "drives": drives, "modules": modules, "ablate": ablate,
-            "most-ablated": most_ablated, "routes": routes, "latency": latency,
-            "baseline-median-s": baseline_median_s, "first-rung": first_rung,
-            "seed": seed, "workers": workers,
+            "modules": modules, "ablate": ablate, "most-ablated": most_ablated,
+            "routes": routes, "latency": latency,
+            "baseline-median-s": baseline_median_s, "seed": seed, "workers": workers,
         })  # fmt: skip
         options = workflow.SearchOptions(
             max_mb=max_mb, max_ms=max_ms, max_joules=max_joules, scheme=scheme,
@@ -105,7 +94,7 @@ def search(
         )  # fmt: skip
         with listening() as listener:
             found = workflow.search(model, frames, output, options, listener)
-        show(found, as_json)
+        show(found)
         return
     need_extra("highway", "search --on-road")
     if ranges is not None or scheme != "full":
@@ -115,18 +104,18 @@ def search(
     from me2e_compress.study.on_road import Limits, RoadSearchOptions, search_on_road
 
     road = RoadSearchOptions(
-        drives=drives or output.with_name(f"{output.stem}.drives"),
+        drives=output.with_name(f"{output.stem}.drives"),
         limits=Limits(max_mb, max_ms, max_joules), modules=modules, ablate=ablate,
         most_ablated=1 if most_ablated is None else most_ablated,
         routes=routes or "all", latency=latency or "trace",
-        baseline_median_s=baseline_median_s, first_rung=first_rung or 22, rules=rules,
-        target=target, module_map=module_map, adapter=adapter, dims=dims,
+        baseline_median_s=baseline_median_s, rules=rules, target=target,
+        module_map=module_map, adapter=adapter, dims=dims,
         threads=threads or 1, seed=seed or 0, provider=runs_on, force=force,
     )  # fmt: skip
     engine = LocalEngine(workers or 1)
     with listening() as listener:
         driven = search_on_road(model, frames, output, road, engine, listener, tell)
-    show(driven, as_json)
+    show(driven)
 
 
 def _refuse_the_road(options: Mapping[str, object]) -> None:

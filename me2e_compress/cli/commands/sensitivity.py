@@ -46,7 +46,6 @@ def sensitivity(
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Measure what int8 costs per module and node, and write a recipe within a limit.
 
@@ -64,4 +63,4 @@ def sensitivity(
     )  # fmt: skip
     with listening() as listener:
         found = workflow.measure_sensitivity(model, frames, output, options, listener)
-    show(found, as_json)
+    show(found)

@@ -7,6 +7,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, say, show, tell
+from me2e_compress.cli.verbosity import is_json
 from me2e_compress.extras import need_extra
 
 STUDY = "STUDY.toml, or a shipped study's name: paper"
@@ -46,9 +47,7 @@ def study(
     trust_code: TrustCode = False,
     workers: given.Workers = 1,
     engine: given.Engine = "local",
-    address: given.Address = None,
     force: given.Force = False,
-    as_json: given.Json = False,
 ) -> None:
     """Drive variants under conditions and compare them; run it again to go on."""
     need_extra("highway", "a study")
@@ -69,7 +68,7 @@ def study(
     check_folder(output, inputs, (JSON, MARKDOWN, HTML))
     ahead = workload(asked, output, workers)
     if dry_run:
-        show(ahead, as_json)
+        show(ahead)
         return
     # the report quotes the command that repeats the study
     options: list[tuple[str, str | Path | None]] = [
@@ -87,12 +86,13 @@ def study(
     if records is None:
         tell(ahead.headline)
     with listening() as listener:
-        chosen_engine = engine_of(engine, workers, address)
+        name, address = given.engine_and_address(engine)
+        chosen_engine = engine_of(name, workers, address)
         found, files = run_and_report(
             *(asked, output, words, chosen_engine, listener, records),
             weigh or (),
             force=force,
         )
-    show(found, as_json)
-    if not as_json:
+    show(found)
+    if not is_json():
         say(f"wrote {files.report}, {files.tables} and {files.record}")

@@ -17,9 +17,9 @@ from me2e_compress.driving.adapter.recurrent import RecurrentEntry
 from me2e_compress.driving.axes import Axes
 from me2e_compress.driving.waypoint_pid import FusionOptions
 from me2e_compress.errors import EvaluationError
-from me2e_compress.graph import sha256_of
+from me2e_compress.graph.files import sha256_of
+from me2e_compress.graph.recurrence import RECURRENT, declared_pairs
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
-from me2e_compress.runtime.recurrence import RECURRENT, declared_pairs
 
 Contract: TypeAlias = Literal["img", "lidar2img", "can_bus", "command", "timestamp"]
 

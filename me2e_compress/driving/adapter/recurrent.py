@@ -17,10 +17,10 @@ from pydantic import (
 
 from me2e_compress.driving.ports import fed, fits, zeros
 from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.graph.stack.first_values import read_value
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import DTYPES, SessionPort
-from me2e_compress.runtime.stack.first_values import read_value
 
 ZEROS = "zeros"
 _FILES = (".npy", ".npz")

@@ -13,8 +13,8 @@ from me2e_compress.driving.policies import POLICIES, Driver, SizedPolicy
 from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import EvaluationError
+from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.stack.split_stack import digest_of_files
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class OnnxDriver(Driver):
 
     def fingerprint(self) -> str:
         """Return the digests of its files, with provider and host stage."""
-        digests = [digest_of_files(self.path)]
+        digests = [sha256_of(self.path)]
         if self.adapter is not None:
             from me2e_compress.driving.adapter import Adapter
 

@@ -6,6 +6,7 @@ from itertools import chain, repeat
 from pathlib import Path
 
 from me2e_compress.errors import EnergyError
+from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.energy.energy_counter import open_counter
 from me2e_compress.runtime.energy.energy_recording import EnergyRecording
 from me2e_compress.runtime.energy.energy_result import EnergyResult
@@ -15,8 +16,7 @@ from me2e_compress.runtime.energy.schedule import EnergySchedule
 from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import replay
-from me2e_compress.runtime.stack.split_stack import digest_of_files
-from me2e_compress.runtime.stack.stack_session import open_session
+from me2e_compress.runtime.stack_session import open_session
 
 MOST_BYTES = 500_000_000
 """Bytes of frames held in memory: reading from disk takes energy too."""
@@ -45,7 +45,7 @@ def measure_energy(
     Returns joules per frame by model; without a counter, the reason why not, at once. A
     counter that fails, or a recording given for several models, is an EnergyError.
     """
-    digests = {name: digest_of_files(path) for name, path in models.items()}
+    digests = {name: sha256_of(path) for name, path in models.items()}
     # Measure, take the recording, or say why there is no counter.
     opened = open_counter(counter)
     if isinstance(opened, Absent):

@@ -86,12 +86,12 @@ def test_waypoints_do_not_depend_on_the_control_branch() -> None:
     [
         ("tcp", {"heads": "nuscenes"}, "tcp has no heads 'nuscenes': there is bench2"),
         ("uniad-tiny", {"heads": "nuscenes"}, "'nuscenes': there is nothing to choose"),
-        ("tcp", {"operators": "plugin"}, "tcp has no deformable attention"),
+        ("tcp", {"dialect": "me2e"}, "tcp has no deformable attention"),
         (
-            *("vad-tiny", {"operators": "plugin", "opset": 18}),
+            *("vad-tiny", {"dialect": "me2e", "opset": 18}),
             "opset 18 with plugins, which take up to 17",
         ),
-        ("highway", {"operators": "plugin"}, "--operators cannot be chosen"),
+        ("highway", {"dialect": "me2e"}, "--dialect cannot be chosen"),
     ],
 )
 def test_what_a_stack_does_not_have_is_refused(

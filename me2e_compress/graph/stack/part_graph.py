@@ -7,15 +7,15 @@ from typing import Self
 
 import onnx_ir as ir
 
-from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.recurrence import SessionPort, declared_pairs
+from me2e_compress.graph.files import load
+from me2e_compress.graph.nodes import Array
+from me2e_compress.graph.recurrence import SessionPort, declared_pairs
 
 
 @dataclasses.dataclass(frozen=True)
 class PartGraph:
-    """The interface of one ONNX file of a stack.
+    """One ONNX file of a stack, and its interface.
 
     ``label`` is ``head`` or ``head.first_frame``; a port of unknown shape has an empty
     one.
@@ -27,13 +27,14 @@ class PartGraph:
     inputs: Mapping[str, SessionPort]
     outputs: Mapping[str, SessionPort]
     metadata: Mapping[str, str]
+    model: ir.Model = dataclasses.field(repr=False)
 
     @classmethod
     def load(cls, label: str, part: str, path: Path) -> Self:
         """Read a file; GraphError if it is missing or not a graph."""
-        model = graph.load(path)
+        model = load(path)
         sides = _ports(model.graph.inputs), _ports(model.graph.outputs)
-        return cls(label, part, path, *sides, dict(model.metadata_props))
+        return cls(label, part, path, *sides, dict(model.metadata_props), model)
 
     def recurrent(self) -> dict[str, str | None]:
         """Return the output declared for each input; None if it is not fed back."""
@@ -47,7 +48,7 @@ class PartGraph:
 
     def initializer(self, name: str) -> Array | None:
         """Read an initializer; None if there is none of that name."""
-        found = graph.load(self.path).graph.initializers.get(name)
+        found = self.model.graph.initializers.get(name)
         tensor = None if found is None else found.const_value
         return None if tensor is None else tensor.numpy()
 
@@ -64,7 +65,7 @@ def misfit(given: SessionPort, taken: SessionPort) -> bool:
     )
 
 
-def told(port: SessionPort) -> str:
+def form(port: SessionPort) -> str:
     """Describe type and shape: ``float [1, 6, 2]``."""
     element = port.type.removeprefix("tensor(").removesuffix(")")
     return f"{element} {list(port.shape)}"

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from me2e_compress.display import reason
-from me2e_compress.documents import check_regular
+from me2e_compress.documents import UNREADABLE, check_regular
 from me2e_compress.errors import GraphError
-from me2e_compress.runtime.frames import UNREADABLE, Array
-from me2e_compress.runtime.recurrence import SessionPort
-from me2e_compress.runtime.stack.part_graph import misfit, told
+from me2e_compress.graph.nodes import Array
+from me2e_compress.graph.recurrence import SessionPort
+from me2e_compress.graph.stack.part_graph import form, misfit
 
 
 def read_value(path: Path, name: str, where: str) -> Array:
@@ -40,7 +40,7 @@ def fitted(value: Array, port: SessionPort, where: str) -> Array:
     found = SessionPort(f"tensor({element})", value.shape)
     if misfit(found, port):
         raise GraphError(
-            f"{where} is {told(found)}, and the input takes {told(port)}: of another"
+            f"{where} is {form(found)}, and the input takes {form(port)}: of another"
             " stack?"
         )
     return value

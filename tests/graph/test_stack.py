@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress import documents
+from me2e_compress import documents, graph
 from me2e_compress.errors import FramesError, GraphError
-from me2e_compress.runtime.session import Session, replay
-from me2e_compress.runtime.stack.split_stack import SplitStack, digest_of_files
-from me2e_compress.runtime.stack.stack_file import PartEntry, StackFile, StateEntry
-from me2e_compress.runtime.stack.stack_session import StackSession, open_session
+from me2e_compress.graph.stack.stack import JoinedStack
+from me2e_compress.graph.stack.stack_file import PartEntry, StackFile, StateEntry
+from me2e_compress.runtime.session import replay
+from me2e_compress.runtime.stack_session import open_session
 from tests.profiles import scaled
 from tests.stacks import HEAD, HEAD_FIRST, THREE_FILES, TWO_PARTS, ones, write_stack
 
@@ -27,9 +27,9 @@ def bevs(path: Path, *starts: bool) -> list[float]:
 def test_equal_names_are_joined_and_state_runs_by_its_names(tmp_path: Path) -> None:
     path = write_stack(tmp_path)
 
-    stack = SplitStack.load(path)
+    stack = JoinedStack.load(path)
 
-    assert list(stack.inputs) == ["prev_bev", "img"]
+    assert list(stack.joined.inputs) == ["prev_bev", "img"]
     assert list(stack.outputs) == ["next_bev", "plan", "feats"]
     assert stack.recurrent == {"prev_bev": "next_bev"}
     assert bevs(path, True, False, False, True) == [2.0, 3.0, 3.5, 2.0]
@@ -60,7 +60,7 @@ def test_two_outputs_of_one_name_are_called_by_their_parts(tmp_path: Path) -> No
         backbone (float[1,4] img) => (float[1,4] plan) { plan = Add(img, img) }""",
     )
 
-    assert list(SplitStack.load(path).outputs) == [
+    assert list(JoinedStack.load(path).outputs) == [
         *("next_bev", "head.plan", "backbone.plan")
     ]
 
@@ -100,7 +100,7 @@ def test_a_part_may_run_at_first_frames_alone(tmp_path: Path) -> None:
     )
 
     assert bevs(path, True, False) == [1.5, 2.75]
-    assert "bev" not in SplitStack.load(path).outputs
+    assert "bev" not in JoinedStack.load(path).outputs
 
 
 def test_what_a_frame_holds_goes_before_the_first_value(tmp_path: Path) -> None:
@@ -132,9 +132,11 @@ def test_state_may_be_another_output_than_its_name_says(tmp_path: Path) -> None:
 def test_metadata_of_the_toml_wins(tmp_path: Path) -> None:
     toml = TWO_PARTS + '[metadata]\n"me2e.plan" = {output = "plan", deltas = true}\n'
 
-    stack = SplitStack.load(write_stack(tmp_path, toml))
+    stack = JoinedStack.load(write_stack(tmp_path, toml))
 
-    assert stack.metadata["me2e.plan"] == '{"output": "plan", "deltas": true}'
+    assert (
+        stack.model.metadata_props["me2e.plan"] == '{"output": "plan", "deltas": true}'
+    )
 
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
@@ -144,24 +146,22 @@ FILE = st.none() | NAME.map(lambda name: Path(f"{name}.onnx"))
 
 
 @given(
-    parts=st.lists(st.tuples(NAME, FILE, st.none() | TEXT), min_size=1, max_size=3),
+    parts=st.lists(st.tuples(NAME, FILE), min_size=1, max_size=3),
     edges=st.dictionaries(TEXT, TEXT, max_size=2),
     state=st.dictionaries(TEXT, st.tuples(st.none() | TEXT, TEXT), max_size=2),
     metadata=st.dictionaries(TEXT, TEXT, max_size=2),
 )
 @settings(max_examples=scaled(40))
 def test_what_is_written_is_read_again(
-    parts: list[tuple[str, Path | None, str | None]],
+    parts: list[tuple[str, Path | None]],
     edges: dict[str, str],
     state: dict[str, tuple[str | None, str]],
     metadata: dict[str, str],
 ) -> None:
     said = StackFile(
         part=tuple(
-            PartEntry(
-                name=f"{at}{name}", file=Path("a.onnx"), first_frame=file, recipe=text
-            )
-            for at, (name, file, text) in enumerate(parts)
+            PartEntry(name=f"{at}{name}", file=Path("a.onnx"), first_frame=file)
+            for at, (name, file) in enumerate(parts)
         ),
         edges=edges,
         state={
@@ -176,10 +176,10 @@ def test_what_is_written_is_read_again(
 
 def test_the_digest_is_of_all_files(tmp_path: Path) -> None:
     path = write_stack(tmp_path)
-    before = digest_of_files(path)
+    before = graph.sha256_of(path)
     write_stack(tmp_path, head=HEAD.replace("0.5", "0.25"))
 
-    assert digest_of_files(path) != before
+    assert graph.sha256_of(path) != before
 
 
 def test_a_missing_input_is_named(tmp_path: Path) -> None:
@@ -187,17 +187,6 @@ def test_a_missing_input_is_named(tmp_path: Path) -> None:
 
     with pytest.raises(FramesError, match="input img is missing; there is prev_bev"):
         session.run({"prev_bev": np.zeros((1, 4), np.float32)})
-
-
-def test_whoever_stops_asking_leaves_the_rest_unrun(tmp_path: Path) -> None:
-    stack = SplitStack.load(write_stack(tmp_path))
-    files = {"backbone": stack.files["backbone"].path}
-    session = StackSession(stack, {n: Session(path) for n, path in files.items()})
-
-    first = next(session.runs(ones(True)[0].arrays, first=True))
-
-    assert first.label == "backbone"
-    assert first.values["feats"].tolist() == [[2, 2, 2, 2]]
 
 
 OTHER_FEATS = HEAD.replace("float[1,4] feats", "float[1,5] feats")
@@ -285,7 +274,28 @@ backbone (float[1,4] img, float[1,4] next_bev) => (float[1,4] feats)
         (
             THREE_FILES,
             {"head_first": HEAD_FIRST.replace("next_bev", "other_bev")},
-            "nothing feeds it back",
+            "frame 1: input prev_bev is missing",
+        ),
+        (
+            TWO_PARTS.replace("head.onnx", "../head.onnx"),
+            {},
+            "../head.onnx is outside the folder of the stack: not read",
+        ),
+        (
+            STATE % "/tmp/none.npy",
+            {},
+            "/tmp/none.npy is outside the folder of the stack: not read",
+        ),
+        (
+            TWO_PARTS,
+            {
+                "head": HEAD.replace('"" : 17', '"" : 11').replace(
+                    "kept = Sub(next_bev, learned)",
+                    "thin = Squeeze<axes = [0]>(next_bev)"
+                    " wide = Unsqueeze<axes = [0]>(thin) kept = Sub(wide, learned)",
+                )
+            },
+            "head.onnx is written in opset 11, backbone.onnx in 17, and Squeeze",
         ),
         ('[[part]]\nname = "a.b"\nfile = "head.onnx"\n', {}, "letters, digits"),
         ('[[part]]\nname = "a"\n', {}, "a has neither file nor first_frame"),

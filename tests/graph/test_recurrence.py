@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from me2e_compress.errors import FramesError, GraphError
-from me2e_compress.runtime.recurrence import SessionPort, not_fed_back, recurrence
+from me2e_compress.graph.recurrence import SessionPort, not_fed_back, recurrence
 from me2e_compress.runtime.session import Session
 from tests.nets import conv_attention
 

@@ -12,6 +12,13 @@ from me2e_compress.errors import GraphError
 
 SUFFIX = ".toml"
 """Suffix of a file that describes a stack, wherever a model is expected."""
+
+
+def is_stack(path: str | Path) -> bool:
+    """Return whether a file name is that of a stack's TOML file."""
+    return Path(path).suffix == SUFFIX
+
+
 ZEROS = "zeros"
 """The default first value of a state."""
 
@@ -27,8 +34,6 @@ class PartEntry(pydantic.BaseModel):
         file: the ONNX file, relative to the TOML; without one, the part runs at first
             frames alone.
         first_frame: the ONNX file that runs instead where a scene begins.
-        recipe: how ``compress`` treats it, where no recipe is given for all: a recipe's
-            name, or its TOML file, relative to this one.
     """
 
     model_config = _STRICT
@@ -36,7 +41,6 @@ class PartEntry(pydantic.BaseModel):
     name: str
     file: Path | None = None
     first_frame: Path | None = None
-    recipe: str | None = None
 
     @pydantic.model_validator(mode="after")
     def _named(self) -> Self:

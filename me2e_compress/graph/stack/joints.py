@@ -2,11 +2,11 @@
 
 import dataclasses
 import graphlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from me2e_compress.errors import GraphError
-from me2e_compress.runtime.stack.part_graph import PartGraph, misfit, told
+from me2e_compress.graph.stack.part_graph import PartGraph, form, misfit
 
 
 class FeedSource(NamedTuple):
@@ -76,22 +76,26 @@ def _check(
         )
     if misfit(given, taker.inputs[name]):
         raise GraphError(
-            f"{taker.label}.{name} takes {told(taker.inputs[name])}, and"
-            f" {giver.label}.{source.name}, which feeds it, is {told(given)}"
+            f"{taker.label}.{name} takes {form(taker.inputs[name])}, and"
+            f" {giver.label}.{source.name}, which feeds it, is {form(given)}"
         )
 
 
 @dataclasses.dataclass(frozen=True)
 class Names:
-    """The names of the parts' inputs and outputs in the stack."""
+    """The names of the parts' inputs and outputs in the stack.
+
+    ``taken`` has the stack's own inputs, whose names no output may have.
+    """
 
     files: Sequence[PartGraph]
+    taken: Collection[str] = ()
 
     def parts(self) -> tuple[str, ...]:
         """Return the parts, in the order of the file."""
         return tuple(dict.fromkeys(each.part for each in self.files))
 
-    def givers(self, output: str) -> tuple[str, ...]:
+    def parts_giving(self, output: str) -> tuple[str, ...]:
         """Return the parts that have an output of that name."""
         return tuple(
             dict.fromkeys(each.part for each in self.files if output in each.outputs)
@@ -102,7 +106,7 @@ class Names:
         files = (each for each in self.files if each.part == part)
         return tuple(dict.fromkeys(name for each in files for name in each.outputs))
 
-    def takers(self, name: str) -> tuple[str, ...]:
+    def parts_taking(self, name: str) -> tuple[str, ...]:
         """Return the parts that have an input of that name."""
         return tuple(
             dict.fromkeys(each.part for each in self.files if name in each.inputs)
@@ -110,17 +114,18 @@ class Names:
 
     def public(self, part: str, output: str) -> str:
         """Return the stack's name of an output, with its part if it is ambiguous."""
-        return output if len(self.givers(output)) == 1 else f"{part}.{output}"
+        alone = len(self.parts_giving(output)) == 1 and output not in self.taken
+        return output if alone else f"{part}.{output}"
 
     def output(self, text: str, where: str) -> FeedSource:
         """Find the output of a text: ``PART.NAME``, or a name that one part gives."""
-        givers = self.givers(text)
-        if len(givers) > 1:
-            raise two_givers(where, text, givers)
-        if givers:
-            return FeedSource(givers[0], text)
+        giving = self.parts_giving(text)
+        if len(giving) > 1:
+            raise ambiguous(where, text, giving)
+        if giving:
+            return FeedSource(giving[0], text)
         part, _, name = text.partition(".")
-        if part in self.givers(name):
+        if part in self.parts_giving(name):
             return FeedSource(part, name)
         there = [
             f"{each}.{output}"
@@ -132,17 +137,17 @@ class Names:
     def inputs(self, text: str, where: str) -> tuple[tuple[str, str], ...]:
         """Find the (part, input) pairs of a text: ``PART.NAME``, or any of a name."""
         part, _, name = text.partition(".")
-        if takers := self.takers(text):
+        if takers := self.parts_taking(text):
             return tuple((each, text) for each in takers)
-        if part in self.takers(name):
+        if part in self.parts_taking(name):
             return ((part, name),)
         there = (f"{file.label}.{each}" for file in self.files for each in file.inputs)
         raise GraphError(f"{where}: no part takes {text}; there is {', '.join(there)}")
 
 
-def two_givers(where: str, name: str, givers: Sequence[str]) -> GraphError:
+def ambiguous(where: str, name: str, giving: Sequence[str]) -> GraphError:
     """Build the error for an input that several parts could feed."""
-    ways = " or ".join(f"{each}.{name}" for each in givers)
+    ways = " or ".join(f"{each}.{name}" for each in giving)
     return GraphError(
-        f"{where}: {' and '.join(givers)} both give {name}: say {ways}, by [edges]"
+        f"{where}: {' and '.join(giving)} both give {name}: say {ways}, by [edges]"
     )

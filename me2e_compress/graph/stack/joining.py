@@ -7,21 +7,22 @@ from pathlib import Path
 
 from me2e_compress import documents
 from me2e_compress.errors import GraphError
-from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.recurrence import RECURRENT, SessionPort, recurrence
-from me2e_compress.runtime.stack.first_values import fitted, read_value
-from me2e_compress.runtime.stack.joints import FeedSource, Joints, Names, two_givers
-from me2e_compress.runtime.stack.part_graph import PartGraph, misfit, told
-from me2e_compress.runtime.stack.stack_file import ZEROS, StackFile, StateEntry
+from me2e_compress.graph.nodes import Array
+from me2e_compress.graph.recurrence import RECURRENT, SessionPort, recurrence
+from me2e_compress.graph.stack.first_values import fitted, read_value
+from me2e_compress.graph.stack.joints import FeedSource, Joints, Names, ambiguous
+from me2e_compress.graph.stack.part_graph import PartGraph, form, misfit
+from me2e_compress.graph.stack.stack_file import ZEROS, StackFile, StateEntry
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Joined:
-    """The result of joining a stack's files; see ``SplitStack``."""
+    """The result of joining a stack's files; see ``JoinedStack``."""
 
     inputs: Mapping[str, SessionPort]
     outputs: Mapping[str, SessionPort]
     answers: Mapping[str, tuple[str, str]]
+    names: Names
     recurrent: Mapping[str, str]
     first_values: Mapping[str, Array]
     at_first: Joints
@@ -36,6 +37,7 @@ def join(content: StackFile, files: Sequence[PartGraph], folder: Path) -> Joined
     at_next = joiner.joints(first=False)
     at_first = joiner.joints(first=True)
     inputs = _inputs((at_next, at_first))
+    joiner.names = dataclasses.replace(joiner.names, taken=inputs)
     # Name the outputs of the stack.
     answers = dict(joiner.answers())
     ports = {each.label: each.outputs for each in files}
@@ -47,9 +49,12 @@ def join(content: StackFile, files: Sequence[PartGraph], folder: Path) -> Joined
     recurrent = joiner.recurrent(inputs, outputs)
     _check_joined(joiner.names.parts(), (at_next, at_first), recurrent, answers)
     first_values = joiner.first_values(inputs, at_first)
-    metadata = _merged(files) | content.said()
+    # files that run at most frames win over those for first frames
+    kept = [each.label for each in at_next.graphs.values()]
+    ranked = sorted(files, key=lambda each: each.label in kept)
+    metadata = _merged(ranked) | content.said()
     return Joined(
-        *(inputs, outputs, answers, recurrent, first_values),
+        *(inputs, outputs, answers, joiner.names, recurrent, first_values),
         *(at_first, at_next, metadata),
     )
 
@@ -180,19 +185,19 @@ class _Joiner:
         if taker.recurrent().get(name) is not None:
             return FeedSource("", name)
         # An output of the same name feeds the input.
-        givers = [
+        giving = [
             part
             for part, each in graphs.items()
             if part != taker.part and name in each.outputs
         ]
-        if len(givers) > 1:
-            raise two_givers(f"{taker.label}.{name}", name, givers)
-        return FeedSource(givers[0] if givers else "", name)
+        if len(giving) > 1:
+            raise ambiguous(f"{taker.label}.{name}", name, giving)
+        return FeedSource(giving[0] if giving else "", name)
 
     def _given_first(self, entry: StateEntry) -> FeedSource | None:
         """Return the output that is a first value; None where it is something else."""
         part, _, name = entry.first.partition(".")
-        return FeedSource(part, name) if part in self.names.givers(name) else None
+        return FeedSource(part, name) if part in self.names.parts_giving(name) else None
 
     def _array(self, text: str, name: str, where: str) -> Array:
         path = self.folder / text
@@ -219,8 +224,8 @@ def _inputs(joints: Sequence[Joints]) -> dict[str, SessionPort]:
             other, known = found.setdefault(public, (taker, port))
             if misfit(known, port):
                 raise GraphError(
-                    f"{other.label} takes {public} as {told(known)}, {taker.label} as"
-                    f" {told(port)}; one that another part gives belongs into [edges]"
+                    f"{other.label} takes {public} as {form(known)}, {taker.label} as"
+                    f" {form(port)}; one that another part gives belongs into [edges]"
                 )
     return {name: port for name, (_, port) in found.items()}
 
@@ -235,8 +240,8 @@ def _check_answer(
         raise GraphError(f"[state] {name}: {answer} does not come at every frame")
     if name in inputs and misfit(outputs[answer], inputs[name]):
         raise GraphError(
-            f"[state] {name} takes {told(inputs[name])}, and {answer}, which is fed"
-            f" back to it, is {told(outputs[answer])}"
+            f"[state] {name} takes {form(inputs[name])}, and {answer}, which is fed"
+            f" back to it, is {form(outputs[answer])}"
         )
 
 

@@ -1,0 +1,1 @@
+"""Several ONNX files as one graph: joined on reading, split on writing."""

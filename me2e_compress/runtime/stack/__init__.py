@@ -1,1 +1,0 @@
-"""Run a stack of several ONNX files as one model."""

@@ -1,0 +1,293 @@
+"""A stack's files as one graph: it answers as they do, and is cut again."""
+
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph, recipe
+from me2e_compress.errors import GraphError
+from me2e_compress.graph import JoinedStack
+from me2e_compress.manager import PassManager
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context
+from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.session import Session, replay
+from me2e_compress.runtime.stack_session import open_session
+from tests.stacks import (
+    DENSE,
+    HEAD,
+    THREE_FILES,
+    TWO_PARTS,
+    ones,
+    write_dense,
+    write_stack,
+)
+
+
+def by_files(path: Path, frames: list[Frame]) -> list[dict[str, Array]]:
+    """Run the files of a stack one by one; return what the frames' outputs are."""
+    stack = JoinedStack.load(path)
+    sessions = {
+        label: Session(each.path, threads=1, optimize=False)
+        for label, each in stack.files.items()
+    }
+    joined, found, state = stack.joined, list[dict[str, Array]](), dict[str, Array]()
+    for frame in frames:
+        joints = joined.at_first if frame.starts_scene else joined.at_next
+        if frame.starts_scene:
+            shape = joined.inputs["prev_bev"].shape
+            sizes = [size for size in shape if isinstance(size, int)]
+            state = {"prev_bev": np.zeros(sizes, np.float32)}
+            state = {**state, **joined.first_values}
+        values = dict[tuple[str, str], Array]()
+        for part in joints.order:
+            fed = {
+                name: values[source]
+                if source.part
+                else {**frame.arrays, **state}[source.name]
+                for name, source in joints.sources[part].items()
+            }
+            ran = sessions[joints.graphs[part].label].run(fed)
+            values |= {(part, name): value for name, value in ran.items()}
+        found.append({name: values[at] for name, at in joined.answers.items()})
+        state = {name: found[-1][answer] for name, answer in joined.recurrent.items()}
+    return found
+
+
+def images(count: int = 5) -> list[Frame]:
+    draws = np.random.default_rng(0).standard_normal((count, 4, 16))
+    return [
+        Frame(at, at in (0, 3), {"img": draw.astype(np.float32)})
+        for at, draw in enumerate(draws)
+    ]
+
+
+@pytest.mark.parametrize("toml", [TWO_PARTS, THREE_FILES])
+def test_the_joined_graph_answers_as_its_parts(tmp_path: Path, toml: str) -> None:
+    path = write_dense(tmp_path, toml)
+
+    session = open_session(path, threads=1, optimize=False)
+    whole = list(replay(session, images()))
+
+    for one, other in zip(whole, by_files(path, images()), strict=True):
+        assert one.keys() == other.keys()
+        assert all(np.array_equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.parametrize("text", ["exact", "full-fused"])
+def test_what_passes_made_is_cut_and_joined_again(tmp_path: Path, text: str) -> None:
+    path = write_dense(tmp_path, THREE_FILES)
+    stack = JoinedStack.load(path)
+    passes = tuple(each for each in recipe.load(text) if each.exact)
+    manager = PassManager(passes, verify_frames=0)
+    small = manager.run(stack.model, Context(ModuleMap.whole())).model
+    (tmp_path / "small").mkdir()
+
+    for label, each in stack.first_files.items():
+        graph.save(each.model, tmp_path / "small" / f"{label}.onnx")
+    stack.save(small, tmp_path / "small" / "stack.toml")
+
+    again = JoinedStack.load(tmp_path / "small" / "stack.toml")
+    for label, each in stack.files.items():
+        assert again.files[label].inputs == each.inputs
+        assert again.files[label].outputs == each.outputs
+    whole = list(replay(open_session(again.path, threads=1), images()))
+    for one, other in zip(whole, by_files(path, images()), strict=True):
+        for name, value in one.items():
+            assert value == pytest.approx(other[name], rel=1e-5, abs=1e-6)
+
+
+def test_names_that_two_parts_have_are_told_apart(tmp_path: Path) -> None:
+    model = JoinedStack.load(write_dense(tmp_path)).model
+
+    assert list(model.graph.initializers) == ["backbone.w", "points", "head.w"]
+    assert [value.name for value in model.graph.outputs] == [
+        *("next_bev", "plan", "feats")
+    ]
+
+
+def test_weights_are_shared_with_the_files(tmp_path: Path) -> None:
+    stack = JoinedStack.load(write_dense(tmp_path))
+
+    joined = stack.model.graph.initializers["backbone.w"].const_value
+    assert joined is stack.files["backbone"].model.graph.initializers["w"].const_value
+
+
+def test_an_older_part_is_written_in_the_opset_of_the_newest(tmp_path: Path) -> None:
+    path = write_stack(tmp_path, head=HEAD.replace('"" : 17', '"" : 16'))
+
+    assert graph.opset_of(JoinedStack.load(path).model) == 17
+    plans = [each["plan"][0, 0, 0] for each in replay(open_session(path), ones(True))]
+    assert plans == [1.0]
+
+
+def test_a_name_that_the_state_bears_twice(tmp_path: Path) -> None:
+    path = write_stack(
+        tmp_path,
+        TWO_PARTS + '[state]\nfeats = "backbone.feats"\n',
+        head=HEAD.replace("prev_bev", "other"),
+    )
+    frames = [
+        Frame(at, not at, {**each.arrays, "other": np.zeros((1, 4), np.float32)})
+        for at, each in enumerate(ones(True, False))
+    ]
+
+    session = open_session(path, threads=1)
+
+    assert session.recurrent == {"feats": "backbone.feats"}
+    bevs = [float(each["next_bev"][0, 0]) for each in replay(session, frames)]
+    assert bevs == [0.0, 2.0]
+
+
+def test_what_a_part_passes_on_keeps_its_names(tmp_path: Path) -> None:
+    passing = HEAD.replace("float[1,2,2] plan)", "float[1,2,2] plan, float[1,4] feats)")
+    path = write_stack(
+        tmp_path,
+        TWO_PARTS.replace("head", "neck") + "[edges]\nfeats = 'backbone.feats'\n",
+        neck=passing,
+    )
+    stack = JoinedStack.load(path)
+
+    stack.save(stack.model, tmp_path / "again.toml")
+
+    again = JoinedStack.load(tmp_path / "again.toml")
+    assert list(again.outputs) == ["next_bev", "plan", "neck.feats", "backbone.feats"]
+    assert again.files["neck"].inputs == stack.files["neck"].inputs
+
+
+def test_a_part_that_would_need_what_no_file_gives_is_named(tmp_path: Path) -> None:
+    stack = JoinedStack.load(write_stack(tmp_path))
+    (add,) = (each for each in stack.model.graph if each.op_type == "Add")
+    (image,) = (each for each in stack.model.graph.inputs if each.name == "img")
+    add.replace_input_with(0, image)
+
+    with pytest.raises(GraphError, match=r"head cannot be cut out again: .* img"):
+        stack.save(stack.model, tmp_path / "again.toml")
+
+
+def test_dense_parts_share_no_name_with_their_inner_values(tmp_path: Path) -> None:
+    body = DENSE["backbone"].replace("a = MatMul(img, w) ", "plan = MatMul(img, w) ")
+    body = body.replace("Relu(a)", "Relu(plan)").replace("w)", "img)")
+    body = body.replace("float[4,16] img", "float[4,4] img").replace("32", "4")
+    model = ir.from_onnx_text(body)
+    path = write_stack(tmp_path)
+    graph.save(model, tmp_path / "backbone.onnx")
+    head = HEAD.replace("float[1,4]", "float[4,4]").replace("1,2,2", "4,2,2")
+    head = head.replace("learned = {1,2,3,4}", f"learned = {{{','.join('1' * 16)}}}")
+    graph.save(ir.from_onnx_text(head), tmp_path / "head.onnx")
+
+    joined = JoinedStack.load(path).model
+
+    names = [value.name for node in joined.graph for value in node.outputs]
+    assert "backbone.plan" in names
+    assert len(names) == len(set(names))
+
+
+CALL = """
+<ir_version: 9, opset_import: ["" : 17, "own" : 1]>
+{name} (float[1,4] {taken}) => (float[1,4] {given}) {{ {given} = own.Twice({taken}) }}
+<domain: "own", opset_import: ["" : 17]>
+Twice (x) => (y) {{ y = {body} }}
+"""
+
+
+def test_functions_of_one_name_that_differ_are_told_apart(tmp_path: Path) -> None:
+    path = write_stack(
+        tmp_path,
+        backbone=CALL.format(
+            name="backbone", taken="img", given="feats", body="Add(x, x)"
+        ),
+        head=CALL.format(name="head", taken="feats", given="plan", body="Mul(x, x)"),
+    )
+
+    stack = JoinedStack.load(path)
+    stack.save(stack.model, tmp_path / "again.toml")
+
+    for each in (path, tmp_path / "again.toml"):
+        (found,) = replay(open_session(each, threads=1), ones(True))
+        assert found["plan"][0, 0] == 4.0
+    assert len(JoinedStack.load(path).model.functions) == 2
+
+
+BRANCH = """
+<ir_version: 9, opset_import: ["" : 17]>
+{name} (float[1,4] {taken}) => (float[1,4] {given})
+<bool yes = {{1}}, float[1] two = {{2}}> {{
+    {given} = If (yes) <
+        then_branch = then () => (float[1,4] inner) {{ inner = Mul({taken}, two) }},
+        else_branch = other () => (float[1,4] rest) {{ rest = Identity({taken}) }}
+    >
+}}
+"""
+
+
+def test_names_in_bodies_are_told_apart_too(tmp_path: Path) -> None:
+    path = write_stack(
+        tmp_path,
+        backbone=BRANCH.format(name="backbone", taken="img", given="feats"),
+        head=BRANCH.format(name="head", taken="feats", given="plan"),
+    )
+
+    stack = JoinedStack.load(path)
+    stack.save(stack.model, tmp_path / "again.toml")
+
+    for each in (path, tmp_path / "again.toml"):
+        (found,) = replay(open_session(each, threads=1), ones(True))
+        assert found["plan"][0, 0] == 4.0
+
+
+def test_large_weights_stay_on_disk(tmp_path: Path) -> None:
+    path = write_dense(tmp_path)
+    head = graph.load(tmp_path / "head.onnx")
+    (tmp_path / "head.onnx").unlink()
+    graph.save(head, tmp_path / "head.onnx", external=True)
+
+    stack = JoinedStack.load(path)
+
+    weight = stack.model.graph.initializers["head.w"].const_value
+    assert isinstance(weight, ir.ExternalTensor)
+    (tmp_path / "small").mkdir()
+    stack.save(stack.model, tmp_path / "small" / "stack.toml")
+    assert (tmp_path / "small" / "head.onnx.data").is_file()
+    assert not (tmp_path / "small" / "backbone.onnx.data").exists()
+
+
+def test_what_a_pass_took_away_is_missing_from_its_part(tmp_path: Path) -> None:
+    toml = TWO_PARTS + '[state]\nprev_bev = {first = "head.learned"}\n'
+    stack = JoinedStack.load(write_stack(tmp_path, toml))
+    body, small = stack.model.graph, tmp_path / "small"
+    (add,) = (each for each in body if each.op_type == "Add")
+    (state,) = (each for each in body.inputs if each.name == "prev_bev")
+    zeros = ir.tensor(np.zeros((1, 4), np.float32), name="zeros")
+    value = ir.Value(name="zeros", type=state.type, shape=state.shape)
+    value.const_value = zeros
+    body.register_initializer(value)
+    add.replace_input_with(1, value)
+    body.remove(
+        [each for each in body if each.op_type == "Mul" and each.name == "/head/Mul"]
+    )
+    body.inputs.remove(state)
+    small.mkdir()
+
+    stack.save(stack.model, small / "stack.toml")
+
+    again = JoinedStack.load(small / "stack.toml")
+    assert list(again.joined.inputs) == ["img"]
+    assert again.recurrent == {}
+    (found,) = replay(open_session(again.path, threads=1), ones(True))
+    assert found["next_bev"][0, 0] == 2.0
+
+
+def test_a_part_without_an_output_is_left_out(tmp_path: Path) -> None:
+    stack = JoinedStack.load(write_stack(tmp_path))
+    body, small = stack.model.graph, tmp_path / "small"
+    for value in list(body.outputs):
+        if value.name != "feats":
+            body.outputs.remove(value)
+    small.mkdir()
+
+    stack.save(stack.model, small / "stack.toml")
+
+    assert list(JoinedStack.load(small / "stack.toml").files) == ["backbone"]
