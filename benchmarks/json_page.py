@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.driving.adapter.port_use import PortUse
+from me2e_compress.driving.adapter.port_uses import PortUse
 from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.open_loop import OpenLoop
 from me2e_compress.manager import Step, Verification
@@ -28,11 +28,10 @@ from me2e_compress.sensitivity.remedy import Remedy
 from me2e_compress.study.on_road.halving import Rung
 from me2e_compress.targets.base import LintFinding
 from me2e_compress.workflows.check_model import ModelCheck
-from me2e_compress.workflows.compress_fidelity import MeasuredLoss
 from me2e_compress.workflows.doctor import Checkup
 from me2e_compress.workflows.inspect_result import InspectResult
-from me2e_compress.workflows.inspect_stack import StackInspectResult
 from me2e_compress.workflows.int8_outcome import Int8Outcome
+from me2e_compress.workflows.measured_loss import MeasuredLoss
 from me2e_compress.zoo.weights_record import WeightsRecord
 
 PAGE = Path(__file__).parents[1] / "docs" / "json.md"
@@ -41,7 +40,7 @@ NAMED = (
     *(Ranges, PortUse, Fidelity, OpenLoop, Step, Verification, Decision, QuantPlan),
     *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity, Remedy, Rung),
     *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
-    *(StackInspectResult, Int8Outcome, WeightsRecord),
+    *(Int8Outcome, WeightsRecord),
 )
 """Classes that the forms name; what their fields name is found."""
 HEAD = """\
