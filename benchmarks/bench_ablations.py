@@ -18,11 +18,11 @@ from pathlib import Path
 
 import onnx_ir as ir
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import Me2eError
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
 from me2e_compress.study.paper.published import (
     MODULES_AWAY,

@@ -21,7 +21,7 @@ import onnxruntime
 from benchmarks.processes import in_turn
 from me2e_compress import graph
 from me2e_compress.graph import provenance
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.hoist_linear import HoistLinear
 

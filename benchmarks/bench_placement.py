@@ -27,15 +27,15 @@ import onnx_ir as ir
 from benchmarks.processes import has_modelopt
 from benchmarks.subjects import Subject, make
 from benchmarks.synthetic import synthetic
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.graph import WEIGHTED
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.nodes import constant_values
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import ModuleMap
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.quantization.plan import (
     FLOAT,

@@ -16,9 +16,10 @@ from pathlib import Path
 from time import process_time
 
 from benchmarks.plan_reaction import plan_reaction
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.fidelity.compare import Reference
+from me2e_compress.manager import recipe
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.frames import FramesOptions, record_frames

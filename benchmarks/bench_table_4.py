@@ -24,7 +24,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import Me2eError
 from me2e_compress.graph import provenance
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.quantization.plan import make_plan, stamp_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme

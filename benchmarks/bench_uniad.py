@@ -161,7 +161,7 @@ def _noted(out: Path, spec: Stack, frames: int) -> list[dict[str, object]]:
 def _truth(given: argparse.Namespace) -> dict[str, object]:
     import onnx_ir as ir
 
-    from me2e_compress.modules import ModuleMap, assign
+    from me2e_compress.graph.modules import ModuleMap, assign
     from tests.zoo.truth import record
 
     known = record(given.stack, opset=given.opset)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
-from me2e_compress import recipe
+from me2e_compress.manager import recipe
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study import Condition, Study, Timing, Variant
 from me2e_compress.workflows.compress import CompressOptions

@@ -10,8 +10,8 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import provenance
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.provenance import Provenance
-from me2e_compress.modules import ModuleMap
 from me2e_compress.quantization.plan import QuantPlan, make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme

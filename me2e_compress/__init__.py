@@ -17,11 +17,11 @@ from me2e_compress.version import __version__
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 if TYPE_CHECKING:
-    from me2e_compress import graph, recipe
+    from me2e_compress import graph
     from me2e_compress.calibration.dataset import CalibrationSet
     from me2e_compress.errors import Me2eError
+    from me2e_compress.graph.modules import ModuleMap
     from me2e_compress.manager import PassManager, Report, Step, Verification
-    from me2e_compress.modules import ModuleMap
     from me2e_compress.passes import PASSES, Context, Pass, PassResult
     from me2e_compress.study import StudyResult, load_study, run_study
     from me2e_compress.study.write import write_study
@@ -108,7 +108,6 @@ __all__ = [
     "measure_sensitivity",
     "plan",
     "profile",
-    "recipe",
     "record_frames",
     "run_study",
     "score",
@@ -120,11 +119,8 @@ _MODULES = (
     "errors",
     "evaluators",
     "graph",
-    "modules",
     "passes",
-    "recipe",
     "registry",
-    "rewrite",
     "targets",
     "testing",
 )
@@ -134,7 +130,7 @@ _ROOMS = {
     "calibration.dataset": ("CalibrationSet",),
     "errors": ("Me2eError",),
     "manager": ("PassManager", "Report", "Step", "Verification"),
-    "modules": ("ModuleMap",),
+    "graph.modules": ("ModuleMap",),
     "passes": ("PASSES", "Context", "Pass", "PassResult"),
     "study": ("StudyResult", "load_study", "run_study"),
     "study.write": ("write_study",),

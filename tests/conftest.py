@@ -8,7 +8,7 @@ import onnx
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.workflows import first_opening
 from tests import profiles

@@ -9,8 +9,8 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import provenance
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.provenance import Provenance
-from me2e_compress.modules import ModuleMap
 from me2e_compress.quantization.rules.paper_rules import PaperRules
 
 PAPER = PaperRules()

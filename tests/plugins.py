@@ -3,7 +3,7 @@
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import rewrite
+from me2e_compress.graph import rewrite
 
 TEXT = """
 <ir_version: 9, opset_import: ["" : 17, "custom_op" : 1, "trt.plugins" : 1]>

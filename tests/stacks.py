@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress import graph, rewrite
+from me2e_compress import graph
+from me2e_compress.graph import rewrite
 from me2e_compress.runtime.frames import Frame
 from tests.frames import record
 

@@ -18,8 +18,8 @@ from me2e_compress.display import (
     reason,
     significant,
 )
+from me2e_compress.graph.modules import ModuleMap, assign
 from me2e_compress.manager import PassManager
-from me2e_compress.modules import ModuleMap, assign
 from me2e_compress.passes import PASSES, Context
 from me2e_compress.quantization.plan import QuantPlan
 from me2e_compress.quantization.plan.decision import Decision

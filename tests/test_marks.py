@@ -14,7 +14,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.recording import write_recording
 from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
 from me2e_compress.calibration.statistics import Statistics
-from me2e_compress.marks import BYTES, MARK, is_marked
+from me2e_compress.registry.marks import BYTES, MARK, is_marked
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.recorded_future import RecordedFuture

@@ -7,13 +7,13 @@ import numpy.typing as npt
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import FramesError
 from me2e_compress.graph import provenance
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import detect
+from me2e_compress.graph.modules import detect
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.runtime.session import Session, replay
 from tests.stand_in import record_driver, write_model

@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 
 import me2e_compress
-from me2e_compress import recipe
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import recipe
 from me2e_compress.passes import PASSES
 
 DOCS = Path(__file__).parents[1] / "docs"

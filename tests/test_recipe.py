@@ -5,8 +5,8 @@ from typing import ClassVar
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import recipe
 from me2e_compress.errors import RecipeError
+from me2e_compress.manager import recipe
 from me2e_compress.passes import Context, Pass, PassResult
 from tests.installed import install
 

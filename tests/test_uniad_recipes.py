@@ -7,10 +7,9 @@ import numpy.typing as npt
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import recipe
 from me2e_compress.graph import provenance
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.runtime.session import run_once
 from tests.nets import net

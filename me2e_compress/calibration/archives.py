@@ -10,10 +10,10 @@ from typing import IO
 
 import numpy as np
 
-from me2e_compress import marks
 from me2e_compress.display import reason
-from me2e_compress.documents import UNREADABLE, check_regular
 from me2e_compress.errors import FramesError
+from me2e_compress.registry import marks
+from me2e_compress.registry.documents import UNREADABLE, check_regular
 from me2e_compress.runtime.frames import Array
 
 LARGEST_BYTES = 2 << 30

@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import documents, marks
 from me2e_compress.calibration.archives import Declared, declared, load_arrays
 from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.calibration.static_inputs import check_static, static_inputs
@@ -24,6 +23,7 @@ from me2e_compress.display import Displayed, Table, counted, reason, table
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.recurrence import not_fed_back, recurrent_inputs, sides
+from me2e_compress.registry import documents, marks
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.recorded_future import RecordedFuture
 

@@ -13,11 +13,11 @@ import numpy as np
 from onnxruntime.quantization.calibrate import TensorData
 from onnxruntime.quantization.quant_utils import write_calibration_table
 
-from me2e_compress import drafts
 from me2e_compress.calibration.observers import QUANT_MAX, scale_of
 from me2e_compress.calibration.observers.base import MaxMin
 from me2e_compress.calibration.ranges import IMPORTED, LARGEST, Ranges
 from me2e_compress.errors import FramesError
+from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_bytes
 
 TABLE_FILES = ("calibration.flatbuffers", "calibration.json", "calibration.cache")

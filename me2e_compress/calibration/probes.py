@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress import rewrite
 from me2e_compress.calibration.statistics import BINS
+from me2e_compress.graph import rewrite
 
 Reading: TypeAlias = tuple[list[ir.Node], list[ir.Value]]
 """Nodes that measure a tensor, in order, and the 1-D values that they produce."""

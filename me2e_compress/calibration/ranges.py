@@ -7,11 +7,11 @@ from typing import Self
 import numpy as np
 import pydantic
 
-from me2e_compress import documents
 from me2e_compress.calibration.observers import OBSERVERS, Observer
 from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.display import Displayed, Table, counted, table
 from me2e_compress.errors import FramesError
+from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_document
 
 OUTLIER_CREST = 64

@@ -10,10 +10,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from me2e_compress import documents, drafts, marks
 from me2e_compress.calibration.dataset import FUTURE
 from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.errors import FramesError
+from me2e_compress.registry import documents, drafts, marks
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.frames import Array, Frame
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from me2e_compress import documents
 from me2e_compress.calibration.archives import archive_of, load_arrays
 from me2e_compress.errors import FramesError
+from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.frames import Array
 

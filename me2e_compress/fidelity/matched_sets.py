@@ -13,8 +13,8 @@ from typing import Self
 import numpy as np
 import pydantic
 
-from me2e_compress import documents
 from me2e_compress.errors import GraphError
+from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
 
 SETS = "me2e.sets"

@@ -12,7 +12,6 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 from google.protobuf.message import DecodeError
 
-from me2e_compress import drafts, marks
 from me2e_compress.display import reason
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import structure
@@ -25,6 +24,7 @@ from me2e_compress.graph.weight_files import (
     settle,
     write_inline,
 )
+from me2e_compress.registry import drafts, marks
 
 INLINE_LIMIT_BYTES = 1_900_000_000
 """Weights beyond this go to a data file: protobuf cannot hold 2 GiB in one message."""

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 
 import onnx_ir as ir
 
-from me2e_compress import documents
 from me2e_compress.errors import GraphError
+from me2e_compress.registry import documents
 
 RECURRENT = "me2e.recurrent"
 """Metadata key: JSON ``{input: output}``, null for an input that is not fed back;

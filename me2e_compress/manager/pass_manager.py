@@ -21,11 +21,11 @@ from me2e_compress.errors import (
 from me2e_compress.graph.opset import lowered
 from me2e_compress.manager import equivalence, pass_contract, reproducer
 from me2e_compress.manager.attempt import attempt
+from me2e_compress.manager.recipe import to_text
 from me2e_compress.manager.report import LossyPass, Report, Step, Verification
 from me2e_compress.manager.verification_inputs import VerificationInputs
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize, needs_import
-from me2e_compress.recipe import to_text
 
 NOT_ASKED = "no frame was asked for (--verify-frames 0)"
 

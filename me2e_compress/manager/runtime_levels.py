@@ -10,9 +10,9 @@ import onnx_ir as ir
 
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import is_read, makers_of
+from me2e_compress.graph.rewrite import sweep
 from me2e_compress.manager.output_errors import errors, relative
 from me2e_compress.manager.verification_inputs import VerificationInputs
-from me2e_compress.rewrite import sweep
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import Level, Session
 

@@ -10,7 +10,7 @@ import onnx_ir as ir
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import array_of, provenance
 from me2e_compress.graph.nodes import Array
-from me2e_compress.rewrite import add_constant, fresh_name, value_names
+from me2e_compress.graph.rewrite import add_constant, fresh_name, value_names
 
 AttributeValue: TypeAlias = int | float | str | Sequence[int]
 Attributes: TypeAlias = Mapping[str, AttributeValue]

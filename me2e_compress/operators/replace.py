@@ -7,6 +7,7 @@ import onnx_ir as ir
 from me2e_compress.errors import GraphError, PreconditionError
 from me2e_compress.graph import opset_of
 from me2e_compress.graph.nodes import STANDARD, is_read, nodes_in
+from me2e_compress.graph.rewrite import replace_value, value_names
 from me2e_compress.graph.shapes import open_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.operators.base import Operator
@@ -18,7 +19,6 @@ from me2e_compress.operators.dialect import (
     Values,
 )
 from me2e_compress.operators.lookup import find
-from me2e_compress.rewrite import replace_value, value_names
 
 _LEAST_OPSET = 13
 """ReduceSum and Unsqueeze take their axes as inputs from here on."""

@@ -13,7 +13,7 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import FramesError, RecipeError
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.runtime.providers import CPU, Provider
 
 

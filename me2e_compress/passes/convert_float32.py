@@ -5,8 +5,8 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress import rewrite
 from me2e_compress.display import counted
+from me2e_compress.graph import rewrite
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.convert_float16.element_types import (
     FLOAT,

@@ -11,8 +11,8 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.nodes import makers_of
-from me2e_compress.modules import ModuleMap
 from me2e_compress.passes.grown_axis import carry
 from me2e_compress.passes.parts import Part, fit, listed, stretched
 from me2e_compress.passes.substitutes import finished, reshaped, shaped_like

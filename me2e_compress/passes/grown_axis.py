@@ -5,8 +5,9 @@ import math
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import graph, rewrite
+from me2e_compress import graph
 from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import rewrite
 from me2e_compress.graph.node_inference import REFUSALS, infer_node
 from me2e_compress.passes.parts import listed
 

@@ -8,11 +8,10 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress import rewrite
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph import provenance
+from me2e_compress.graph import provenance, rewrite
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.quantization.plan import (
     INT8,

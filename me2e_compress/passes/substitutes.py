@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import graph, rewrite
+from me2e_compress import graph
 from me2e_compress.calibration.means import load_means, token_means
 from me2e_compress.display import counted
 from me2e_compress.errors import FramesError, PreconditionError
-from me2e_compress.graph import provenance
+from me2e_compress.graph import provenance, rewrite
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.parts import Part, fit, listed, stretched
 from me2e_compress.runtime.frames import Array

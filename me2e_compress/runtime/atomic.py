@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from me2e_compress import drafts, marks
+from me2e_compress.registry import drafts, marks
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -17,8 +17,8 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
-from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
+from me2e_compress.registry import documents
 from me2e_compress.runtime.latency_trace import LatencyTrace
 
 FORMATS = (

@@ -7,10 +7,10 @@ from typing import Annotated, Any, Self, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from me2e_compress import documents
 from me2e_compress.display import Displayed, Table, counted, not_measured, table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.percentiles import percentile, too_few
+from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.others_load import Load
 

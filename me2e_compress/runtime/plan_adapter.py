@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 import pydantic
 
-from me2e_compress import documents
 from me2e_compress.errors import GraphError
+from me2e_compress.registry import documents
 from me2e_compress.runtime.trajectory import Trajectory
 
 PLAN = "me2e.plan"

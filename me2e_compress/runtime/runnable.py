@@ -20,8 +20,8 @@ from onnxruntime.capi import (
 from me2e_compress import graph, operators
 from me2e_compress.errors import GraphError, PreconditionError
 from me2e_compress.graph.nodes import array_of, bodies_of, input_at, is_standard, maker
+from me2e_compress.graph.rewrite import value_names
 from me2e_compress.operators import OWN_DOMAIN, kernels
-from me2e_compress.rewrite import value_names
 from me2e_compress.runtime.int8_values import read_int8
 from me2e_compress.runtime.providers import CPU, Provider
 

@@ -10,7 +10,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.fidelity.compare import Fidelity, Reference
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.quantization.plan import Overrides, QuantPlan, make_plan
 from me2e_compress.quantization.plan.overrides import keep_float
 from me2e_compress.quantization.rules import RuleSet

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
-from me2e_compress.marks import IN_JSON
+from me2e_compress.registry import documents
+from me2e_compress.registry.marks import IN_JSON
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 

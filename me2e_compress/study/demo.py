@@ -4,8 +4,8 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
-from me2e_compress import recipe
 from me2e_compress.evaluators.highway.engine import LocalEngine
+from me2e_compress.manager import recipe
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.simulator.routes import load_routes, pick_routes

@@ -12,7 +12,6 @@ from typing import Any, Self
 import numpy as np
 from pydantic import TypeAdapter
 
-from me2e_compress import documents
 from me2e_compress.errors import StudyError
 from me2e_compress.metrics.differences import PairedDifference
 from me2e_compress.metrics.episode import Episode
@@ -20,6 +19,7 @@ from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.metrics.route_values import DS, RouteColumn, RouteValues
 from me2e_compress.metrics.scores import Scores
+from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_bytes
 
 

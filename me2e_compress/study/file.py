@@ -8,13 +8,14 @@ from typing import Literal
 
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
-from me2e_compress import documents, recipe
 from me2e_compress.driving.policies import PythonDriver, driver_named
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.evaluator import routes_named
+from me2e_compress.manager import recipe
 from me2e_compress.passes import Pass
+from me2e_compress.registry import documents
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study.condition import Condition

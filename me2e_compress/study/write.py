@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from me2e_compress import drafts, marks
 from me2e_compress.display import in_markdown
 from me2e_compress.errors import StudyError
+from me2e_compress.registry import drafts, marks
 from me2e_compress.runtime.atomic import write_bytes, write_document
 from me2e_compress.study.paper.paper_result import PaperResult, paper_page
 from me2e_compress.study.report.page import Section

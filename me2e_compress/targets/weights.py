@@ -7,10 +7,9 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress import rewrite
 from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph import opset_of
+from me2e_compress.graph import opset_of, rewrite
 from me2e_compress.quantization.plan import Decision
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import run_once

@@ -7,8 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress import rewrite
-from me2e_compress.graph import provenance
+from me2e_compress.graph import provenance, rewrite
 
 BY = "quantize-int8"
 

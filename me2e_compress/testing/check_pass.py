@@ -7,10 +7,10 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import Me2eError, VerificationError
 from me2e_compress.graph import provenance
+from me2e_compress.graph.modules import map_of
 from me2e_compress.manager import equivalence
 from me2e_compress.manager.attempt import attempt
 from me2e_compress.manager.verification_inputs import VerificationInputs
-from me2e_compress.modules import map_of
 from me2e_compress.passes import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.testing.form import check_class

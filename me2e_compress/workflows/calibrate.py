@@ -7,7 +7,7 @@ from pathlib import Path
 
 import onnx_ir as ir
 
-from me2e_compress import drafts, graph, recipe
+from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.exchange import (
     TABLE_FILES,
@@ -21,9 +21,11 @@ from me2e_compress.calibration.sample import FrameSubset, draw, shard
 from me2e_compress.calibration.stack_frames import StackFrames, recording_of
 from me2e_compress.calibration.statistics import Statistics, merge
 from me2e_compress.errors import FramesError, RecipeError
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.stack.part_graph import PartGraph
-from me2e_compress.modules import ModuleMap
+from me2e_compress.manager import recipe
 from me2e_compress.passes.fix_shapes import with_sizes
+from me2e_compress.registry import drafts
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.calibrate_result import CalibrateResult, beside_ranges
 from me2e_compress.workflows.checks import (

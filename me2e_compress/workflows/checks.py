@@ -13,10 +13,10 @@ from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.outputs import plan_of
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import EvaluationError, GraphError, RecipeError
+from me2e_compress.graph.modules import ModuleMap, map_of
 from me2e_compress.graph.opset import lowered
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.shapes import unshaped_plugins
-from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.zoo.shipped import SHIPPED, shipped
 

@@ -8,14 +8,14 @@ from time import process_time
 from typing import TypeAlias
 
 from me2e_compress import graph
-from me2e_compress import recipe as recipes
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.stack_frames import StackFrames
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import SQNR_FLOOR_DB, Floor
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager import PassManager, Report
+from me2e_compress.manager import recipe as recipes
 from me2e_compress.manager.pass_manager import collector_paused
-from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.quantize_int8 import QuantizeInt8

@@ -7,11 +7,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from me2e_compress import drafts, graph
+from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.manager import Report
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.quantization.plan import plan_of, save_plan
+from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.workflows.checks import Given, check_folder
 from me2e_compress.workflows.claims import writing

@@ -5,8 +5,9 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.manager import recipe
 from me2e_compress.runtime.interleaved import RunTimes, time_interleaved
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.runtime.session import Session

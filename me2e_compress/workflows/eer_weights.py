@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field, TypeAdapter, with_config
 
-from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.eer import MEASURES, EerResult, EerScale, Normalization
+from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_json
 
 Kind = Literal["measured", "modelled"]

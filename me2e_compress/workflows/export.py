@@ -6,9 +6,9 @@ from pathlib import Path
 
 import onnx_ir as ir
 
-from me2e_compress import graph, rewrite
+from me2e_compress import graph
 from me2e_compress.errors import GraphError, RecipeError
-from me2e_compress.graph import file_bytes
+from me2e_compress.graph import file_bytes, rewrite
 from me2e_compress.operators import (
     dialect_of,
     fused_nodes,

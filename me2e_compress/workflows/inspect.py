@@ -7,15 +7,15 @@ from pathlib import Path
 
 import onnx_ir as ir
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.graph import provenance
+from me2e_compress.graph.modules import Item, ModuleMap, assign, itemise
 from me2e_compress.graph.opset import lowered
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.stack.stack_file import ZEROS
 from me2e_compress.graph.summary import why_uncounted
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import Item, ModuleMap, assign, itemise
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
 from me2e_compress.runtime.energy.modelled import (

@@ -3,7 +3,7 @@
 import dataclasses
 
 from me2e_compress.graph import Port
-from me2e_compress.modules import Item
+from me2e_compress.graph.modules import Item
 from me2e_compress.runtime.energy.modelled import ModelledEnergy
 from me2e_compress.workflows.result import (
     Result,

@@ -5,12 +5,13 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import draw
 from me2e_compress.calibration.stack_frames import recording_of
+from me2e_compress.manager import recipe
 from me2e_compress.passes import Pass
 from me2e_compress.passes.fix_shapes import FixShapes, with_sizes
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS

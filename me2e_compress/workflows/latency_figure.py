@@ -13,8 +13,8 @@ from matplotlib.style import context
 from matplotlib.ticker import PercentFormatter
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.marks import MARK
 from me2e_compress.metrics.percentiles import percentile, too_few
+from me2e_compress.registry.marks import MARK
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.latency_trace import LatencyTrace, Microseconds
 

@@ -9,7 +9,6 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from me2e_compress import modules, recipe
 from me2e_compress.calibration.logs import LOGS
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.driving.host_stage import HOST_STAGES
@@ -19,6 +18,8 @@ from me2e_compress.driving.policies import POLICIES
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import RecipeError
 from me2e_compress.evaluators import EVALUATORS
+from me2e_compress.graph import modules
+from me2e_compress.manager import recipe
 from me2e_compress.operators import OPERATORS
 from me2e_compress.passes import PASSES
 from me2e_compress.quantization.rules import RULE_SETS, RULES

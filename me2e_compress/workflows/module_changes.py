@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress import graph
-from me2e_compress.modules import Item
+from me2e_compress.graph.modules import Item
 from me2e_compress.workflows.checks import load_map
 from me2e_compress.workflows.inspect import weigh
 from me2e_compress.workflows.result import (

@@ -11,7 +11,7 @@ from me2e_compress import graph
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.activations import activation_bytes
-from me2e_compress.modules import Item
+from me2e_compress.graph.modules import Item
 from me2e_compress.runtime.latency_trace import LatencyTrace, shares
 
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import onnx_ir as ir
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.errors import RecipeError
+from me2e_compress.manager import recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.quantize_int8 import QuantizeInt8

@@ -8,10 +8,10 @@ from typing import NoReturn, Self
 
 import onnx_ir as ir
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.errors import PreconditionError
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RULE_SETS

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import onnx_ir as ir
 
-from me2e_compress import drafts, graph
+from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.stack_frames import recording_of
 from me2e_compress.errors import EvaluationError, MissingExtraError, RecipeError
+from me2e_compress.graph.modules import assign
 from me2e_compress.metrics.deadlines import BUDGET_MS
-from me2e_compress.modules import assign
+from me2e_compress.registry import drafts
 from me2e_compress.runtime.breakdown import Breakdown, break_down
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.energy.energy_counter import check_counter

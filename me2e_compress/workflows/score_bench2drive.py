@@ -5,7 +5,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.real_results import (
     Bench2DriveResults,
@@ -25,6 +24,7 @@ from me2e_compress.metrics.leaderboard_scores import (
 )
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.metrics.scores import Scores
+from me2e_compress.registry import documents
 from me2e_compress.workflows.result import Table, number, table
 
 STANDING = "the ego stood most of the time, which is comfortable: see comfort in motion"

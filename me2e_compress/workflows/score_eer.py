@@ -5,13 +5,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.eer import MEASURES, EerResult, EerScale, eer, rankings
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
 from me2e_compress.metrics.route_summary import RouteSummary
+from me2e_compress.registry import documents
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.workflows.eer_weights import Kind, SavedWeights, save_weights
 from me2e_compress.workflows.result import (

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import onnx
 
 from me2e_compress.errors import GraphError, MissingExtraError
-from me2e_compress.marks import PRODUCER
+from me2e_compress.registry.marks import PRODUCER
 from me2e_compress.zoo.construct import construct, draw
 from me2e_compress.zoo.model_files import write
 from me2e_compress.zoo.stacks import TCP, Stack, find

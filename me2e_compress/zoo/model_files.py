@@ -3,8 +3,8 @@
 import tempfile
 from pathlib import Path
 
-from me2e_compress import drafts
 from me2e_compress.errors import GraphError
+from me2e_compress.registry import drafts
 
 
 def write(path: Path, content: bytes) -> Path:

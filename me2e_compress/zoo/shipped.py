@@ -7,8 +7,8 @@ from typing import Self
 
 import pydantic
 
-from me2e_compress.documents import reading
 from me2e_compress.errors import GraphError
+from me2e_compress.registry.documents import reading
 from me2e_compress.zoo.model_files import write
 from me2e_compress.zoo.stacks import STACKS
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from me2e_compress.documents import MalformedError, check_regular, reading
 from me2e_compress.errors import GraphError, MissingExtraError
+from me2e_compress.registry.documents import MalformedError, check_regular, reading
 
 if TYPE_CHECKING:
     from torch import Tensor

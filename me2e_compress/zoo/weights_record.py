@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import pydantic
 
-from me2e_compress.documents import MalformedError, from_json
+from me2e_compress.registry.documents import MalformedError, from_json
 from me2e_compress.zoo.stacks import STACKS
 
 RECORD = "me2e.weights"

@@ -10,8 +10,9 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph, rewrite
+from me2e_compress import graph
 from me2e_compress.cli import main
+from me2e_compress.graph import rewrite
 from tests.conftest import DRIVER, DRIVER_MAP
 from tests.docs.documents import faults
 from tests.frames import record

@@ -6,9 +6,11 @@ from pathlib import Path
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph, modules, recipe
+from me2e_compress import graph
 from me2e_compress.cli.app import COMMANDS
 from me2e_compress.cli.console import show
+from me2e_compress.graph import modules
+from me2e_compress.manager import recipe
 from me2e_compress.targets.tensorrt.tensorrt_engine import (
     EngineSettings,
     TensorRTEngine,

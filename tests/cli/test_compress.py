@@ -8,7 +8,8 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph, rewrite
+from me2e_compress import graph
+from me2e_compress.graph import rewrite
 from tests.cli.conftest import Cli, write_frames
 from tests.frames import record
 from tests.nets import conv_attention, image, save_text

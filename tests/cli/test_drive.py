@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from me2e_compress.marks import IN_JSON
+from me2e_compress.registry.marks import IN_JSON
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.simulator.routes import load_routes, save_routes

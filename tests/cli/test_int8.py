@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.marks import IN_JSON
 from me2e_compress.quantization.plan import KeptFloat, load_plan, plan_of, save_plan
+from me2e_compress.registry.marks import IN_JSON
 from tests.cli.conftest import Cli
 from tests.frames import record
 from tests.nets import conv_attention, image, net

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from me2e_compress import graph, rewrite
+from me2e_compress import graph
+from me2e_compress.graph import rewrite
 from tests.cli.conftest import Cli, contents, write_frames
 from tests.nets import save_text
 

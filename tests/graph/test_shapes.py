@@ -2,9 +2,9 @@
 
 import onnx_ir as ir
 
-from me2e_compress import graph, recipe
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import ModuleMap
+from me2e_compress import graph
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 
 CHAIN = """

@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress import documents, graph
+from me2e_compress import graph
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.stack.stack import JoinedStack
 from me2e_compress.graph.stack.stack_file import PartEntry, StackFile, StateEntry
+from me2e_compress.registry import documents
 from me2e_compress.runtime.session import replay
 from me2e_compress.runtime.stack_session import open_session
 from tests.profiles import scaled

@@ -6,11 +6,11 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import JoinedStack
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session, replay

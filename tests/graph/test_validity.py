@@ -3,7 +3,7 @@
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import rewrite
+from me2e_compress.graph import rewrite
 from me2e_compress.graph.validity import refusal
 from tests.plugins import exported
 

@@ -4,12 +4,12 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import PassError, VerificationError
 from me2e_compress.graph import provenance
-from me2e_compress.manager import PassManager, Report
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import PassManager, Report, recipe
 from me2e_compress.passes.base import Context, Pass
 from me2e_compress.zoo.shipped import sample_frames, shipped
 from tests.manager import passes

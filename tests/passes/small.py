@@ -10,7 +10,7 @@ import onnxruntime
 
 from me2e_compress import graph
 from me2e_compress.graph import provenance
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.passes.base import Context, Pass, PassResult
 
 NO_MODULES = Context(ModuleMap("none", ()))

@@ -13,7 +13,7 @@ from me2e_compress.errors import (
     RecipeError,
 )
 from me2e_compress.graph import provenance
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.base import Context
 from me2e_compress.runtime.session import run_once

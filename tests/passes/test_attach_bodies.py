@@ -2,9 +2,8 @@ import numpy as np
 import onnx_ir as ir
 import onnxruntime
 
-from me2e_compress import recipe
 from me2e_compress.graph import static_shape
-from me2e_compress.manager import PassManager
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.passes.attach_bodies import AttachBodies
 from me2e_compress.passes.fused_nodes import ExpandOperators

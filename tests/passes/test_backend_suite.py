@@ -8,11 +8,10 @@ import dataclasses
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import recipe
 from me2e_compress.errors import Me2eError
 from me2e_compress.graph import provenance
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.runtime.opening import REFUSALS

@@ -13,8 +13,8 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import ModuleMapError, PreconditionError, ProviderError
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager.output_errors import relative
-from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.convert_float16 import ConvertFloat16
 from me2e_compress.passes.convert_float32 import ConvertFloat32

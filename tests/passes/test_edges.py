@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.errors import ModuleMapError, PreconditionError, RecipeError
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import PASSES
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.base import Context

@@ -5,10 +5,10 @@ from collections.abc import Mapping
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.errors import Me2eError, PreconditionError, RecipeError
-from me2e_compress.manager import PassManager, Report
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import PassManager, Report, recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, with_sizes
 

@@ -7,7 +7,8 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.graph import static_shape
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.rewrite import Array
 from me2e_compress.passes import Context
 from me2e_compress.passes.fold_constants import (
     FoldConstants,
@@ -16,7 +17,6 @@ from me2e_compress.passes.fold_constants import (
     table,
 )
 from me2e_compress.passes.fold_constants.knowledge import Knowledge
-from me2e_compress.rewrite import Array
 from me2e_compress.runtime.opening import REFUSALS
 
 

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress import recipe
 from me2e_compress.errors import RecipeError
 from me2e_compress.graph import digest, infer_shapes, opset_of, provenance, static_shape
-from me2e_compress.manager import PassManager
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.operators import expand
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.passes.base import PassResult

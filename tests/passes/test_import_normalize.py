@@ -5,10 +5,10 @@ import onnx_ir as ir
 import onnxruntime as ort
 import pytest
 
-from me2e_compress import graph, rewrite
+from me2e_compress import graph
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.graph import provenance
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph import provenance, rewrite
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.passes import Context, PassResult
 from me2e_compress.passes.import_normalize import (
     ORIGINAL_DOMAIN,

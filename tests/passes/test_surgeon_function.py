@@ -8,8 +8,8 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import PassError
 from me2e_compress.graph import provenance
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.provenance import Provenance
-from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.surgeon_function import SurgeonFunction
 from me2e_compress.testing import check_pass

@@ -6,7 +6,7 @@ from typing import ClassVar
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import recipe
+from me2e_compress.manager import recipe
 from me2e_compress.passes import PASSES, Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RULE_SETS, Rule, RuleFacts, RuleSet

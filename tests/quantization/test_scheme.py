@@ -3,7 +3,7 @@
 import pytest
 
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.modules import Module, ModuleMap
+from me2e_compress.graph.modules import Module, ModuleMap
 from me2e_compress.quantization.scheme import QuantScheme
 
 

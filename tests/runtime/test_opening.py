@@ -7,7 +7,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.rewrite import add_constant
+from me2e_compress.graph.rewrite import add_constant
 from me2e_compress.runtime.opening import open_graph
 from me2e_compress.runtime.session import Session
 from tests.nets import net

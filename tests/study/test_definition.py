@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress import recipe
 from me2e_compress.errors import EvaluationError, Me2eError, StudyError
+from me2e_compress.manager import recipe
 from me2e_compress.passes import Pass
 from me2e_compress.study import Condition, Timing, Variant
 from tests.study.conftest import IDEAL, Make

@@ -4,7 +4,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress import recipe
 from me2e_compress.errors import (
     EvaluationError,
     GraphError,
@@ -12,6 +11,7 @@ from me2e_compress.errors import (
     RecipeError,
     StudyError,
 )
+from me2e_compress.manager import recipe
 from me2e_compress.runtime.providers import CPU, CpuProvider
 from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.study import Condition, load_study

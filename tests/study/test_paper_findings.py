@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.errors import StudyError
-from me2e_compress.marks import is_marked
 from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.registry.marks import is_marked
 from me2e_compress.study import load_study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.paper.paper_drives import Int8Counts, ModelFacts

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.errors import StudyError
-from me2e_compress.manager import PassManager
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.study import Listener, Study, Variant
 from me2e_compress.study.prepared import PreparedVariant, prepare_variant
 from me2e_compress.study.workspace import Workspace

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.errors import RecipeError
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import recipe
 from me2e_compress.study.on_road.grid import GridModules, GridPoint
 from me2e_compress.zoo.shipped import shipped
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress import recipe
 from me2e_compress.errors import EvaluationError, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.worker import Driven, Job
-from me2e_compress.marks import is_marked
+from me2e_compress.manager import recipe
 from me2e_compress.metrics.episode import Ending, Episode
+from me2e_compress.registry.marks import is_marked
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.study.on_road import (
     Limits,

@@ -18,7 +18,7 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.fidelity.compare import Reference
 from me2e_compress.graph import provenance
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.fold_constants import FoldConstants

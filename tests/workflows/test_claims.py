@@ -13,7 +13,7 @@ import pytest
 
 from me2e_compress.calibration.recording import partial_of, write_recording
 from me2e_compress.errors import GraphError
-from me2e_compress.marks import MARK
+from me2e_compress.registry.marks import MARK
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.workflows.claims import check_ours, writing
 from me2e_compress.workflows.frames import record_frames

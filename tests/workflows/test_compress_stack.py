@@ -8,14 +8,15 @@ import onnx_ir as ir
 import pytest
 
 import me2e_compress as me2e
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.errors import (
     FramesError,
     GraphError,
     ModuleMapError,
 )
 from me2e_compress.graph import JoinedStack
-from me2e_compress.marks import IN_JSON
+from me2e_compress.manager import recipe
+from me2e_compress.registry.marks import IN_JSON
 from tests.cli.conftest import Command, strict
 from tests.docs.documents import faults
 from tests.stacks import (

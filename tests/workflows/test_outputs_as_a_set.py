@@ -9,7 +9,8 @@ from pathlib import Path
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import drafts, graph
+from me2e_compress import graph
+from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.workflows import compress_result
 from tests.cli.conftest import Command, contents

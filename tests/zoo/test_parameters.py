@@ -5,7 +5,7 @@ from collections import Counter
 import pytest
 import torch
 
-from me2e_compress.modules import ModuleMap
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.zoo.construct import construct
 from me2e_compress.zoo.stacks import STACKS
 

@@ -5,8 +5,8 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
+from me2e_compress.graph.rewrite import Fusion, fuse, op, var
 from me2e_compress.passes import Context, Pass, PassResult
-from me2e_compress.rewrite import Fusion, fuse, op, var
 
 X = var("x")
 RELU_PAIR = Fusion(

@@ -14,7 +14,6 @@ from typing import Any, ClassVar, overload
 
 import numpy as np
 
-from me2e_compress import documents
 from me2e_compress.calibration.logs.base import (
     CAN_BUS_SIZE,
     Agent,
@@ -26,6 +25,7 @@ from me2e_compress.calibration.logs.base import (
     matrix_of,
 )
 from me2e_compress.errors import FramesError
+from me2e_compress.registry import documents
 
 ROAD_USERS = ("vehicle", "walker")
 """Classes of boxes that a plan may collide with."""

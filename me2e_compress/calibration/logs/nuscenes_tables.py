@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from me2e_compress import documents
 from me2e_compress.calibration.logs.base import Agent, Floats, matrix_of, pose
 from me2e_compress.errors import FramesError
+from me2e_compress.registry import documents
 
 Row: TypeAlias = Mapping[str, Any]
 

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from me2e_compress.calibration.logs.base import Floats
 from me2e_compress.calibration.pixels import PixelInput
-from me2e_compress.documents import MalformedError, check_regular
 from me2e_compress.errors import FramesError
+from me2e_compress.registry.documents import MalformedError, check_regular
 
 Bytes: TypeAlias = npt.NDArray[np.uint8]
 

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from me2e_compress import documents
 from me2e_compress.driving.adapter.controls import ControlAdapter
 from me2e_compress.driving.adapter.feeds import Feed
 from me2e_compress.driving.adapter.image_inputs import ImageInput, ImageNormalization
@@ -19,6 +18,7 @@ from me2e_compress.driving.waypoint_pid import FusionOptions
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph.files import sha256_of
 from me2e_compress.graph.recurrence import RECURRENT, declared_pairs
+from me2e_compress.registry import documents
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
 
 Contract: TypeAlias = Literal["img", "lidar2img", "can_bus", "command", "timestamp"]

@@ -15,9 +15,9 @@ from pydantic import (
     model_validator,
 )
 
-from me2e_compress import documents
 from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE, Shape
 from me2e_compress.errors import EvaluationError
+from me2e_compress.registry import documents
 
 IMAGE = "me2e.image"
 """Metadata key: JSON of `ImageNormalization`."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.recordings import (
     TICK_S,
@@ -26,6 +25,7 @@ from me2e_compress.evaluators.bench2drive.result_files import (
 )
 from me2e_compress.metrics.episode import Episode, InferenceRecord
 from me2e_compress.metrics.scores import FULL_SET
+from me2e_compress.registry import documents
 
 RouteSet = Literal["0.0.3", "0.0.4"]
 

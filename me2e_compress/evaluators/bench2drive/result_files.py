@@ -12,7 +12,6 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.records import (
     BrokenRecordError,
@@ -20,6 +19,7 @@ from me2e_compress.evaluators.bench2drive.records import (
     read_record,
 )
 from me2e_compress.metrics.episode import LARGEST
+from me2e_compress.registry import documents
 
 _CHECKPOINT = b'"_checkpoint"'
 _STEP = re.compile(rb'\s*\{\s*"-?\d+"\s*:\s*\{\s*"\w+"\s*:\s*\[')

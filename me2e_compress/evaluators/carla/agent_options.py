@@ -9,8 +9,8 @@ from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict
 
-from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
+from me2e_compress.registry import documents
 
 
 class AgentOptions(BaseModel):

@@ -9,11 +9,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
-from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.worker import Driven, Job
-from me2e_compress.marks import IN_JSON
 from me2e_compress.metrics.episode import Episode
+from me2e_compress.registry import documents
+from me2e_compress.registry.marks import IN_JSON
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.simulator.routes import Route, is_route_id
 from me2e_compress.version import __version__

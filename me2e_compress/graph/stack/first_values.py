@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from me2e_compress.display import reason
-from me2e_compress.documents import UNREADABLE, check_regular
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.nodes import Array
 from me2e_compress.graph.recurrence import SessionPort
 from me2e_compress.graph.stack.part_graph import form, misfit
+from me2e_compress.registry.documents import UNREADABLE, check_regular
 
 
 def read_value(path: Path, name: str, where: str) -> Array:

@@ -5,7 +5,6 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from me2e_compress import documents
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.nodes import Array
 from me2e_compress.graph.recurrence import RECURRENT, SessionPort, recurrence
@@ -13,6 +12,7 @@ from me2e_compress.graph.stack.first_values import fitted, read_value
 from me2e_compress.graph.stack.joints import FeedSource, Joints, Names, ambiguous
 from me2e_compress.graph.stack.part_graph import PartGraph, form, misfit
 from me2e_compress.graph.stack.stack_file import ZEROS, StackFile, StateEntry
+from me2e_compress.registry import documents
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ from typing import Self
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import marks
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import files as single
 from me2e_compress.graph.nodes import Array
@@ -21,6 +20,7 @@ from me2e_compress.graph.stack.merge import merged
 from me2e_compress.graph.stack.part_graph import PartGraph, form
 from me2e_compress.graph.stack.split import split
 from me2e_compress.graph.stack.stack_file import StackFile, is_stack
+from me2e_compress.registry import marks
 
 _ARRAYS = (".npy", ".npz")
 

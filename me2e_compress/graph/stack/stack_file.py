@@ -7,8 +7,8 @@ from typing import Annotated, Any, Self
 
 import pydantic
 
-from me2e_compress import documents
 from me2e_compress.errors import GraphError
+from me2e_compress.registry import documents
 
 SUFFIX = ".toml"
 """Suffix of a file that describes a stack, wherever a model is expected."""

@@ -6,8 +6,7 @@ import numpy as np
 import onnx
 import onnx_ir as ir
 
-from me2e_compress import rewrite
-from me2e_compress.graph import has_subgraph, is_standard, opset_of, provenance
+from me2e_compress.graph import has_subgraph, is_standard, opset_of, provenance, rewrite
 
 FLOAT, HALF = ir.DataType.FLOAT, ir.DataType.FLOAT16
 _ONNX = {FLOAT: "tensor(float)", HALF: "tensor(float16)"}

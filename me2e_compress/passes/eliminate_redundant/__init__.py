@@ -10,11 +10,7 @@ import onnx_ir.passes.common as common
 
 from me2e_compress.graph import array_of, infer_shapes, opset_of, provenance
 from me2e_compress.graph.nodes import DRAWS, attribute_values
-from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.eliminate_redundant.identities import identity_of
-from me2e_compress.passes.eliminate_redundant.merges import MergeSite, merge
-from me2e_compress.passes.fold_constants.inference import branch_fits
-from me2e_compress.rewrite import (
+from me2e_compress.graph.rewrite import (
     bypass,
     can_replace,
     fresh_name,
@@ -27,6 +23,10 @@ from me2e_compress.rewrite import (
     replace_value,
     value_names,
 )
+from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.eliminate_redundant.identities import identity_of
+from me2e_compress.passes.eliminate_redundant.merges import MergeSite, merge
+from me2e_compress.passes.fold_constants.inference import branch_fits
 
 COMMUTATIVE = frozenset({"Add", "And", "Equal", "Mul", "Or", "Xor"})
 

@@ -12,7 +12,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import array_of, static_shape
 from me2e_compress.graph.nodes import input_at, integers_at, integers_of, permutation_of
-from me2e_compress.rewrite import Array, is_read, is_standard
+from me2e_compress.graph.rewrite import Array, is_read, is_standard
 
 Rule = Callable[[ir.Node, int], ir.Value | None]
 

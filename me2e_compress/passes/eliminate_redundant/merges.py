@@ -12,8 +12,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import provenance, static_shape
 from me2e_compress.graph.nodes import VIEWS, integers_of, permutation_of
-from me2e_compress.passes.eliminate_redundant.identities import moves_nothing
-from me2e_compress.rewrite import (
+from me2e_compress.graph.rewrite import (
     add_constant,
     bypass,
     is_standard,
@@ -21,6 +20,7 @@ from me2e_compress.rewrite import (
     sole_reader,
     value_names,
 )
+from me2e_compress.passes.eliminate_redundant.identities import moves_nothing
 
 _RESHAPING = VIEWS - {"Identity"}
 

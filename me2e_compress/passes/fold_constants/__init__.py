@@ -11,13 +11,7 @@ import onnx_ir as ir
 from me2e_compress import graph as graphs
 from me2e_compress.display import counted
 from me2e_compress.graph import provenance
-from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.fold_constants import evaluation
-from me2e_compress.passes.fold_constants.choice import FoldChoice, choose
-from me2e_compress.passes.fold_constants.inference import branch_fits
-from me2e_compress.passes.fold_constants.knowledge import Sweep
-from me2e_compress.passes.work import BYTES_PER_NODE
-from me2e_compress.rewrite import (
+from me2e_compress.graph.rewrite import (
     Array,
     add_constant,
     graphs_of,
@@ -27,6 +21,12 @@ from me2e_compress.rewrite import (
     replace_value,
     value_names,
 )
+from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.fold_constants import evaluation
+from me2e_compress.passes.fold_constants.choice import FoldChoice, choose
+from me2e_compress.passes.fold_constants.inference import branch_fits
+from me2e_compress.passes.fold_constants.knowledge import Sweep
+from me2e_compress.passes.work import BYTES_PER_NODE
 
 __all__ = ["FoldConstants"]
 

@@ -9,8 +9,8 @@ import onnx_ir as ir
 import onnxruntime
 
 from me2e_compress.graph import array_of
+from me2e_compress.graph.rewrite import Array
 from me2e_compress.passes.fold_constants.knowledge import Expression, Knowledge
-from me2e_compress.rewrite import Array
 from me2e_compress.runtime.opening import REFUSALS
 
 SILENT = 4

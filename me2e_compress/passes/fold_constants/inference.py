@@ -6,8 +6,8 @@ import onnx
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, node_inference
+from me2e_compress.graph.rewrite import Array
 from me2e_compress.graph.shapes import refined
-from me2e_compress.rewrite import Array
 
 
 def learn_shapes(

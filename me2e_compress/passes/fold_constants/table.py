@@ -12,7 +12,7 @@ import onnx
 import onnx_ir as ir
 from onnx.reference import ReferenceEvaluator
 
-from me2e_compress.rewrite import Array
+from me2e_compress.graph.rewrite import Array
 
 NATIVE = frozenset(
     {

@@ -6,9 +6,9 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of
+from me2e_compress.graph.rewrite import Fusion, fuse, maker
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fuse_basic import activations, affine, layer_norm, linear
-from me2e_compress.rewrite import Fusion, fuse, maker
 
 __all__ = ["FuseBasic"]
 

@@ -16,7 +16,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, rank_of
-from me2e_compress.rewrite import (
+from me2e_compress.graph.rewrite import (
     Array,
     Facts,
     Fusion,

@@ -21,8 +21,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import bias_of, channel_axis, static_shape
-from me2e_compress.passes.work import BYTES_PER_NODE, work
-from me2e_compress.rewrite import (
+from me2e_compress.graph.rewrite import (
     Array,
     Facts,
     Fusion,
@@ -39,6 +38,7 @@ from me2e_compress.rewrite import (
     sole_reader,
     var,
 )
+from me2e_compress.passes.work import BYTES_PER_NODE, work
 
 WEIGHT = var("weight")
 LAYER = op(("Conv", "ConvTranspose", "Gemm"), var("x"), WEIGHT, more=True)

@@ -9,7 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import array_of, rank_of, static_shape
 from me2e_compress.graph.nodes import integers_at
-from me2e_compress.rewrite import (
+from me2e_compress.graph.rewrite import (
     Facts,
     Fusion,
     Kit,

@@ -12,7 +12,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
-from me2e_compress.rewrite import (
+from me2e_compress.graph.rewrite import (
     FLOATS,
     Facts,
     Fusion,

@@ -10,6 +10,13 @@ import onnx_ir as ir
 from me2e_compress.errors import GraphError, PreconditionError, RecipeError
 from me2e_compress.graph import array_of, graphs_of, is_standard, opset_of
 from me2e_compress.graph.nodes import is_read, nodes_in
+from me2e_compress.graph.rewrite import (
+    add_constant,
+    inherit,
+    remove_dead,
+    replace_value,
+    value_names,
+)
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fuse_operators import decomposed, fused_form
@@ -18,13 +25,6 @@ from me2e_compress.passes.fuse_operators.numeric_check import (
     nodes_between,
     piece_of,
     run_piece,
-)
-from me2e_compress.rewrite import (
-    add_constant,
-    inherit,
-    remove_dead,
-    replace_value,
-    value_names,
 )
 
 __all__ = ["FuseOperators"]

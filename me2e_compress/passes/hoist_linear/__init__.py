@@ -7,6 +7,7 @@ import onnx_ir as ir
 
 from me2e_compress.display import counted
 from me2e_compress.graph import opset_of
+from me2e_compress.graph.rewrite import graphs_of, remove_dead, value_names
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.hoist_linear.batch_operands import split_operand
 from me2e_compress.passes.hoist_linear.least_work import Prices
@@ -14,7 +15,6 @@ from me2e_compress.passes.hoist_linear.linear_layers import layer_at
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.repeated_rows import do_before_repeats
 from me2e_compress.passes.work import BYTES_PER_NODE
-from me2e_compress.rewrite import graphs_of, remove_dead, value_names
 
 __all__ = ["HoistLinear"]
 

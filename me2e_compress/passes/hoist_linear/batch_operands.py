@@ -14,13 +14,13 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import macs, static_shape
+from me2e_compress.graph.rewrite import Array, maker, sole_reader
 from me2e_compress.passes.hoist_linear.head_layout import HeadLayout, layout_of
 from me2e_compress.passes.hoist_linear.least_work import terms_of
 from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.row_moves import without_repeats
 from me2e_compress.passes.work import work
-from me2e_compress.rewrite import Array, maker, sole_reader
 
 
 @dataclasses.dataclass(frozen=True)

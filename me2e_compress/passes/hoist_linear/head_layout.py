@@ -11,8 +11,8 @@ import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.nodes import VIEWS, permutation_of
+from me2e_compress.graph.rewrite import is_standard, scalar_of, sole_maker
 from me2e_compress.passes.digits import Digit, Layout, flat, regrouped, whole
-from me2e_compress.rewrite import is_standard, scalar_of, sole_maker
 
 BATCH_OR_TOKENS = ("0", "1")
 CHANNELS = "2"

@@ -16,6 +16,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.nodes import VIEWS
+from me2e_compress.graph.rewrite import holds_numbers, is_standard, sole_reader
 from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
 from me2e_compress.passes.hoist_linear.owned_work import Amount, OwnedWork
 from me2e_compress.passes.hoist_linear.row_moves import (
@@ -33,7 +34,6 @@ from me2e_compress.passes.hoist_linear.ways import (
     uses_weight,
 )
 from me2e_compress.passes.work import MACS_PER_NODE, MOVED_BYTES_PER_NODE
-from me2e_compress.rewrite import holds_numbers, is_standard, sole_reader
 
 DEEPEST = 32
 """Largest number of consecutive nodes examined before a product."""

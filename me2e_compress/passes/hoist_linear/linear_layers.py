@@ -7,7 +7,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, static_shape
-from me2e_compress.rewrite import (
+from me2e_compress.graph.rewrite import (
     FLOATS,
     Numbers,
     holds_numbers,

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import onnx_ir as ir
 
+from me2e_compress.graph.rewrite import Numbers, numbers_of
 from me2e_compress.passes.hoist_linear.ways import (
     Composed,
     Distributed,
@@ -12,7 +13,6 @@ from me2e_compress.passes.hoist_linear.ways import (
     Term,
     Way,
 )
-from me2e_compress.rewrite import Numbers, numbers_of
 
 
 class Matrix:

@@ -7,10 +7,10 @@ import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.activations import value_bytes
+from me2e_compress.graph.rewrite import holds_numbers, sole_reader
 from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
 from me2e_compress.passes.hoist_linear.row_moves import moved_rows
 from me2e_compress.passes.work import work
-from me2e_compress.rewrite import holds_numbers, sole_reader
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,17 +8,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.nodes import VIEWS
-from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer
-from me2e_compress.passes.hoist_linear.matrices import Matrix, plus, times, vector_of
-from me2e_compress.passes.hoist_linear.ways import (
-    Composed,
-    Direct,
-    Distributed,
-    Precomputed,
-    Term,
-    Way,
-)
-from me2e_compress.rewrite import (
+from me2e_compress.graph.rewrite import (
     Array,
     Numbers,
     add_constant,
@@ -28,6 +18,16 @@ from me2e_compress.rewrite import (
     overflow,
     remove_node,
     replace_value,
+)
+from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer
+from me2e_compress.passes.hoist_linear.matrices import Matrix, plus, times, vector_of
+from me2e_compress.passes.hoist_linear.ways import (
+    Composed,
+    Direct,
+    Distributed,
+    Precomputed,
+    Term,
+    Way,
 )
 
 

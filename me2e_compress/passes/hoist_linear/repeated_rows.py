@@ -15,6 +15,7 @@ import onnx_ir as ir
 from me2e_compress.graph import is_standard, rank_of, static_shape
 from me2e_compress.graph.activations import value_bytes
 from me2e_compress.graph.nodes import integers_at
+from me2e_compress.graph.rewrite import is_read, sole_reader
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.row_moves import (
     broadcasts,
@@ -22,7 +23,6 @@ from me2e_compress.passes.hoist_linear.row_moves import (
     without_repeats,
 )
 from me2e_compress.passes.work import MOVED_BYTES_PER_NODE
-from me2e_compress.rewrite import is_read, sole_reader
 
 UNARY = frozenset(
     {

@@ -7,12 +7,12 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.graph import provenance
+from me2e_compress.graph.modules import assign
 from me2e_compress.graph.nodes import is_plugin, nodes_in, nodes_of
+from me2e_compress.graph.rewrite import lift_constants
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
-from me2e_compress.modules import assign
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import doubles
-from me2e_compress.rewrite import lift_constants
 
 __all__ = [
     "ORIGINAL_DOMAIN",

@@ -9,12 +9,12 @@ from pathlib import Path
 import onnx_ir as ir
 import pydantic
 
-from me2e_compress import documents
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import RecipeError
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.operators import int8_op_types
 from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_document
 
 METADATA = "me2e.quant_plan"

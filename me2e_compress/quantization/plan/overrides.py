@@ -27,10 +27,10 @@ from typing import Literal, Self
 import onnx_ir as ir
 import pydantic
 
-from me2e_compress import documents
 from me2e_compress.errors import RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan.decision import FLOAT, INT8, Decision
+from me2e_compress.registry import documents
 
 _GLOB = str.maketrans({"[": "[[]", "?": "[?]", "*": "[*]"})
 """Makes a name a pattern that matches only itself."""

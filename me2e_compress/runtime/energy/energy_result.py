@@ -8,9 +8,9 @@ from typing import Annotated, Any, Self, TypeAlias
 import numpy as np
 from pydantic import Field, TypeAdapter
 
-from me2e_compress import documents
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import EnergyError
+from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.energy.estimate import Window, estimate
 from me2e_compress.runtime.energy.reader import DeviceState

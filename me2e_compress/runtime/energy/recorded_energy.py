@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from me2e_compress import documents
 from me2e_compress.errors import EnergyError
+from me2e_compress.registry import documents
 from me2e_compress.runtime.energy.energy_counter import EnergyCounter
 from me2e_compress.runtime.energy.energy_recording import EnergyRecording
 from me2e_compress.runtime.energy.power import Floats, integrated

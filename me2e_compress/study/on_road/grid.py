@@ -7,9 +7,9 @@ from typing import Self
 
 import onnx_ir as ir
 
-from me2e_compress import recipe
 from me2e_compress.errors import RecipeError
-from me2e_compress.modules import ModuleMap, assign
+from me2e_compress.graph.modules import ModuleMap, assign
+from me2e_compress.manager import recipe
 from me2e_compress.passes import Pass
 from me2e_compress.passes.ablate_modules import PLANNER, AblateModules
 from me2e_compress.passes.fix_shapes import with_sizes

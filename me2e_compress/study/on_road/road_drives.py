@@ -6,13 +6,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from me2e_compress import documents, graph
+from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.engine import Engine
 from me2e_compress.metrics.differences import PairedDifference, difference
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.metrics.route_values import DS
+from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study.definition import Study

@@ -4,12 +4,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from me2e_compress import graph, marks, recipe
+from me2e_compress import graph
 from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.evaluator import routes_named
+from me2e_compress.manager import recipe
+from me2e_compress.registry import marks
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant

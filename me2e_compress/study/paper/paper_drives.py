@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter, with_config
 
-from me2e_compress import documents
 from me2e_compress.errors import StudyError
+from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.study.drive_record import DriveRecord

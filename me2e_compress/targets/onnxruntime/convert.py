@@ -7,11 +7,11 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress import graph, rewrite
+from me2e_compress import graph
 from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph import producer_of
+from me2e_compress.graph import producer_of, rewrite
 from me2e_compress.targets.onnxruntime.kernels import LAYERS, has_kernel
 from me2e_compress.targets.onnxruntime.lower import Draft, lower
 from me2e_compress.targets.onnxruntime.region import find_region

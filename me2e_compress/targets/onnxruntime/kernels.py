@@ -7,8 +7,8 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import bias_of, is_standard, rank_of
+from me2e_compress.graph.rewrite import sole_reader
 from me2e_compress.graph.shapes import extent, is_one_matrix
-from me2e_compress.rewrite import sole_reader
 
 MOVES = frozenset(
     {

@@ -6,8 +6,9 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress import graph, rewrite
+from me2e_compress import graph
 from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import rewrite
 from me2e_compress.targets.onnxruntime.kernels import biased_end
 from me2e_compress.targets.weights import QuantizedWeight
 from me2e_compress.targets.writer import Writer

@@ -6,8 +6,9 @@ from collections.abc import Collection, Mapping
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import graph, rewrite
+from me2e_compress import graph
 from me2e_compress.errors import FramesError
+from me2e_compress.graph import rewrite
 from me2e_compress.targets.onnxruntime.layer_forms import write_layer
 from me2e_compress.targets.onnxruntime.region import Grid, Region, find_region
 from me2e_compress.targets.quantized import QUANTIZE, is_dequantized

@@ -14,10 +14,9 @@ from typing import ClassVar
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import rewrite
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.graph import input_at, static_shape
+from me2e_compress.graph import input_at, rewrite, static_shape
 from me2e_compress.operators import find, int8_inputs
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import (

@@ -25,8 +25,8 @@ from me2e_compress.evaluators.highway.evaluator import (
 )
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
 from me2e_compress.evaluators.highway.worker import Job
-from me2e_compress.marks import is_marked
 from me2e_compress.metrics.episode import Ending, Episode
+from me2e_compress.registry.marks import is_marked
 from me2e_compress.simulator.routes import Route, save_routes
 from tests.evaluators.highway.drivers import (
     CROSSING,

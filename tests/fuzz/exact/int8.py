@@ -21,9 +21,9 @@ import onnx
 import onnx_ir as ir
 from onnx import numpy_helper
 
-from me2e_compress import recipe
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import Me2eError, PassError, VerificationError
+from me2e_compress.manager import recipe
 from me2e_compress.manager.pass_manager import PassManager
 from me2e_compress.passes import Context
 from tests.frames import record

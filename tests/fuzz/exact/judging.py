@@ -17,12 +17,13 @@ import onnx
 import onnx.printer
 import onnx_ir as ir
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.errors import Me2eError, PassError, VerificationError
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import recipe
 from me2e_compress.manager.pass_manager import PassManager
 from me2e_compress.manager.report import Report
 from me2e_compress.manager.reproducer import shrink
-from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context, Pass
 from tests.fuzz.exact.drawing import drawing
 from tests.fuzz.exact.pipelines import PREFIX, dear_work

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import onnx
 
-from me2e_compress import recipe
+from me2e_compress.manager import recipe
 from me2e_compress.passes import PASSES, Pass, hoist_linear, work
 from tests.fuzz.exact.running import open_sizes
 

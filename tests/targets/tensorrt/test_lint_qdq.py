@@ -6,8 +6,8 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import rewrite
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.graph import rewrite
 from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme

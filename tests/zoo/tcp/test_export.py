@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from me2e_compress.errors import GraphError
-from me2e_compress.modules import ModuleMap, assign, detect
+from me2e_compress.graph.modules import ModuleMap, assign, detect
 from me2e_compress.workflows.export import ExportOptions, export_stack
 from me2e_compress.zoo.export import trace
 from me2e_compress.zoo.stacks import Stack

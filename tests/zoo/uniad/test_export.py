@@ -10,7 +10,7 @@ import onnxruntime
 import pytest
 import torch
 
-from me2e_compress.modules import ModuleMap, assign
+from me2e_compress.graph.modules import ModuleMap, assign
 from me2e_compress.operators import expand, fused_nodes, import_domains
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.export import in_dialect

@@ -16,7 +16,7 @@ from typing import Any
 
 import onnx_ir as ir
 
-from me2e_compress import graph, rewrite
+from me2e_compress import graph
 from me2e_compress.errors import (
     BrokenPackageError,
     GraphError,
@@ -24,6 +24,7 @@ from me2e_compress.errors import (
     PreconditionError,
     RecipeError,
 )
+from me2e_compress.graph import rewrite
 from me2e_compress.graph.nodes import is_plugin
 from me2e_compress.quantization.plan import INT8, QuantPlan, plan_of
 from me2e_compress.runtime.children import run_script

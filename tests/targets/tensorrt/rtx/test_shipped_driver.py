@@ -5,10 +5,10 @@ import importlib.util
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph, recipe
+from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import map_of
+from me2e_compress.graph.modules import map_of
+from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.quantization.plan import make_plan, stamp_plan, tensors_of
 from me2e_compress.quantization.rules import RULE_SETS

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import onnx_ir as ir
 
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.modules.module_map import ModuleMap, presets
-from me2e_compress.modules.paths import parameter_path, scope_of
+from me2e_compress.graph.modules.module_map import ModuleMap, presets
+from me2e_compress.graph.modules.paths import parameter_path, scope_of
 
 STACK = "me2e.stack"
 """Model metadata in which our exporters name the stack, e.g. ``vad-tiny``."""

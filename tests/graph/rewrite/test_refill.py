@@ -5,7 +5,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.graph import array_of
-from me2e_compress.rewrite import Fusion, Kit, Match, fuse, op, var
+from me2e_compress.graph.rewrite import Fusion, Kit, Match, fuse, op, var
 from tests.passes.small import read
 
 NEW = np.full((1, 4), 7, np.float32)

@@ -9,10 +9,10 @@ from typing import Literal, Self
 
 import pydantic
 
-from me2e_compress import documents
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.modules.paths import PathGlob, is_malformed
+from me2e_compress.graph.modules.paths import PathGlob, is_malformed
+from me2e_compress.registry import documents
 
 Role = Literal["feature", "prediction"]
 
@@ -219,7 +219,7 @@ def presets() -> tuple[str, ...]:
 
 
 def _folder() -> Traversable:
-    return resources.files("me2e_compress.modules").joinpath("presets")
+    return resources.files("me2e_compress.graph.modules").joinpath("presets")
 
 
 def _checked(texts: tuple[str, ...]) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ import onnx_ir as ir
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import array_of, is_standard
 from me2e_compress.graph.nodes import FLOATS, is_close, scalar_of
-from me2e_compress.rewrite.products import factors_of
+from me2e_compress.graph.rewrite.products import factors_of
 
 _IN_ANY_ORDER = frozenset(
     {"Add", "And", "Equal", "Max", "Mean", "Min", "Mul", "Or", "Sum", "Xor"}

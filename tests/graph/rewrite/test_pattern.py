@@ -5,7 +5,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.errors import GraphError
-from me2e_compress.rewrite import (
+from me2e_compress.graph.rewrite import (
     Facts,
     Fusion,
     Match,

@@ -5,9 +5,9 @@ from collections.abc import Collection, Mapping, Sequence
 import onnx_ir as ir
 
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.modules.assignment import Assignment, Placement
-from me2e_compress.modules.module_map import ModuleMap
-from me2e_compress.modules.paths import parameter_path, scope_of
+from me2e_compress.graph.modules.assignment import Assignment, Placement
+from me2e_compress.graph.modules.module_map import ModuleMap
+from me2e_compress.graph.modules.paths import parameter_path, scope_of
 
 STAMP = "me2e.module"
 """Node metadata that holds the module in a graph that was imported before."""

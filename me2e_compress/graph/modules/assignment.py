@@ -8,7 +8,7 @@ from typing import Literal
 import onnx_ir as ir
 
 from me2e_compress.display import Displayed, Table, table
-from me2e_compress.modules.module_map import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 
 Rule = Literal["stamp", "parameter", "scope", "neighbour"]
 

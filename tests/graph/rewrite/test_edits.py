@@ -1,8 +1,8 @@
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import graph, rewrite
-from me2e_compress.graph import provenance
+from me2e_compress import graph
+from me2e_compress.graph import provenance, rewrite
 
 
 def test_a_constant_takes_a_free_name(driver: ir.Model) -> None:

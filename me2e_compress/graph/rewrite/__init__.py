@@ -21,7 +21,7 @@ from me2e_compress.graph.nodes import (
     sole_reader,
 )
 from me2e_compress.graph.provenance import inherit
-from me2e_compress.rewrite.edits import (
+from me2e_compress.graph.rewrite.edits import (
     add_constant,
     bypass,
     can_replace,
@@ -34,7 +34,7 @@ from me2e_compress.rewrite.edits import (
     sweep,
     value_names,
 )
-from me2e_compress.rewrite.fusion import (
+from me2e_compress.graph.rewrite.fusion import (
     Facts,
     Fused,
     Fusion,
@@ -42,8 +42,8 @@ from me2e_compress.rewrite.fusion import (
     fuse,
     needs_opset,
 )
-from me2e_compress.rewrite.match import Match, match
-from me2e_compress.rewrite.pattern import (
+from me2e_compress.graph.rewrite.match import Match, match
+from me2e_compress.graph.rewrite.pattern import (
     Pattern,
     constant,
     either,

@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress import rewrite
 from me2e_compress.errors import GraphError
+from me2e_compress.graph import rewrite
+from me2e_compress.graph.rewrite import Fusion, fuse, op, var
 from me2e_compress.passes.base import Pass
 from me2e_compress.passes.eliminate_redundant import EliminateRedundant
 from me2e_compress.passes.fuse_basic import FuseBasic
-from me2e_compress.rewrite import Fusion, fuse, op, var
 from tests.passes.small import NO_MODULES, apply, ops, read
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'

@@ -1,17 +1,17 @@
 """Modules: which node of a graph belongs to which part of the driving stack."""
 
-from me2e_compress.modules.assign import assign
-from me2e_compress.modules.assignment import Assignment, Placement
-from me2e_compress.modules.detect import detect, map_of, map_of_files
-from me2e_compress.modules.inventory import Item, itemise
-from me2e_compress.modules.module_map import (
+from me2e_compress.graph.modules.assign import assign
+from me2e_compress.graph.modules.assignment import Assignment, Placement
+from me2e_compress.graph.modules.detect import detect, map_of, map_of_files
+from me2e_compress.graph.modules.inventory import Item, itemise
+from me2e_compress.graph.modules.module_map import (
     Module,
     ModuleMap,
     Role,
     Substitute,
     presets,
 )
-from me2e_compress.modules.paths import PathGlob, scope_of
+from me2e_compress.graph.modules.paths import PathGlob, scope_of
 
 __all__ = [
     "Assignment",

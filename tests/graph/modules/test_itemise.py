@@ -1,6 +1,6 @@
 import onnx_ir as ir
 
-from me2e_compress.modules import Item, ModuleMap, assign, itemise
+from me2e_compress.graph.modules import Item, ModuleMap, assign, itemise
 
 MAP = ModuleMap.parse(
     '[modules.neck]\nrole = "feature"\noptional = ["neck"]\n'

@@ -3,8 +3,8 @@ import pytest
 
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.graph import provenance
-from me2e_compress.modules import Assignment, ModuleMap, assign
-from me2e_compress.modules.assign import STAMP
+from me2e_compress.graph.modules import Assignment, ModuleMap, assign
+from me2e_compress.graph.modules.assign import STAMP
 
 MAP = ModuleMap.parse(
     '[modules.neck]\nrole = "feature"\noptional = ["neck"]\n'

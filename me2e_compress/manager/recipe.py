@@ -19,9 +19,9 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
-from me2e_compress import documents
 from me2e_compress.errors import RecipeError
 from me2e_compress.passes import PASSES, Pass
+from me2e_compress.registry import documents
 from me2e_compress.registry.registry import default_of, fields_of
 from me2e_compress.registry.text import chosen_fields
 

@@ -10,7 +10,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import graphs_of, input_at, is_standard, opset_of, provenance
 from me2e_compress.graph.nodes import Array, is_read, sole_reader
-from me2e_compress.rewrite.edits import (
+from me2e_compress.graph.rewrite.edits import (
     add_constant,
     fresh_name,
     put,
@@ -19,8 +19,8 @@ from me2e_compress.rewrite.edits import (
     replace_value,
     value_names,
 )
-from me2e_compress.rewrite.match import Match, match
-from me2e_compress.rewrite.pattern import Pattern
+from me2e_compress.graph.rewrite.match import Match, match
+from me2e_compress.graph.rewrite.pattern import Pattern
 
 ROUNDS = 16
 """A fusion can complete the pattern of another: real graphs need two or three."""

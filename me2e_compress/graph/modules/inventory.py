@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 
 import onnx_ir as ir
 
-from me2e_compress.modules.module_map import ModuleMap
-from me2e_compress.modules.paths import parameter_path
+from me2e_compress.graph.modules.module_map import ModuleMap
+from me2e_compress.graph.modules.paths import parameter_path
 
 _NOT_WEIGHTS = (
     *(ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL),

@@ -8,7 +8,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.modules import Assignment, ModuleMap, assign
+from me2e_compress.graph.modules import Assignment, ModuleMap, assign
 from me2e_compress.zoo.vad.stack import VadTiny
 from tests.zoo import truth
 

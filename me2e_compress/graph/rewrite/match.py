@@ -8,7 +8,7 @@ import onnx_ir as ir
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import array_of
 from me2e_compress.graph.nodes import Array, Numbers, is_read
-from me2e_compress.rewrite.pattern import Goal, Pattern
+from me2e_compress.graph.rewrite.pattern import Goal, Pattern
 
 
 @dataclasses.dataclass(frozen=True)

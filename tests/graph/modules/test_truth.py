@@ -10,14 +10,14 @@ import torch
 
 from me2e_compress import graph
 from me2e_compress.graph import provenance
-from me2e_compress.modules import ModuleMap, assign, detect, itemise
+from me2e_compress.graph.modules import ModuleMap, assign, detect, itemise
 from me2e_compress.passes import Context
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.zoo.vad.stack import VadTiny
 
 if TYPE_CHECKING:
-    from tests.modules.conftest import Reference
+    from tests.graph.modules.conftest import Reference
 
 pytestmark = pytest.mark.xdist_group("vad")
 
