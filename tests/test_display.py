@@ -26,7 +26,7 @@ from me2e_compress.quantization.plan.decision import Decision
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from tests.cli.conftest import write_frames
+from tests.command import write_frames
 from tests.conftest import DRIVER, DRIVER_MAP
 
 COUNT = 400

@@ -8,7 +8,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.cli.app import COMMANDS
-from me2e_compress.cli.console import show
+from me2e_compress.cli.console import print_json
 from me2e_compress.graph import modules
 from me2e_compress.manager import recipe
 from me2e_compress.targets.tensorrt.tensorrt_engine import (
@@ -20,7 +20,7 @@ from me2e_compress.workflows.export import ExportResult
 from me2e_compress.workflows.frames import FramesOptions, FramesResult
 from me2e_compress.workflows.listing import KINDS, REGISTRIES
 from me2e_compress.zoo.weights_record import WeightsRecord
-from tests.cli.conftest import Cli, strict
+from tests.command import Cli, strict
 from tests.docs.documents import faults
 from tests.installed import install
 from tests.targets.onnxruntime.lowered import MATMUL_RELU
@@ -29,7 +29,7 @@ NAMES = sorted(COMMANDS)
 TWIST = (
     '<ir_version: 9, opset_import: ["" : 17, "own" : 1]>'
     "m (float[2] x) => (float[2] y) { a = own.Twist(x) b = own.Twist(a)"
-    " y = own.Twist(b) }"
+    " c = own.Twist(b) d = own.Twist(c) y = own.Twist(d) }"
 )
 
 
@@ -106,15 +106,15 @@ def test_a_clean_graph_passes_the_lint(cli: Cli, dense: Path, target: str) -> No
 def test_what_would_be_refused_is_listed_and_fails(cli: Cli, tmp_path: Path) -> None:
     graph.save(ir.from_onnx_text(TWIST), tmp_path / "twist.onnx")
 
-    said = cli("lint twist.onnx --shown 1")
+    said = cli("lint twist.onnx")
     assert said.code == 1
     assert "error plugin: 2 more" in said.out
     (line,) = said.err.strip().splitlines()
-    assert "tensorrt refuses it, 3 errors; plugin 'a': own::Twist is neither" in line
-    assert "more" not in cli("lint twist.onnx --shown 1 -v").out
+    assert "tensorrt refuses it, 5 errors; plugin 'a': own::Twist is neither" in line
+    assert "more" not in cli("lint twist.onnx -v").out
     found = cli.document("lint twist.onnx", code=1)
     assert found["status"] == "refused"
-    assert [each["rule"] for each in found["findings"]] == ["plugin"] * 3
+    assert [each["rule"] for each in found["findings"]] == ["plugin"] * 5
     assert found["tensorrt_rtx"] is None
 
 
@@ -164,7 +164,7 @@ def test_a_stack_of_a_checkpoint_names_it(cli: Cli, tmp_path: Path) -> None:
     output.write_bytes(b"1234")
     record = WeightsRecord("a.pth", "0" * 64, epoch=3, converted={"float16": 9})
 
-    show(ExportResult("tcp", output, 17, record), as_json=True)
+    print_json(ExportResult("tcp", output, 17, record).document())
 
     found = strict(cli.capsys.readouterr().out)
     assert faults("export", found) == []
@@ -177,7 +177,7 @@ def test_frames_that_there_are_count_not_those_asked_for(
     for name in ("000000.npz", "000001.npz"):
         (tmp_path / name).touch()
 
-    show(FramesResult("vad-tiny", tmp_path, FramesOptions(count=3)), as_json=True)
+    print_json(FramesResult("vad-tiny", tmp_path, FramesOptions(count=3)).document())
 
     found = strict(cli.capsys.readouterr().out)
     assert faults("frames", found) == []

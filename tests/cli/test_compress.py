@@ -10,7 +10,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.graph import rewrite
-from tests.cli.conftest import Cli, write_frames
+from tests.command import Cli, write_frames
 from tests.frames import record
 from tests.nets import conv_attention, image, save_text
 from tests.plugins import exported

@@ -9,7 +9,7 @@ from me2e_compress import graph
 from me2e_compress.study import demo
 from me2e_compress.workflows.module_changes import ModuleChanges
 from me2e_compress.zoo import shipped
-from tests.cli.conftest import Cli
+from tests.command import Cli
 from tests.stand_in import write_shipped
 from tests.study.conftest import Here
 

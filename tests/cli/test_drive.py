@@ -11,7 +11,7 @@ from me2e_compress.registry.marks import IN_JSON
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.simulator.routes import load_routes, save_routes
-from tests.cli.conftest import Cli
+from tests.command import Cli
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
 from tests.frames import record
 from tests.nets import save_text

@@ -18,7 +18,7 @@ from tests.calibration.logs.small_logs import (
     write_bench2drive,
     write_nuscenes,
 )
-from tests.cli.conftest import Cli
+from tests.command import Cli
 from tests.nets import save_text
 from tests.stacks import write_stack
 

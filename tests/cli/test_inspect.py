@@ -9,7 +9,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from tests.cli.conftest import Cli, write_frames
+from tests.command import Cli, write_frames
 from tests.graph.test_opset import written
 from tests.nets import conv_attention, save_text
 

@@ -11,7 +11,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.quantization.plan import KeptFloat, load_plan, plan_of, save_plan
 from me2e_compress.registry.marks import IN_JSON
-from tests.cli.conftest import Cli
+from tests.command import Cli
 from tests.frames import record
 from tests.nets import conv_attention, image, net
 
@@ -210,10 +210,10 @@ def test_options_are_not_for_a_plan_that_is_made(
 
 @pytest.mark.usefixtures("dense")
 def test_a_plan_is_shown_with_reasons(cli: Cli) -> None:
-    said = cli.done(f"plan dense.onnx --scheme feature-ext {MAP} --all").out
+    said = cli.done(f"plan dense.onnx --scheme feature-ext {MAP} --nodes").out
 
     assert "0 of 2 nodes int8; module 1" in said
-    assert "/backbone/Relu" in said
+    assert "/plan_head/MatMul" in said
 
 
 def test_what_is_decided_together_is_listed(cli: Cli, tmp_path: Path) -> None:
@@ -228,7 +228,7 @@ def test_what_is_decided_together_is_listed(cli: Cli, tmp_path: Path) -> None:
         '[modules.head]\nrole = "prediction"\noptional = ["**"]\n'
     )
 
-    assert "shared-input" in cli.done(f"plan two.onnx {MAP} --all").out
+    assert "shared-input" in cli.done(f"plan two.onnx {MAP} --nodes").out
 
 
 def test_what_a_target_kept_and_what_is_close_is_told(cli: Cli, dense: Path) -> None:
@@ -242,7 +242,7 @@ def test_what_a_target_kept_and_what_is_close_is_told(cli: Cli, dense: Path) -> 
     changed = dataclasses.replace(made, kept_float=kept, decisions=close)
     save_plan(changed, dense / "kept.plan.json")
 
-    said = cli.done("plan kept.plan.json --all").words
+    said = cli.done("plan kept.plan.json --nodes").words
 
     assert "1 of them stay float on their target" in said
     assert "[8,8]" in said

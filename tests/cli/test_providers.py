@@ -8,7 +8,7 @@ import pytest
 import me2e_compress as me2e
 from me2e_compress.cli import commands
 from me2e_compress.runtime.providers import CpuProvider
-from tests.cli.conftest import Cli
+from tests.command import Cli
 
 STUDY = """
 title = "Try"

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.conftest import Cli
 from tests.cli.test_drive import scored
+from tests.command import Cli
 from tests.evaluators.bench2drive.files import (
     RAMMED,
     checkpoint,

@@ -11,7 +11,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.graph import rewrite
-from tests.cli.conftest import Cli, contents, write_frames
+from tests.command import Cli, contents, write_frames
 from tests.nets import save_text
 
 F = "dense.onnx frames --map map.toml"
@@ -142,7 +142,7 @@ DRIVE = {
     "--routes nowhere": "no route 'nowhere'",
     "--routes 1 --render nowhere": "no route 'nowhere'",
     "--routes 1 --engine cloud": "engine 'cloud'",
-    "--routes 1 --engine local --address a:1": "engine 'local' with address a:1",
+    "--routes 1 --engine local:a:1": "engine 'local' with address a:1",
     "--routes 1 --weather snow=1": "weather option 'snow'",
     "--routes 1 --weather night=dark": "weather option night",
     "--routes 1 --latency fast": "no latency source 'fast'",
@@ -275,7 +275,6 @@ def test_a_number_that_is_none(cli: Cli, dense: Path, line: str, value: str) -> 
         "frames vad-tiny -n 1 -o out --seed -1",
         "export vad-tiny -o out --seed -1",
         "evaluate blind --routes 1 -o out --seed -1",
-        "lint dense.onnx --shown -1",
         "demo -o out --stack uniad",
         "evaluate --check",
         "evaluate blind",

@@ -11,7 +11,7 @@ from me2e_compress import graph
 from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import save_routes
-from tests.cli.conftest import Cli, write_frames
+from tests.command import Cli, write_frames
 from tests.evaluators.highway.drivers import PARKED, straight_on
 from tests.metrics.drives import drive as by_hand
 

@@ -11,7 +11,7 @@ from me2e_compress.registry.marks import IN_JSON
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.zoo import shipped
-from tests.cli.conftest import Cli
+from tests.command import Cli
 from tests.evaluators.highway.drivers import EXIT, straight_on
 from tests.stand_in import record_driver, write_model, write_shipped
 

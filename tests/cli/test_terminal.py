@@ -12,7 +12,7 @@ from me2e_compress.cli.console import EVERY_S, ProgressLines, listening, print_t
 from me2e_compress.cli.verbosity import Verbosity, set_verbosity
 from me2e_compress.display import Cell, Table, duration, table
 from me2e_compress.version import __version__
-from tests.cli.conftest import Cli
+from tests.command import Cli
 
 
 @pytest.fixture(autouse=True)

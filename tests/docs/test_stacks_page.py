@@ -11,7 +11,7 @@ from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.graph.stack.stack_file import StackFile
 from me2e_compress.simulator.cameras import CameraRig
 from me2e_compress.zoo.shipped import shipped
-from tests.cli.conftest import Command, command
+from tests.command import Command, command
 from tests.docs.pages import ROOT, blocks
 from tests.stacks import dense_frames, write_dense
 

@@ -14,7 +14,7 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.compare import compare as compare_files
-from tests.cli.conftest import write_frames
+from tests.command import write_frames
 
 SCALED = """
 <ir_version: 9, opset_import: ["" : 17]>

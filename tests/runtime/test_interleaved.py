@@ -8,7 +8,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.runtime.interleaved import BLOCK, record_traces
-from tests.cli.conftest import write_frames
+from tests.command import write_frames
 
 TEXT = """<ir_version: 8, opset_import: ["" : 17]>
 model (float[3] x, float[3] s) => (float[3] y, float[3] s_out) {

@@ -19,7 +19,7 @@ from me2e_compress.study import (
     Variant,
     run_study,
 )
-from tests.cli.conftest import write_frames
+from tests.command import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
 
 ROUTES = (CROSSING, PARKED)

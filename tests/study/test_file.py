@@ -17,7 +17,7 @@ from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.study import Condition, load_study
 from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
 from me2e_compress.zoo.shipped import shipped
-from tests.cli.conftest import write_frames
+from tests.command import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED
 
 GOOD = """

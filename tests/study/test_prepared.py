@@ -12,7 +12,7 @@ from me2e_compress.study import Listener, Study, Variant
 from me2e_compress.study.prepared import PreparedVariant, prepare_variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.listener import SILENT
-from tests.cli.conftest import write_frames
+from tests.command import write_frames
 from tests.stand_in import write_model
 from tests.study.conftest import Make
 

@@ -23,7 +23,7 @@ from me2e_compress.study.on_road import (
     RoadSearchResult,
     search_on_road,
 )
-from tests.cli.conftest import write_frames
+from tests.command import write_frames
 from tests.docs.documents import faults
 from tests.evaluators.highway.drivers import straight_on
 

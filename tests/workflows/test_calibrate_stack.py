@@ -12,7 +12,7 @@ from me2e_compress.calibration.stack_frames import StackFrames, recording_of
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.runtime.session import replay
 from me2e_compress.runtime.stack_session import open_session
-from tests.cli.conftest import Command, command, strict
+from tests.command import Command, command, strict
 from tests.docs.documents import faults
 from tests.frames import record
 from tests.stacks import THREE_FILES, TWO_PARTS, dense_frames, write_dense, write_stack

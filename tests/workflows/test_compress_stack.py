@@ -17,7 +17,7 @@ from me2e_compress.errors import (
 from me2e_compress.graph import JoinedStack
 from me2e_compress.manager import recipe
 from me2e_compress.registry.marks import IN_JSON
-from tests.cli.conftest import Command, strict
+from tests.command import Command, strict
 from tests.docs.documents import faults
 from tests.stacks import (
     THREE_FILES,

@@ -13,7 +13,7 @@ from me2e_compress import graph
 from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.workflows import compress_result
-from tests.cli.conftest import Command, contents
+from tests.command import Command, contents
 
 COMPRESS = ("compress", "in.onnx", "-o", "out.onnx", "--passes")
 

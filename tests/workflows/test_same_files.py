@@ -8,12 +8,13 @@ from pathlib import Path
 import pytest
 
 import me2e_compress as me2e
+from me2e_compress.manager import recipe
 from me2e_compress.registry.marks import IN_JSON
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.workflows.export import export_stack
 from me2e_compress.workflows.result import Result
 from me2e_compress.workflows.routes import RoutesOptions, examine_routes, make_routes
-from tests.cli.conftest import Command
+from tests.command import Command
 from tests.simulator.world.driving import route_of
 
 Call = Callable[[], object]
@@ -46,7 +47,7 @@ CASES: dict[str, tuple[str, Call]] = {
     "compress, passes": (
         "compress in.onnx -o out.onnx --passes fold-constants,fuse-basic",
         lambda: me2e.compress(
-            "in.onnx", "out.onnx", me2e.recipe.parse("fold-constants,fuse-basic")
+            "in.onnx", "out.onnx", recipe.parse("fold-constants,fuse-basic")
         ),
     ),
     "calibrate": (

@@ -18,7 +18,7 @@ from me2e_compress.targets.tensorrt.tensorrt_engine import (
     EngineSettings,
     TensorRTEngine,
 )
-from tests.cli.conftest import Command, strict
+from tests.command import Command, strict
 from tests.docs.documents import faults
 from tests.frames import record
 from tests.stacks import (

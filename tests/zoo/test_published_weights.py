@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import onnx
@@ -276,11 +276,11 @@ def test_options_that_contradict_the_weights(
         ExportOptions(**options)
 
 
-@pytest.mark.parametrize("operators", ["standard", "plugin"])
+@pytest.mark.parametrize("dialect", [None, "me2e"])
 def test_an_export_is_of_the_checkpoint_and_names_it(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    operators: Literal["standard", "plugin"],
+    dialect: str | None,
 ) -> None:
     """As far as the trace, which takes minutes at full size."""
     path = saved(tmp_path / "a.pth", mmcv(thin(published("vad-tiny"))))
@@ -294,7 +294,7 @@ def test_an_export_is_of_the_checkpoint_and_names_it(
         )
 
     monkeypatch.setattr(exporting, "trace", trace)
-    options = ExportOptions(weights=path, operators=operators)
+    options = ExportOptions(weights=path, dialect=dialect)
     found = export_stack("vad-tiny", tmp_path / "out.onnx", options)
 
     (model,) = traced

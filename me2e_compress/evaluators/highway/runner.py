@@ -131,7 +131,8 @@ def drive(
     """Drive a route to its end and return the record.
 
     At each decision the controller turns the policy's plan and the ego's state at that
-    same frame into a control; throttle, steer and brake are converted by `vehicle_map`.
+    same frame into a control; throttle, steer and brake are converted as CARLA's car
+    would answer them.
     Equation 4 (or the other latency model) says when it acts and how long it is held.
     Until the first one acts, the ego coasts straight. A policy that raises, or answers
     neither finite waypoints nor valid controls, ends the route as failed.

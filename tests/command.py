@@ -1,0 +1,154 @@
+"""Runs the command as a shell does, and keeps what it said."""
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.cli import main
+from me2e_compress.graph import rewrite
+from tests.conftest import DRIVER, DRIVER_MAP
+from tests.docs.documents import faults
+from tests.frames import record
+
+Command = Callable[..., int]
+
+
+@dataclass(frozen=True)
+class Said:
+    """How a run of the command ended, and what it said."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def words(self) -> str:
+        """The output however wide the terminal is: words one space apart."""
+        return " ".join(self.out.split())
+
+
+@dataclass(frozen=True)
+class Cli:
+    """Runs the command in one folder, which is the working directory."""
+
+    command: Command
+    folder: Path
+    capsys: pytest.CaptureFixture[str]
+
+    def __call__(self, line: str, *more: str | Path) -> Said:
+        """Run the words of a line, and more words that may hold spaces."""
+        self.capsys.readouterr()
+        code = self.command(*line.split(), *more)
+        return Said(code, *self.capsys.readouterr())
+
+    def done(self, line: str, *more: str | Path) -> Said:
+        """Run what must succeed."""
+        said = self(line, *more)
+        assert said.code == 0, said.err
+        return said
+
+    def document(self, line: str, *more: str | Path, code: int = 0) -> Any:
+        """Return what ``--json`` prints; its keys are those of docs/json.md."""
+        said = self(line, *more, "--json")
+        assert said.code == code, said.err
+        found = strict(said.out)
+        assert faults(line.split()[0], found) == []
+        return found
+
+    def refused(self, line: str, *more: str | Path) -> str:
+        """Run what must be refused: one line says why, and no file changes."""
+        before = contents(self.folder)
+        said = self(line, *more)
+        assert said.code == 1
+        lines = [e for e in said.err.splitlines() if not e.startswith("warning: ")]
+        assert len(lines) == 1, said.err
+        assert contents(self.folder) == before
+        return lines[0]
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run ``me2e-compress`` with these words; give its exit code."""
+
+    def run(*words: str | Path) -> int:
+        argv = ["me2e-compress", *(str(word) for word in words)]
+        monkeypatch.setattr(sys, "argv", argv)
+        return main()
+
+    return run
+
+
+@pytest.fixture
+def cli(
+    command: Command,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Cli:
+    """The command in the folder of the test."""
+    monkeypatch.chdir(tmp_path)
+    return Cli(command, tmp_path, capsys)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """A folder with a model, its map and its frames."""
+    graph.save(ir.from_onnx_text(DRIVER), tmp_path / "in.onnx")
+    (tmp_path / "map.toml").write_text(DRIVER_MAP)
+    write_frames(tmp_path / "frames", camera=np.zeros((1, 4), np.float32))
+    return tmp_path
+
+
+@pytest.fixture
+def dense(files: Path) -> Path:
+    """The folder with a model that has a layer to quantize."""
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "dense (float[4,16] camera) => (float[4,32] plan) {"
+        ' ["/backbone/Relu"] a = Relu(camera)\n'
+        ' ["/plan_head/MatMul"] plan = MatMul(a, w) }'
+    )
+    draws = np.random.default_rng(0).normal(size=(16, 32)).astype(np.float32)
+    weight = rewrite.add_constant(model.graph, draws, "w")
+    model.graph[1].replace_input_with(1, weight)
+    graph.save(model, files / "dense.onnx")
+    camera = np.random.default_rng(1).normal(size=(4, 16)).astype(np.float32)
+    shutil.rmtree(files / "frames")
+    write_frames(files / "frames", camera=camera)
+    return files
+
+
+def strict(text: str) -> Any:
+    """Read JSON as programs do: it knows neither NaN nor Infinity."""
+
+    def refuse(word: str) -> None:
+        raise ValueError(f"{word} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Read all files of a folder, by name."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def write_frames(folder: Path, **arrays: np.ndarray) -> Path:
+    """Write one scene of two frames, the second one unit more than the first."""
+    moved = (
+        {name: array + array.dtype.type(index) for name, array in arrays.items()}
+        for index in range(2)
+    )
+    return record(folder, list(moved))
