@@ -48,7 +48,8 @@ class Cli:
         """Run the words of a line, and more words that may hold spaces."""
         self.capsys.readouterr()
         code = self.command(*line.split(), *more)
-        return Said(code, *self.capsys.readouterr())
+        said = self.capsys.readouterr()
+        return Said(code, said.out, said.err)
 
     def done(self, line: str, *more: str | Path) -> Said:
         """Run what must succeed."""

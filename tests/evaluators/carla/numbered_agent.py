@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-import carla  # type: ignore
+from carla import VehicleControl  # type: ignore
 from leaderboard.autoagents.autonomous_agent import (  # type: ignore
     AutonomousAgent,
     Track,
@@ -43,7 +43,7 @@ class NumberedAgent(AutonomousAgent):  # type: ignore[misc]
             raise RuntimeError("CUDA out of memory")
         self.decisions += 1
         self.metric_info[self.step] = self.get_metric_info()
-        control = carla.VehicleControl()
+        control = VehicleControl()
         control.throttle, control.steer = 0.5, LEAD * self.decisions
         self.control = control
         return control

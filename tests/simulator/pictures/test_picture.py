@@ -21,7 +21,7 @@ from me2e_compress.simulator.scene import ActorKind, Event, EventKind, SignalSta
 from tests.simulator.cameras import town
 
 TEXTURE = town.paint()
-PLAN_AHEAD = np.stack([np.arange(1, 7) * 4.0, np.zeros(6)], axis=1)
+PLAN_AHEAD = np.array([(4.0 * step, 0.0) for step in range(1, 7)])
 Image8 = npt.NDArray[np.uint8]
 
 
