@@ -4,7 +4,7 @@ import itertools
 import json
 from collections import Counter
 
-from me2e_compress.driving.contract import Evaluator
+from me2e_compress.driving.contract import Evaluator, SizedEvaluator
 from me2e_compress.errors import VerificationError
 from me2e_compress.evaluators import EVALUATORS
 from me2e_compress.metrics.episode import Episode
@@ -31,6 +31,10 @@ def check_evaluator(
     """
     check_form(evaluator, EVALUATORS)
     name = evaluator.name
+    if isinstance(evaluator, SizedEvaluator):
+        size: object = evaluator.set_size
+        if not isinstance(size, int):
+            raise VerificationError(f"{name}: set_size is no property of a number")
     first = tuple(evaluator.episodes())
     if not first:
         raise VerificationError(f"{name} yields no episode")
@@ -49,7 +53,9 @@ def check_evaluator(
         raise VerificationError(f"{name} yields other routes, or in another order")
     for one, other in zip(first, second, strict=True):
         if one != other:
-            raise VerificationError(f"{name} yields two episodes for {one.route}")
+            raise VerificationError(
+                f"two runs of {name} give different episodes for {one.route}"
+            )
     return first
 
 

@@ -21,7 +21,7 @@ from me2e_compress.runtime.session import run_once
 from me2e_compress.testing.drawn_calls import Draw, DrawnCall, drawn, graph_of
 from me2e_compress.testing.form import check_form
 
-OPSETS = (13, 17)
+OPSETS = (13, 17, 20)
 TOLERANCE = 1e-4
 """Allowed max|a-b| / max(1, max|b|) of float32 against float64."""
 
@@ -34,8 +34,8 @@ def check_operator(
     """Check that an operator computes the same, in whatever dialect it is called.
 
     It passes :func:`check_form`, and has an own form called ``me2e`` in the domain of
-    that name. For every dialect, at opsets 13 and 17, on random inputs: the body, run
-    in float32, is the float64 reference within 1e-4; the output has the declared shape
+    that name. For every dialect, at opsets 13, 17 and 20, on random inputs: the body,
+    run in float32, is the float64 reference within 1e-4; the output has the declared shape
     and type; calls in the own form are translated into the dialect, unless that refuses
     them, and compute the same there; and an attribute that the dialect does not have is
     refused.
@@ -54,6 +54,7 @@ def check_operator(
             f"{operator.name}: the own form is {operator.own.name!r} in the domain"
             f" {operator.own.domain!r}, both must be {OWN_DOMAIN!r}"
         )
+    _check_letters(operator)
     # every dialect at every opset, on random calls
     make = drawn if draw is None else draw
     for dialect in operator.all_dialects():
@@ -64,6 +65,19 @@ def check_operator(
                 case.check_call(make(dialect, random))
                 case.check_translated(make(operator.own, random))
         _Case(operator, dialect, OPSETS[0]).check_attributes(make(dialect, random))
+
+
+def _check_letters(operator: Operator) -> None:
+    """Refuse sizes that nobody gives: they would count as unknown for ever."""
+    sizes = {letter for each in operator.own.operands for letter in each.letters}
+    sizes |= {each.name for each in operator.own.attributes}
+    for which, text in (("output", operator.output), ("work", operator.work)):
+        for word in text.split():
+            if word not in sizes and not word.isdigit():
+                raise VerificationError(
+                    f"{operator.name}: {which} has {word!r}, which is no letter of an"
+                    " operand, attribute or number"
+                )
 
 
 @dataclasses.dataclass(frozen=True)

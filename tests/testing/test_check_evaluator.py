@@ -56,7 +56,7 @@ def test_what_errs_in_no_way_holds() -> None:
         ("no episode", "made yields 'a', no episode"),
         ("twice", "made yields route a 2 times"),
         ("order", "made yields other routes, or in another order"),
-        ("drifts", "made yields two episodes for a"),
+        ("drifts", "two runs of made give different episodes for a"),
         ("no name", r"made yields route '\.\./a': a name is made of letters"),
         ("too far", "made: a cannot be kept: .* completion_percent Input should be"),
         ("stutters", "made: the frames of a are not in their order"),
@@ -65,6 +65,19 @@ def test_what_errs_in_no_way_holds() -> None:
 def test_a_wrong_evaluator_is_caught(way: str, message: str) -> None:
     with pytest.raises(VerificationError, match=message):
         check_evaluator(Made(way))
+
+
+@dataclass(frozen=True)
+class Sized(Made):
+    """Its size is a method."""
+
+    def set_size(self) -> int:
+        return 2
+
+
+def test_a_size_that_is_a_method_is_caught() -> None:
+    with pytest.raises(VerificationError, match="made: set_size is no property"):
+        check_evaluator(Sized())
 
 
 def test_ours_holds(tmp_path: Path) -> None:

@@ -96,6 +96,22 @@ class OtherShape(Gain):
         return None if shapes[0] is None else (*shapes[0], 1)
 
 
+@dataclasses.dataclass(frozen=True)
+class OtherLetters(Gain):
+    """Work in a letter that no operand has."""
+
+    work: ClassVar[str] = "2 gain Q"
+
+
+@dataclasses.dataclass(frozen=True)
+class LateBody(Gain):
+    """A body that errs from opset 18 on."""
+
+    def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
+        found = super().body(call, inputs, attributes)
+        return found if call.opset < 18 else call.add("Neg", [found])
+
+
 class Forgetful(Dialect):
     """Translates into a call without the attribute."""
 
@@ -154,6 +170,8 @@ class OtherOwn(Gain):
         (OtherTranslation(), "test, opset 13: a translated call is off"),
         (OtherType(), "test, opset 13: the output is said to be INT32, it is float32"),
         (LaxAttributes(), "test, opset 13: it takes an attribute"),
+        (OtherLetters(), "gain: work has 'Q', which is no letter of an operand"),
+        (LateBody(), "gain in the dialect me2e, opset 20: the body is off"),
         (OtherOwn(), "gain: the own form is 'test' in the domain 'some'"),
     ],
     ids=lambda each: type(each).__name__,
