@@ -35,10 +35,10 @@ def check_operator(
 
     It passes :func:`check_form`, and has an own form called ``me2e`` in the domain of
     that name. For every dialect, at opsets 13, 17 and 20, on random inputs: the body,
-    run in float32, is the float64 reference within 1e-4; the output has the declared shape
-    and type; calls in the own form are translated into the dialect, unless that refuses
-    them, and compute the same there; and an attribute that the dialect does not have is
-    refused.
+    run in float32, is the float64 reference within 1e-4; the output has the declared
+    shape and type; calls in the own form are translated into the dialect, unless that
+    refuses them, and compute the same there; and an attribute that the dialect does not
+    have is refused.
 
     The operator need not be installed. ``draw`` makes a call in a dialect; None draws
     what the dialect's operands declare, and any shape if they declare none. So many
