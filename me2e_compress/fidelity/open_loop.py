@@ -1,8 +1,7 @@
 """L2 and collisions of two plans on recorded driving, with intervals.
 
-They are given at 1, 2 and 3 s, and by both conventions of the field: *at* the horizon
-(UniAD), and as the mean over the half seconds *up to* it (ST-P3, VAD), which is the
-smaller number. A plan that repeats the recorded one may still drive badly.
+They are given at 1, 2 and 3 s, by both conventions of the field: *at* the horizon
+(UniAD), and as the mean *up to* it (ST-P3, VAD), which is the smaller number.
 """
 
 import dataclasses

@@ -34,8 +34,7 @@ class JoinedStack:
         files: the ONNX files by label: ``head``, ``head.first_frame``.
         model: the graph at every frame but, perhaps, the first of a scene.
         first: the graph at first frames; None where it is the same.
-        outputs: the outputs present at every frame, by name: ``NAME``, or ``PART.NAME``
-            where two parts share a name.
+        outputs: those of every frame: ``NAME``, or ``PART.NAME`` where two share it.
         recurrent: ``{input: output}`` of the state that is fed forward.
         first_values: first values of recurrent inputs that are not zeros.
     """
@@ -52,9 +51,8 @@ class JoinedStack:
         """Read a TOML file and the files it names, and join them.
 
         Raises:
-            GraphError: a file is missing, no graph or outside the folder, or the files
-                do not fit each other; the message names the TOML file, the part and
-                the tensor.
+            GraphError: a file is missing, no graph or outside the folder, or does not
+                fit the others; the message names the TOML file, the part, the tensor.
         """
         content = StackFile.load(path)
         try:
