@@ -67,7 +67,7 @@ def _export(subject: Subject) -> None:
     if subject.name in PRESETS:
         export_stack(subject.name, subject.source)
         preset = f"modules/presets/{PRESETS[subject.name]}.toml"
-        text = (Path(graph.__file__).parents[1] / preset).read_text("utf-8")
+        text = (Path(graph.__file__).parent / preset).read_text("utf-8")
     else:
         maker = {"resnet50": resnet50, "bev-head": bev_head}[subject.name]
         maker.export(subject.source)
