@@ -26,6 +26,7 @@ PASSES: Registry[Pass] = Registry(
         "expand-operators": f"{_HERE}.fused_nodes:ExpandOperators",
         "translate-plugins": f"{_HERE}.fused_nodes:TranslatePlugins",
         "attach-bodies": f"{_HERE}.attach_bodies:AttachBodies",
+        "fuse-kernels": f"{_HERE}.fuse_kernels:FuseKernels",
         "quantize-int8": f"{_HERE}.quantize_int8:QuantizeInt8",
         "convert-float16": f"{_HERE}.convert_float16:ConvertFloat16",
         "convert-float32": f"{_HERE}.convert_float32:ConvertFloat32",
