@@ -3,6 +3,7 @@
     python -m benchmarks.bench_runtime OUT [--peer-python PYTHON] [--rounds 5]
         [--threads 2] [--frames 1] [--only "ours, int8;PyTorch, eager"]
         [--static-geometry] [--with torch.compile] [--prepare]
+        [--stack vad-tiny-original]
 
 One frame of the stack at its published size, recurrent state at zeros: a process a row,
 in turn, round by round, so that whatever else runs on the machine falls on all rows.
@@ -21,6 +22,9 @@ The cameras' matrices are an input. With ``--static-geometry`` they are constant
 every file: others read the exported file after our passes ``static-geometry`` and
 ``fold-constants``; PyTorch has no such pass and runs what it always does. SQNR is still
 that against the file as exported.
+
+``--stack vad-tiny-original`` measures the same network, written as the published code
+writes it (:mod:`benchmarks.original_patterns`).
 """
 
 import argparse
@@ -43,7 +47,8 @@ from benchmarks.runtime_files import (
     ENTRIES,
     OPTIONAL,
     REFERENCE,
-    STACK,
+    STACKS,
+    TORCH,
     Entry,
     first_frame,
     made,
@@ -74,7 +79,8 @@ def run(
     """Run an entry in a process of its own; return why it did not, if so."""
     peer = entry.engine.startswith("openvino")
     python = str(given.peer_python if peer else sys.executable)
-    target = entry.file if entry.file == STACK else str(path_of(subject, entry))
+    stack = entry.engine in TORCH
+    target = subject.name if stack else str(path_of(subject, entry))
     out = answers_of(subject, entry)
     command = [python, "-W", "ignore", *(() if peer else ("-m",))]
     command += ["benchmarks/run_one.py" if peer else "benchmarks.run_one"]
@@ -209,13 +215,14 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument(
         "--with", action="append", choices=OPTIONAL, default=[], dest="optional"
     )
+    found.add_argument("--stack", choices=STACKS, default=STACKS[0])
     found.add_argument("--prepare", action="store_true", help="write files, and end")
     return found
 
 
 def main() -> None:
     given = parser().parse_args()
-    subject = subjects.make(STACK, given.out, given.frames)
+    subject = subjects.make(given.stack, given.out, given.frames)
     entries = chosen(given)
     failed: dict[str, str] = {}
     for name, entry in entries.items():

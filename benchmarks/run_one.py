@@ -10,7 +10,8 @@ resident set in MB; OUT.npz gets the outputs of the last.
 
 Engines: ``onnxruntime`` (defaults), ``ours`` (a Session of this package: the same
 onnxruntime, with the kernels of fused nodes), ``openvino-f32``, ``openvino-bf16``, and
-``torch``, ``torch-compile``, where MODEL.onnx is the name of a stack of the zoo.
+``torch``, ``torch-compile``, where MODEL.onnx is the name of a stack of the zoo or
+``vad-tiny-original``.
 """
 
 import argparse
@@ -31,14 +32,17 @@ Run = Callable[[], Mapping[str, Any]]
 def torch_eager(
     stack: str, frame: Mapping[str, Any], threads: int, *, compiled: bool = False
 ) -> Run:
-    """Build a stack of the zoo, as its export is built: from seed 0."""
+    """Build a stack, as its export is built: from seed 0."""
     import torch
 
+    from benchmarks import original_patterns
     from me2e_compress.zoo.export import build
     from me2e_compress.zoo.stacks import find
 
     torch.set_num_threads(threads)
-    spec, model = find(stack), build(stack)
+    originally = stack == original_patterns.NAME
+    spec = find(original_patterns.OF if originally else stack)
+    model = original_patterns.original() if originally else build(stack)
     inputs = [torch.from_numpy(frame[name]) for name in spec.inputs]
     called: Callable[..., Any] = torch.compile(model) if compiled else model
 

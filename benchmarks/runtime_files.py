@@ -26,7 +26,7 @@ class Entry:
 
     Attributes:
         engine: its name.
-        file: its name in the folder; of PyTorch, the stack's.
+        file: its name in the folder; of PyTorch, which has none, a word.
         passes: of ours, what makes it of the exported file.
         tool: of others, what makes it; empty for the exported file.
         of: the file that a tool reads.
@@ -39,15 +39,16 @@ class Entry:
     of: str = "source"
 
 
-STACK = "vad-tiny"
+STACKS = ("vad-tiny", "vad-tiny-original")
+"""What is measured: VAD-tiny of the zoo, or in the forms of the original code."""
 FOLDED = "import-normalize,fold-constants"
 BEFORE = f"{FOLDED},eliminate-redundant,hoist-linear"
 FUSED = f"{BEFORE},fuse-operators,eliminate-redundant,fuse-basic"
 INT8 = "quantize-int8{target=onnxruntime}"
 QUANTIZED = Entry("onnxruntime", "onnxruntime-int8", tool="peer", of="model")
 ENTRIES = {
-    "PyTorch, eager": Entry("torch", STACK),
-    "PyTorch, torch.compile": Entry("torch-compile", STACK),
+    "PyTorch, eager": Entry("torch", "stack"),
+    "PyTorch, torch.compile": Entry("torch-compile", "stack"),
     REFERENCE: Entry("onnxruntime", "source"),
     "onnxsim + onnxruntime": Entry("onnxruntime", "onnxsim", tool="onnxsim"),
     "onnxruntime.quantization": QUANTIZED,

@@ -3,6 +3,7 @@
 * ``resnet50``: a classifier, 224 x 224.
 * ``bev-head``: see :mod:`benchmarks.bev_head`.
 * ``vad-tiny``: the reference stack.
+* ``vad-tiny-original``: the same, see :mod:`benchmarks.original_patterns`.
 * ``highway``: the driver that ships; its frames need the extra ``highway``.
 * the models of :mod:`benchmarks.model_kinds`, which need the extra ``models``.
 
@@ -15,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import bev_head, resnet50
+from benchmarks import bev_head, original_patterns, resnet50
 from benchmarks.subject import Subject, at
 from me2e_compress import graph
 from me2e_compress.workflows.compress import CompressOptions, compress
@@ -24,8 +25,9 @@ from me2e_compress.workflows.frames import FramesOptions, record_frames
 
 __all__ = ["SUBJECTS", "Subject", "at", "make"]
 
-SUBJECTS = ("resnet50", "bev-head", "vad-tiny", "highway")
-PRESETS = {"vad-tiny": "vad", "highway": "highway"}
+ORIGINAL = original_patterns.NAME
+SUBJECTS = ("resnet50", "bev-head", "vad-tiny", ORIGINAL, "highway")
+PRESETS = {"vad-tiny": "vad", ORIGINAL: "vad", "highway": "highway"}
 """Module maps of the stacks of the zoo."""
 WHOLE = """
 [modules.network]
@@ -65,7 +67,10 @@ def _make_kind(subject: Subject) -> Subject:
 
 def _export(subject: Subject) -> None:
     if subject.name in PRESETS:
-        export_stack(subject.name, subject.source)
+        if subject.name == ORIGINAL:
+            original_patterns.export(subject.source)
+        else:
+            export_stack(subject.name, subject.source)
         preset = f"modules/presets/{PRESETS[subject.name]}.toml"
         text = (Path(graph.__file__).parent / preset).read_text("utf-8")
     else:
@@ -79,7 +84,8 @@ def _export(subject: Subject) -> None:
 
 def _record(name: str, folder: Path, count: int, seed: int) -> None:
     if name in PRESETS:
-        record_frames(name, folder, FramesOptions(count, seed, SCENE))
+        stack = original_patterns.OF if name == ORIGINAL else name
+        record_frames(stack, folder, FramesOptions(count, seed, SCENE))
     elif name == "bev-head":
         bev_head.record(folder, count, seed)
     else:
