@@ -1,11 +1,11 @@
-"""VAD-tiny on this CPU in every runtime at hand, in one interleaved run.
+"""A model on this CPU in every runtime at hand, in one interleaved run.
 
     python -m benchmarks.bench_runtime OUT [--peer-python PYTHON] [--rounds 5]
         [--threads 2] [--frames 1] [--only "ours, int8;PyTorch, eager"]
         [--static-geometry] [--with torch.compile] [--prepare]
-        [--stack vad-tiny-original]
+        [--stack vad-tiny|vad-tiny-original|uniad-tiny|tcp|deformable-detr]
 
-One frame of the stack at its published size, recurrent state at zeros: a process a row,
+One frame of a stack at its published size, recurrent state at zeros: a process a row,
 in turn, round by round, so that whatever else runs on the machine falls on all rows.
 The table gives least and median CPU time of all runs and of all threads together, the
 clock, the largest resident set, the least SQNR over the outputs and that of the plan
@@ -23,8 +23,9 @@ every file: others read the exported file after our passes ``static-geometry`` a
 ``fold-constants``; PyTorch has no such pass and runs what it always does. SQNR is still
 that against the file as exported.
 
-``--stack vad-tiny-original`` measures the same network, written as the published code
-writes it (:mod:`benchmarks.original_patterns`).
+``vad-tiny-original`` is VAD-tiny as the published code writes it
+(:mod:`benchmarks.original_patterns`); ``deformable-detr`` needs the extra ``models``
+and has no PyTorch row.
 """
 
 import argparse
@@ -46,8 +47,8 @@ from benchmarks.processes import answer, in_turn
 from benchmarks.runtime_files import (
     ENTRIES,
     OPTIONAL,
+    PLANS,
     REFERENCE,
-    STACKS,
     TORCH,
     Entry,
     first_frame,
@@ -176,14 +177,14 @@ def shares(
         yield name, (every - int8) / rates["float32"] + int8 / rates["int8"]
 
 
-def table(rows: dict[str, Row], floor: Mapping[str, float]) -> str:
+def table(rows: dict[str, Row], floor: Mapping[str, float], plan: str) -> str:
     """Write the table.
 
     Args:
         rows: what was measured; the others are compared with the first.
         floor: least CPU seconds that the MACs of a row take, where they are known.
+        plan: the output that is the plan; empty if there is none.
     """
-    plan = "ego_fut_preds"
     eager = min(next(iter(rows.values())).cpu_s)
     lines = [
         "| | CPU s, least | median | x first row | wall s, least | peak MB"
@@ -193,10 +194,11 @@ def table(rows: dict[str, Row], floor: Mapping[str, float]) -> str:
     for name, row in rows.items():
         least, found = min(row.cpu_s), row.sqnr_db
         share = f"{floor[name] / least:.0%}" if name in floor else "-"
+        at_plan = f"{found[plan]:.1f}" if plan else "-"
         lines.append(
             f"| {name} | {least:.2f} | {statistics.median(row.cpu_s):.2f}"
             f" | {eager / least:.2f} | {min(row.wall_s):.2f} | {row.peak_mb:.0f}"
-            f" | {min(found.values()):.1f} | {found[plan]:.1f} | {share} |"
+            f" | {min(found.values()):.1f} | {at_plan} | {share} |"
         )
     return "\n".join(lines)
 
@@ -215,7 +217,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument(
         "--with", action="append", choices=OPTIONAL, default=[], dest="optional"
     )
-    found.add_argument("--stack", choices=STACKS, default=STACKS[0])
+    found.add_argument("--stack", choices=PLANS, default="vad-tiny")
     found.add_argument("--prepare", action="store_true", help="write files, and end")
     return found
 
@@ -261,7 +263,7 @@ def show(
         f"{processor()}, {given.threads} threads, {given.rounds} rounds; {versions()}"
     )
     print(", ".join(f"{k}: {v / 1e9:.0f} GMAC/CPU s" for k, v in rates.items()) + "\n")
-    print(table(rows, dict(shares(subject, entries, rates))))
+    print(table(rows, dict(shares(subject, entries, rates)), PLANS[subject.name]))
     return refused
 
 

@@ -1,4 +1,4 @@
-"""What :mod:`benchmarks.bench_runtime` runs: files of VAD-tiny, ours and others'.
+"""What :mod:`benchmarks.bench_runtime` runs: files of a model, ours and others'.
 
 A file that is there is not made again.
 """
@@ -39,8 +39,14 @@ class Entry:
     of: str = "source"
 
 
-STACKS = ("vad-tiny", "vad-tiny-original")
-"""What is measured: VAD-tiny of the zoo, or in the forms of the original code."""
+PLANS = {
+    "vad-tiny": "ego_fut_preds",
+    "vad-tiny-original": "ego_fut_preds",
+    "uniad-tiny": "sdc_traj",
+    "tcp": "pred_wp",
+    "deformable-detr": "",
+}
+"""The models that are measured, and which output of each is the plan."""
 FOLDED = "import-normalize,fold-constants"
 BEFORE = f"{FOLDED},eliminate-redundant,hoist-linear"
 FUSED = f"{BEFORE},fuse-operators,eliminate-redundant,fuse-basic"
@@ -131,6 +137,7 @@ def first_frame(subject: Subject) -> Path:
             arrays = dict(held)
         for value in graph.load(subject.source).graph.inputs:
             shape = graph.static_shape(value) or ()
-            arrays.setdefault(str(value.name), np.zeros(shape, np.float32))
+            kind = np.float32 if value.dtype is None else value.dtype.numpy()
+            arrays.setdefault(str(value.name), np.zeros(shape, kind))
         np.savez(path, **arrays)
     return path

@@ -4,6 +4,7 @@
 * ``bev-head``: see :mod:`benchmarks.bev_head`.
 * ``vad-tiny``: the reference stack.
 * ``vad-tiny-original``: the same, see :mod:`benchmarks.original_patterns`.
+* ``uniad-tiny``, ``tcp``: other stacks of the zoo.
 * ``highway``: the driver that ships; its frames need the extra ``highway``.
 * the models of :mod:`benchmarks.model_kinds`, which need the extra ``models``.
 
@@ -26,9 +27,15 @@ from me2e_compress.workflows.frames import FramesOptions, record_frames
 __all__ = ["SUBJECTS", "Subject", "at", "make"]
 
 ORIGINAL = original_patterns.NAME
-SUBJECTS = ("resnet50", "bev-head", "vad-tiny", ORIGINAL, "highway")
-PRESETS = {"vad-tiny": "vad", ORIGINAL: "vad", "highway": "highway"}
+PRESETS = {
+    "vad-tiny": "vad",
+    ORIGINAL: "vad",
+    "uniad-tiny": "uniad",
+    "tcp": "tcp",
+    "highway": "highway",
+}
 """Module maps of the stacks of the zoo."""
+SUBJECTS = ("resnet50", "bev-head", *PRESETS)
 WHOLE = """
 [modules.network]
 role = "feature"
