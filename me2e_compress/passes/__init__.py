@@ -20,6 +20,7 @@ PASSES: Registry[Pass] = Registry(
         "fold-with-onnxsim": f"{_HERE}.fold_with_onnxsim:FoldWithOnnxsim",
         "eliminate-redundant": f"{_HERE}.eliminate_redundant:EliminateRedundant",
         "hoist-linear": f"{_HERE}.hoist_linear:HoistLinear",
+        "flatten-matmul": f"{_HERE}.flatten_matmul:FlattenMatmul",
         "ablate-modules": f"{_HERE}.ablate_modules:AblateModules",
         "fuse-operators": f"{_HERE}.fuse_operators:FuseOperators",
         "fuse-basic": f"{_HERE}.fuse_basic:FuseBasic",

@@ -1,5 +1,8 @@
 """The cost of a node per frame, and its equivalent in bytes of the file."""
 
+import math
+
+import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import macs
@@ -19,6 +22,23 @@ element-wise operators on two cores of an AMD Zen 5 (``python -m
 benchmarks.bench_folding --price`` measures a machine). The constants move little: what
 is folded on VAD-tiny is the same from 1 to 4 KB a node.
 """
+
+SMALL_PRODUCTS_PER_NODE = 25
+"""Products of a batch of matrices that take as long to start as a node does.
+
+At 85 ns each: a matrix [4, 4] times each of 240,000 vectors takes onnxruntime's CPU
+20.4 ms (``python -m benchmarks.bench_hoisting``).
+"""
+
+
+def small_products(left: tuple[int, ...], right: tuple[int, ...]) -> int:
+    """Return how many products of matrices onnxruntime starts for operands' shapes.
+
+    It is one where the right operand is a single matrix: its rows are one batch then.
+    """
+    if math.prod(right[:-2]) == 1:
+        return 1
+    return math.prod(np.broadcast_shapes(left[:-2], right[:-2]))
 
 
 def work(node: ir.Node) -> float:

@@ -23,6 +23,7 @@ MOTIFS: Mapping[str, tuple[Motif, float]] = {
     "layers-in-a-row": (ln.layers_in_a_row, 2),
     "on-positions": (ln.on_positions, 2),
     "on-columns": (ln.on_columns, 2),
+    "on-points": (ln.on_points, 1.5),
     "same-source": (ln.same_source, 2),
     "repeated-rows": (rows.repeated_rows, 6),
     "repeated-layer": (rows.repeated_layer, 3),

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import onnx
 
 from me2e_compress.manager import recipe
-from me2e_compress.passes import PASSES, Pass, hoist_linear, work
+from me2e_compress.passes import PASSES, Pass, flatten_matmul, hoist_linear, work
 from tests.fuzz.exact.running import open_sizes
 
 NUMBERS = {"bytes_per_node": (0, 1_000_000)}
@@ -37,8 +37,9 @@ DEAR = (
     "hoist-linear{bytes_per_node=1000000}",
     "fold-constants{bytes_per_node=1000000}, hoist-linear{bytes_per_node=1000000},"
     " fuse-basic, eliminate-redundant",
+    "hoist-linear, flatten-matmul, eliminate-redundant",
 )
-PRICES = ("MACS_PER_NODE", "MOVED_BYTES_PER_NODE")
+PRICES = ("MACS_PER_NODE", "MOVED_BYTES_PER_NODE", "SMALL_PRODUCTS_PER_NODE")
 
 SHORT, LONG = 7, 8
 """Pipelines for each graph of the short test, and of a night."""
@@ -107,7 +108,8 @@ def dear_work() -> Iterator[None]:
     homes = [
         module
         for name, module in list(sys.modules.items())
-        if name == work.__name__ or name.startswith(f"{hoist_linear.__name__}.")
+        if name in (work.__name__, flatten_matmul.__name__)
+        or name.startswith(f"{hoist_linear.__name__}.")
     ]
     before = [
         (module, name, getattr(module, name))

@@ -123,6 +123,21 @@ def on_positions(b: Builder) -> None:
         layer(b, both)
 
 
+def on_points(b: Builder) -> None:
+    """A matrix for each camera times the vectors of all points; one may be repeated."""
+    cameras, points = b.rng.choice((1, 3)), b.rng.choice((4, 60, 200))
+    size, columns = b.rng.choice((3, 4)), b.rng.choice((1, 1, 2))
+    matrices = b.input([cameras, 1, size, size])
+    if b.chance(0.3):
+        matrices = sp.tile(b, matrices, (1, points, 1, 1))
+    elif b.chance(0.3):
+        matrices = sp.unsqueeze(b, matrices, 0)
+    vectors = b.input([1, points, size, columns])
+    if b.chance(0.3):
+        vectors = sp.expand(b, vectors, (cameras, points, size, columns))
+    sp.matmul(b, matrices, vectors)
+
+
 def on_columns(b: Builder) -> None:
     """A layer on columns side by side, some of them repeated or constant."""
     x = b.rows(2, 3)

@@ -1,0 +1,254 @@
+"""Multiply many rows by a matrix at once, not each of them on its own."""
+
+import dataclasses
+import math
+from typing import ClassVar
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.display import counted
+from me2e_compress.graph import array_of, is_standard, opset_of, static_shape
+from me2e_compress.graph.activations import value_bytes
+from me2e_compress.graph.nodes import VIEWS
+from me2e_compress.graph.rewrite import graphs_of, remove_dead, value_names
+from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
+from me2e_compress.passes.hoist_linear.row_moves import broadcasts
+from me2e_compress.passes.work import (
+    MOVED_BYTES_PER_NODE,
+    SMALL_PRODUCTS_PER_NODE,
+    small_products,
+)
+
+OLDEST_OPSET = 9
+"""The first opset whose MatMul multiplies integers too, so that no type matters."""
+
+Shape = tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class FlattenMatmul(Pass):
+    """Multiply all points by a camera's matrix at once, not the matrix by each point.
+
+    Given:   MatMul(matrices [6, 1, 4, 4], points [1, 40000, 4, 1])
+
+    Result:  MatMul(points [1, 40000, 4], transposed matrices [6, 4, 4])
+
+    The last batch axes along which one operand is broadcast become rows of the other;
+    of vectors, the transposed product is taken. Repetitions in front of a product that
+    broadcasts by itself (Tile, Expand) are not read any more. A product is rewritten
+    where that saves more starts of small products than the views around it cost
+    (:mod:`me2e_compress.passes.work`). Sizes must be known. Products and their sums are
+    the same; a runtime may add them up in another order.
+    """
+
+    name: ClassVar[str] = "flatten-matmul"
+    exact: ClassVar[bool] = True
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Rewrite every product that has a cheaper form, until none has."""
+        if opset_of(model) < OLDEST_OPSET:
+            return PassResult(model, 0)
+        repeats = flattened = open_shapes = 0
+        names = value_names(model.graph)
+        for body in graphs_of(model.graph):
+            rewriter = Rewriter(body, names, self.name)
+            for node in list(body):
+                if node.op_type != "MatMul" or not is_standard(node):
+                    continue
+                product: ir.Node | None = node
+                open_shapes += _shapes(node) is None
+                while product is not None:
+                    repeats += _read_unrepeated(product, rewriter)
+                    product = _flatten(product, rewriter)
+                    flattened += product is not None
+        if repeats or flattened:
+            remove_dead(model.graph)
+        notes = (
+            (flattened, f"flattened {counted(flattened, 'product')}"),
+            (repeats, f"{counted(repeats, 'repeated operand')} read unrepeated"),
+            (open_shapes, f"left {counted(open_shapes, 'product')} of unknown shape"),
+        )
+        said = tuple(note for count, note in notes if count)
+        return PassResult(model, repeats + flattened, said)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Form:
+    """A cheaper product: ``rows`` [*batch, R, K] times ``matrix`` [*batch, K, C].
+
+    ``turned`` says that the matrix is the left operand, to be transposed.
+    """
+
+    rows: ir.Value
+    rows_shape: Shape
+    matrix: ir.Value
+    matrix_shape: Shape
+    turned: bool
+
+    @property
+    def shape(self) -> Shape:
+        """The shape of the product."""
+        batch = np.broadcast_shapes(self.rows_shape[:-2], self.matrix_shape[:-2])
+        return (*batch, self.rows_shape[-2], self.matrix_shape[-1])
+
+    @property
+    def price(self) -> float:
+        """What its views, its transposition and its products cost, in node starts."""
+        starts = small_products(self.rows_shape, self.matrix_shape)
+        price = 3.0 + starts / SMALL_PRODUCTS_PER_NODE
+        if self.turned:
+            moved = 2 * (value_bytes(self.matrix) or 0)
+            price += 1.0 + moved / MOVED_BYTES_PER_NODE
+        return price
+
+
+def _flatten(product: ir.Node, rewriter: Rewriter) -> ir.Node | None:
+    """Write the cheapest form of a product, and return its node; None if it has one."""
+    shapes, (left, right) = _shapes(product), product.inputs[:2]
+    if shapes is None or left is None or right is None:
+        return None
+    # Rows of the left operand, or the right operand's vectors as rows
+    forms = [_form(left, shapes[0], right, shapes[1], turned=False)]
+    if shapes[1][-1] == 1:
+        forms.append(_form(right, _turned(shapes[1]), left, _turned(shapes[0])))
+    found = min(filter(None, forms), key=lambda form: form.price, default=None)
+    before = small_products(*shapes) / SMALL_PRODUCTS_PER_NODE
+    if found is None or found.price >= before:
+        return None
+    return _write(product, found, rewriter)
+
+
+def _form(
+    rows: ir.Value,
+    rows_shape: Shape,
+    matrix: ir.Value,
+    matrix_shape: Shape,
+    *,
+    turned: bool = True,
+) -> _Form | None:
+    """Move the last batch axes that the matrix lacks into the rows; None if none."""
+    rank = max(len(rows_shape), len(matrix_shape))
+    rows_shape, matrix_shape = _widened(rows_shape, rank), _widened(matrix_shape, rank)
+    # Only the rows have the axes from here to the last
+    at = rank - 2
+    while at and matrix_shape[at - 1] == 1:
+        at -= 1
+    count = math.prod(rows_shape[at:-1])
+    if count == rows_shape[-2]:
+        return None
+    # Axes of which neither has more than one element go too
+    batches = zip(rows_shape[:at], matrix_shape[:at], strict=True)
+    kept = [pair for pair in batches if max(pair) > 1]
+    return _Form(
+        rows,
+        (*(one for one, _ in kept), count, rows_shape[-1]),
+        matrix,
+        (*(other for _, other in kept), *matrix_shape[-2:]),
+        turned,
+    )
+
+
+def _write(product: ir.Node, form: _Form, rewriter: Rewriter) -> ir.Node:
+    old = product.outputs[0]
+    rows = _viewed(form.rows, form.rows_shape, product, rewriter)
+    shape = _turned(form.matrix_shape) if form.turned else form.matrix_shape
+    matrix = _viewed(form.matrix, shape, product, rewriter)
+    if form.turned:
+        rank = len(shape)
+        order = [*range(rank - 2), rank - 1, rank - 2]
+        matrix = rewriter.write(
+            "Transpose",
+            [matrix],
+            [ir.AttrInt64s("perm", order)],
+            form.matrix_shape,
+            sources=(product,),
+            like=old,
+        )
+        matrix.type = form.matrix.type
+    new = rewriter.write(
+        "MatMul", [rows, matrix], [], form.shape, sources=(product,), like=old
+    )
+    node = new.producer()
+    assert node is not None
+    rewriter.swap(old, _viewed(new, static_shape(old) or (), product, rewriter))
+    return node
+
+
+def _viewed(
+    value: ir.Value, shape: Shape, product: ir.Node, rewriter: Rewriter
+) -> ir.Value:
+    """Return a value in another shape: a constant again where only this reads it."""
+    if static_shape(value) == shape:
+        return value
+    known = array_of(value)
+    if known is not None and len(value.uses()) == 1 and not value.is_graph_output():
+        return rewriter.store(known.reshape(shape), value.name or "constant")
+    old = product.outputs[0]
+    target = rewriter.target(shape, f"{old.name}_shape")
+    view = rewriter.write(
+        "Reshape", [value, target], [], shape, sources=(product,), like=old
+    )
+    view.type = value.type
+    return view
+
+
+def _read_unrepeated(product: ir.Node, rewriter: Rewriter) -> int:
+    """Read operands in front of their repetitions where the product broadcasts."""
+    count = 0
+    for index in (0, 1):
+        shapes, value = _shapes(product), product.inputs[index]
+        if shapes is None or value is None:
+            continue
+        found = _before_repeats(value, shapes[index])
+        if found is None:
+            continue
+        source, small = found
+        pair = (small, shapes[1]) if index == 0 else (shapes[0], small)
+        batch = np.broadcast_shapes(*(shape[:-2] for shape in pair))
+        same = batch == np.broadcast_shapes(*(shape[:-2] for shape in shapes))
+        if small[-2:] == shapes[index][-2:] and same:
+            view = _viewed(source, small, product, rewriter)
+            product.replace_input_with(index, view)
+            rewriter.drop(value)
+            count += 1
+    return count
+
+
+def _before_repeats(value: ir.Value, shape: Shape) -> tuple[ir.Value, Shape] | None:
+    """Return the source of repeated axes, and its shape behind a view in between."""
+    node = value.producer()
+    if node is not None and node.op_type in VIEWS and is_standard(node):
+        node = None if node.inputs[0] is None else node.inputs[0].producer()
+    if node is None or not broadcasts(node) or node.graph is not value.graph:
+        return None
+    source, large = node.inputs[0], static_shape(node.outputs[0])
+    small = static_shape(source)
+    if source is None or small is None or large is None:
+        return None
+    # The view may only insert or drop axes of size 1
+    if [n for n in shape if n != 1] != [n for n in large if n != 1]:
+        return None
+    pairs = zip(_widened(small, len(large)), large, strict=True)
+    kept = iter([one for one, many in pairs if many != 1])
+    result = tuple(1 if size == 1 else next(kept) for size in shape)
+    return None if result == shape else (source, result)
+
+
+def _shapes(product: ir.Node) -> tuple[Shape, Shape] | None:
+    """Return the shapes of both operands of a product of matrices, none empty."""
+    left, right = map(static_shape, product.inputs[:2])
+    if left is None or right is None or static_shape(product.outputs[0]) is None:
+        return None
+    if min(len(left), len(right)) < 2 or 0 in (*left, *right):
+        return None
+    return left, right
+
+
+def _widened(shape: Shape, rank: int) -> Shape:
+    return (1,) * (rank - len(shape)) + shape
+
+
+def _turned(shape: Shape) -> Shape:
+    return (*shape[:-2], shape[-1], shape[-2])

@@ -1,0 +1,170 @@
+"""GridSample of feature maps as deformable attention: one head, one point, weight 1.
+
+Given:   Reshape(Transpose(rows [H W, C])) -> GridSample -> Reshape -> Transpose
+
+Result:  Reshape -> me2e::MultiScaleDeformableAttention -> Reshape, on the rows
+
+onnxruntime's CPU reads a map channel by channel; the kernel reads all channels of a
+pixel at once, and wants them side by side. BEVFormer keeps its view so, and turns it
+about only to rotate it. Nearest samples are bilinear ones at rounded positions.
+"""
+
+import dataclasses
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import static_shape
+from me2e_compress.graph.nodes import VIEWS, is_standard, permutation_of, sole_reader
+from me2e_compress.graph.rewrite import maker, replace_value
+from me2e_compress.operators import OWN_DOMAIN, FusedCall
+
+LEAST_CHANNELS = 16
+"""Fewer do not fill one vector of 512 bits of float32."""
+
+_BILINEAR, _NEAREST = ("bilinear", "linear"), "nearest"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sizes:
+    """Of the image [N, C, H, W] and of the grid [N, F, G, 2]."""
+
+    batch: int
+    channels: int
+    height: int
+    width: int
+    grid: tuple[int, ...]
+
+    @property
+    def points(self) -> int:
+        return self.grid[1] * self.grid[2]
+
+
+def fuse(node: ir.Node, call: FusedCall) -> ir.Value | None:
+    """Write a GridSample with constant sizes as deformable attention; [N, C, F, G]."""
+    image, grid = node.inputs[:2]
+    if image is None or grid is None:
+        return None
+    # Check attributes, sizes and what it gains
+    mode, sizes = _mode(node), _sizes(image, grid)
+    rows = _source_rows(image, sizes)
+    turned = _turned_readers(node.outputs[0], sizes)
+    if mode != _NEAREST and rows is None and not turned:
+        raise PreconditionError("bilinear, and channels are not side by side")
+    # Sample rows of channels
+    n, channels = sizes.batch, sizes.channels
+    if rows is None:
+        whole = call.reshape(image, (n, channels, -1))
+        rows = call.transpose(whole, (0, 2, 1))
+    value = call.reshape(rows, (n, sizes.height * sizes.width, 1, channels))
+    sampled = _attention(call, value, _locations(call, grid, mode, sizes), sizes)
+    # Readers that turn channels to the last axis read the rows as they are
+    for reader in turned:
+        shape = static_shape(reader.outputs[0]) or ()
+        replace_value(reader.outputs[0], call.reshape(sampled, shape))
+    result = call.reshape(sampled, (n, sizes.points, channels))
+    result = call.transpose(result, (0, 2, 1))
+    return call.reshape(result, (n, channels, *sizes.grid[1:3]))
+
+
+def _mode(node: ir.Node) -> str:
+    mode = node.attributes.get_string("mode", "bilinear")
+    padding = node.attributes.get_string("padding_mode", "zeros")
+    if mode not in (*_BILINEAR, _NEAREST):
+        raise PreconditionError(f"it samples {mode}")
+    if padding != "zeros":
+        raise PreconditionError(f"it pads with {padding}, not zeros")
+    if node.attributes.get_int("align_corners", 0):
+        raise PreconditionError("it aligns corners")
+    return mode
+
+
+def _sizes(image: ir.Value, grid: ir.Value) -> _Sizes:
+    map_, places = static_shape(image), static_shape(grid)
+    if map_ is None or places is None or len(map_) != 4 or 0 in (*map_, *places):
+        raise PreconditionError("sizes are unknown, or it samples a volume")
+    if image.dtype != ir.DataType.FLOAT or grid.dtype != ir.DataType.FLOAT:
+        raise PreconditionError("it is not of float32")
+    if map_[1] < LEAST_CHANNELS:
+        raise PreconditionError(f"{map_[1]} channels, below {LEAST_CHANNELS}")
+    return _Sizes(*map_, places)
+
+
+def _source_rows(image: ir.Value, sizes: _Sizes) -> ir.Value | None:
+    """Return what the image is turned from, its channels last; None if nothing."""
+    value = image
+    while (view := maker(value, *VIEWS)) is not None and view.inputs[0] is not None:
+        value = view.inputs[0]
+    turn = maker(value, "Transpose")
+    shape, order = static_shape(value), None if turn is None else permutation_of(turn)
+    if turn is None or shape is None or order is None:
+        return None
+    back = [order.index(axis) for axis in range(len(order))]
+    return turn.inputs[0] if _puts_channels_last(shape, back, sizes) else None
+
+
+def _turned_readers(value: ir.Value, sizes: _Sizes) -> list[ir.Node]:
+    """Return the Transposes, behind views, that put the channels last."""
+    found, waiting = [], [use.node for use in value.uses()]
+    while waiting:
+        node = waiting.pop()
+        source = node.inputs[0]
+        if not is_standard(node) or node.graph is not value.graph or source is None:
+            continue
+        if node.op_type in VIEWS:
+            reader = sole_reader(node.outputs[0])
+            waiting.extend([] if reader is None else [reader])
+        shape, order = static_shape(source), permutation_of(node)
+        turns = node.op_type == "Transpose" and shape is not None and order is not None
+        if turns and _puts_channels_last(shape or (), order or [], sizes):
+            found.append(node)
+    return found
+
+
+def _puts_channels_last(shape: tuple[int, ...], order: list[int], s: _Sizes) -> bool:
+    """Return whether an order turns a view of [N, C, ...] to one of [N, ..., C]."""
+    real = [axis for axis in order if shape[axis] != 1]
+    kept = sorted(real)
+    lead = kept[:1] if s.batch > 1 else []
+    first, *rest = kept[len(lead) :] or [-1]
+    if [shape[axis] for axis in lead] != [s.batch] * len(lead):
+        return False
+    return shape[first] == s.channels and real == [*lead, *rest, first]
+
+
+def _locations(call: FusedCall, grid: ir.Value, mode: str, s: _Sizes) -> ir.Value:
+    """Write the positions -1..1 as 0..1 of the map, [N, Q, 1, 1, 1, 2]."""
+    moved = call.add("Add", [grid, call.numbers(1.0, grid)])
+    half = call.numbers(0.5, grid)
+    if mode != _NEAREST:
+        at = call.add("Mul", [moved, half])
+    else:
+        # In onnxruntime's order, so that ties fall alike
+        size = call.numbers(np.array([s.width, s.height]), grid)
+        scaled = call.add("Mul", [moved, size])
+        pixel = call.add("Sub", [scaled, call.numbers(1.0, grid)])
+        pixel = call.add("Round", [call.add("Mul", [pixel, half])])
+        at = call.add("Div", [call.add("Add", [pixel, half]), size])
+    return call.reshape(at, (s.batch, s.points, 1, 1, 1, 2))
+
+
+def _attention(
+    call: FusedCall, value: ir.Value, locations: ir.Value, s: _Sizes
+) -> ir.Value:
+    """Write the sum of one sample of one map for each query, [N, Q, 1, C]."""
+    ones = np.ones((s.batch, s.points, 1, 1, 1))
+    result = call.add(
+        "MultiScaleDeformableAttention",
+        [
+            value,
+            call.sizes((s.height, s.width), (1, 2)),
+            call.integers([0]),
+            locations,
+            call.numbers(ones, value),
+        ],
+        domain=OWN_DOMAIN,
+    )
+    result.type = value.type
+    result.shape = ir.Shape((s.batch, s.points, 1, s.channels))
+    return result
