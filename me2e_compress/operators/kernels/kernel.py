@@ -39,14 +39,31 @@ _DEFORMABLE = (
 )
 _INPUTS = (FLOAT, ANY, ANY, FLOAT, FLOAT)
 
-KERNELS = tuple(
-    CompiledKernel(
-        f"MultiScaleDeformableAttention{word}", "deformable_kernel", inputs, _DEFORMABLE
-    )
-    for word, inputs in (
-        ("", _INPUTS),
-        ("Int8", (INT8, *_INPUTS[1:], FLOAT, INT8)),
-        ("Uint8", (UINT8, *_INPUTS[1:], FLOAT, UINT8)),
-    )
+ATTENTION = "MultiHeadAttention"
+WIDEST_HEAD = 256
+"""Channels of a head at most, for attention."""
+
+_ATTENTION = (
+    "the inputs must be of rank 4",
+    "the inputs do not fit each other: they must be query [N,Q,M,D], key and value"
+    " [N,K,M,D], with one key at least",
+    f"a head has more than {WIDEST_HEAD} channels",
+)
+
+KERNELS = (
+    *(
+        CompiledKernel(
+            f"MultiScaleDeformableAttention{word}",
+            "deformable_kernel",
+            inputs,
+            _DEFORMABLE,
+        )
+        for word, inputs in (
+            ("", _INPUTS),
+            ("Int8", (INT8, *_INPUTS[1:], FLOAT, INT8)),
+            ("Uint8", (UINT8, *_INPUTS[1:], FLOAT, UINT8)),
+        )
+    ),
+    CompiledKernel(ATTENTION, "attention_kernel", (FLOAT, FLOAT, FLOAT), _ATTENTION),
 )
 """All compiled kernels."""

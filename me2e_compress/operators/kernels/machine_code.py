@@ -20,7 +20,7 @@ from llvmlite import binding as llvm
 from me2e_compress.errors import GraphError
 from me2e_compress.operators.kernels.store import keep, private
 
-_FOREIGN = frozenset({"memset", "memcpy", "memmove", "floorf", "expf"})
+_FOREIGN = frozenset({"memset", "memcpy", "memmove", "floorf", "expf", "sqrt"})
 """C library functions that kernels may call. Code that calls into Python or Numba
 would crash a process into which Numba is not loaded."""
 

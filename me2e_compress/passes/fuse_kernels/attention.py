@@ -1,0 +1,189 @@
+"""Fuse attention over long sequences: product, softmax, product."""
+
+import dataclasses
+import math
+
+import onnx_ir as ir
+
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph.nodes import maker, permutation_of, sole_reader
+from me2e_compress.graph.rewrite import bypass
+from me2e_compress.graph.rewrite.products import factors_of
+from me2e_compress.graph.shapes import static_shape
+from me2e_compress.operators import OWN_DOMAIN, FusedCall
+from me2e_compress.operators.kernels.kernel import ATTENTION, WIDEST_HEAD
+
+_OPSET = 13
+"""The first opset for which fused nodes have bodies."""
+
+_SAME = 1e-6
+"""How near to 1 / sqrt(C) a scale must be, relative, to need no product."""
+
+_ROWS = {3: [1, 0, 2], 4: [0, 2, 1, 3]}
+"""By rank, the order of a Transpose that takes heads from rows into the batch; the same
+takes them back."""
+
+_KEYS = {3: [1, 2, 0], 4: [0, 2, 3, 1]}
+"""The order of one that turns the keys as well."""
+
+LEAST_QUERIES = 24
+"""Fewer queries fill the registers too little: the kernel computes 48 side by side."""
+
+LEAST_SCORES = 2**14
+"""Scores of a head from which the kernel is faster than onnxruntime's three nodes."""
+
+_Shape = tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Attention:
+    """Softmax(scale * query turned_key) value, with the heads in the batch.
+
+    query [.., Q, C], turned_key [.., C, K], value [.., K, C].
+    """
+
+    query: ir.Value
+    turned_key: ir.Value
+    value: ir.Value
+    scale: float
+
+    @property
+    def operands(self) -> tuple[ir.Value, ir.Value, ir.Value]:
+        return self.query, self.turned_key, self.value
+
+
+def fuse_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
+    """Fuse attention that ends at a MatMul, where a compiled kernel is faster.
+
+    Given:   y = MatMul(Softmax(MatMul(Mul(q, scale), k^T)), v)
+
+    Result:  y = me2e::MultiHeadAttention(q, k, v)
+
+    Where Transposes put the heads of q, k and v into the batch, what they read is taken
+    as it is, and Transposes behind y that undo it go too.
+    """
+    softmax = maker(node.inputs[0], "Softmax")
+    found = None if softmax is None else _found(node, softmax)
+    if found is None or softmax is None:
+        return None
+    if call.opset < _OPSET:
+        raise PreconditionError(f"fused nodes need opset {_OPSET} or later")
+    shape = _checked(found, softmax)
+    result = _side_by_side(call, found, shape)
+    return _in_batch(call, found, shape) if result is None else result
+
+
+def _found(node: ir.Node, softmax: ir.Node) -> _Attention | None:
+    """Return the parts of an attention; None if there are not two products."""
+    scores, scale = _unscaled(softmax.inputs[0])
+    product, value = maker(scores, "MatMul"), node.inputs[1]
+    if product is None:
+        masked = maker(scores, "Add", "Where", "Sub")
+        if masked and any(maker(_unscaled(e)[0], "MatMul") for e in masked.inputs):
+            raise PreconditionError("its scores have a mask")
+        return None
+    query, by_query = _unscaled(product.inputs[0])
+    turned, by_key = _unscaled(product.inputs[1])
+    # Scores and weights must be read by nothing else
+    for inner in (product.outputs[0], softmax.inputs[0], softmax.outputs[0]):
+        if inner is None or sole_reader(inner) is None:
+            raise PreconditionError("others read its scores or weights")
+    if query is None or turned is None or value is None:
+        return None
+    return _Attention(query, turned, value, scale * by_query * by_key)
+
+
+def _unscaled(value: ir.Value | None) -> tuple[ir.Value | None, float]:
+    """Return what is multiplied by a number, and the number."""
+    found = None if value is None else factors_of(value)
+    if found is None or len(found.factors) != 1:
+        return value, 1.0
+    return found.factors[0], found.scale
+
+
+def _checked(found: _Attention, softmax: ir.Node) -> _Shape:
+    """Return the shape [.., Q, C] of the query; refuse what the kernel cannot do."""
+    shapes = [static_shape(each) for each in found.operands]
+    query, key, value = shapes
+    if query is None or key is None or value is None:
+        raise PreconditionError("its shapes are not known")
+    if any(maker(each, "DequantizeLinear") for each in found.operands):
+        raise PreconditionError("its products are int8")
+    if any(each.dtype != ir.DataType.FLOAT for each in found.operands):
+        raise PreconditionError("it is not of float32 numbers")
+    count, width = query[-2:]
+    keys = key[-1]
+    if key != (*query[:-2], width, keys) or value != (*query[:-2], keys, width):
+        raise PreconditionError(
+            "query, key and value are of different batches or sizes"
+        )
+    if softmax.attributes.get_int("axis", -1) not in (-1, len(query) - 1):
+        raise PreconditionError("its softmax is not over the last axis")
+    if width > WIDEST_HEAD:
+        raise PreconditionError(f"a head has more than {WIDEST_HEAD} channels")
+    if count < LEAST_QUERIES or count * keys < LEAST_SCORES:
+        raise PreconditionError(f"{count} queries and {keys} keys are few")
+    return query
+
+
+def _side_by_side(call: FusedCall, found: _Attention, shape: _Shape) -> ir.Value | None:
+    """Write attention of the rows that Transposes read; None if one is not so read."""
+    rank, parts = len(shape), []
+    for value, orders in zip(found.operands, (_ROWS, _KEYS, _ROWS), strict=True):
+        node = maker(value, "Transpose")
+        if node is None or permutation_of(node) != orders.get(rank):
+            return None
+        parts.append(node.inputs[0])
+    rows = [_viewed(call, each, -2) for each in parts]
+    heads, width = shape[-3], shape[-1]
+    result = _attention(call, rows, found.scale * math.sqrt(width), heads)
+    split = call.reshape(result, static_shape(parts[0]) or ())
+    # What takes the heads out of the batch again is done already
+    for reader in call.node.outputs[0].consumers():
+        back = reader.outputs[0]
+        if maker(back, "Transpose") and permutation_of(reader) == _ROWS[rank]:
+            bypass(back, split)
+    return call.transpose(split, _ROWS[rank])
+
+
+def _in_batch(call: FusedCall, found: _Attention, shape: _Shape) -> ir.Value:
+    """Write attention whose heads are in the batch."""
+    last = [*range(len(shape) - 2), len(shape) - 1, len(shape) - 2]
+    node = maker(found.turned_key, "Transpose")
+    if node is not None and permutation_of(node) == last:
+        key = node.inputs[0]
+    else:
+        key = call.transpose(found.turned_key, last)
+    rows = [_viewed(call, each, -1) for each in (found.query, key, found.value)]
+    result = _attention(call, rows, found.scale * math.sqrt(shape[-1]), 1)
+    return call.reshape(result, shape)
+
+
+def _viewed(call: FusedCall, value: ir.Value | None, rows: int) -> ir.Value:
+    """Return a value as [B, rows, C], its axes up to ``rows`` joined, and those after.
+
+    ``rows`` counts from the end. A Reshape of such a value gives that.
+    """
+    shape = static_shape(value)
+    assert value is not None
+    assert shape is not None
+    at = len(shape) + rows - 1
+    wanted = (math.prod(shape[:at]), shape[at], math.prod(shape[at + 1 :]))
+    before = maker(value, "Reshape")
+    for known in (value, None if before is None else before.inputs[0]):
+        if known is not None and static_shape(known) == wanted:
+            return known
+    return call.reshape(value, wanted)
+
+
+def _attention(
+    call: FusedCall, rows: list[ir.Value], factor: float, heads: int
+) -> ir.Value:
+    """Write the fused node; ``factor`` is by what the scale is not 1 / sqrt(C)."""
+    query, key, value = rows
+    if abs(factor - 1) > _SAME:
+        query = call.add("Mul", [query, call.numbers(factor, query)])
+    attributes = {"heads": heads} if heads > 1 else {}
+    result = call.add(ATTENTION, (query, key, value), attributes, domain=OWN_DOMAIN)
+    result.type, result.shape = query.type, query.shape
+    return result
