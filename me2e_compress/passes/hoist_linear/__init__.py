@@ -14,6 +14,7 @@ from me2e_compress.passes.hoist_linear.least_work import Prices
 from me2e_compress.passes.hoist_linear.linear_layers import layer_at
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.repeated_rows import do_before_repeats
+from me2e_compress.passes.hoist_linear.sunk_repeats import sink_repeats
 from me2e_compress.passes.work import BYTES_PER_NODE
 
 __all__ = ["HoistLinear"]
@@ -109,7 +110,9 @@ class HoistLinear(Pass):
                 if rewriter.replace(layer, found.way):
                     tally.products += 1
                     tally.macs += found.macs
-            elif do_before_repeats(node, rewriter, opset):
+            elif do_before_repeats(node, rewriter, opset) or sink_repeats(
+                node, rewriter, opset
+            ):
                 tally.others += 1
             elif (fewer := split_operand(node, rewriter)) is not None:
                 tally.operands += 1
