@@ -8,7 +8,14 @@ import onnx_ir as ir
 from me2e_compress.graph import array_of
 from me2e_compress.graph.rewrite import Fusion, fuse, maker
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.fuse_basic import activations, affine, layer_norm, linear
+from me2e_compress.passes.fuse_basic import (
+    activations,
+    affine,
+    any_of,
+    layer_norm,
+    linear,
+    scalars,
+)
 
 __all__ = ["FuseBasic"]
 
@@ -48,6 +55,8 @@ class FuseBasic(Pass):
             layer_norm.FUSION,
             *activations.fusions(swish=self.swish),
             *linear.CHAIN,
+            any_of.FUSION,
+            scalars.FUSION,
         )
 
 
