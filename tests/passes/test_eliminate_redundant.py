@@ -48,6 +48,7 @@ ONE = {"c": np.float32(1)}
         ("Sub(a, c)", {"c": np.float32(0.0)}),
         ("Clip(a)", {}),
         ("Where(c, a, x)", {"c": np.bool_(True)}),
+        ("Where(c, a, a)", {"c": np.eye(2, 3) > 0}),
         ("Abs(a)", {}),
     ],
 )
@@ -135,6 +136,34 @@ def test_merged_casts_say_what_happens_beyond_the_range() -> None:
     assert ops(model) == ["Cast", "Cast"]
     [found] = compute(model, {"x": np.array([10000], np.float16)})
     np.testing.assert_array_equal(found, [np.nan])
+
+
+@pytest.mark.parametrize(
+    ("axis", "start", "end", "left"),
+    [
+        (0, 0, 2, ["Abs", "Neg"]),
+        (0, 2, 3, ["Sqrt", "Neg"]),
+        (0, -1, 99, ["Sqrt", "Neg"]),
+        (0, 0, 1, ["Abs", "Sqrt", "Concat", "Slice", "Neg"]),
+        (0, 1, 3, ["Abs", "Sqrt", "Concat", "Slice", "Neg"]),
+        (1, 0, 2, ["Abs", "Sqrt", "Concat", "Slice", "Neg"]),
+    ],
+)
+def test_a_slice_that_takes_one_operand_of_a_concat_reads_it(
+    axis: int, start: int, end: int, left: list[str]
+) -> None:
+    text = (
+        '<ir_version: 8, opset_import: ["" : 17]>\n'
+        "g (float[2,3] x, float[1,3] z) => (float[M,N] y) { a = Abs(x) b = Sqrt(z)"
+        " both = Concat<axis = 0>(a, b) part = Slice(both, s, e, k) y = Neg(part) }"
+    )
+    bounds = {"s": np.array([start]), "e": np.array([end]), "k": np.array([axis])}
+    model, feeds = read(text, **bounds), {"x": np.ones((2, 3), np.float32)}
+    feeds["z"] = np.full((1, 3), 4, np.float32)
+    (want,) = compute(model, feeds)
+    apply(EliminateRedundant(), model)
+    assert ops(model) == left
+    np.testing.assert_array_equal(compute(model, feeds)[0], want)
 
 
 def test_slices_of_different_axes_become_one() -> None:

@@ -96,7 +96,32 @@ def _slice(node: ir.Node, opset: int) -> ir.Value | None:
         steps = integers_of(input_at(node, 4))
         if steps is None or any(step != 1 for step in steps):
             return None
-    return _if_same_shape(node, opset)
+    return _if_same_shape(node, opset) or _sliced_part(node)
+
+
+def _sliced_part(node: ir.Node) -> ir.Value | None:
+    """Return the operand of a Concat that a Slice takes out again, if it is one."""
+    whole = node.inputs[0]
+    inner = None if whole is None else whole.producer()
+    shape, axes = static_shape(whole), integers_at(node, "axes", 3)
+    starts, ends = integers_at(node, "starts", 1), integers_at(node, "ends", 2)
+    if inner is None or not is_standard(inner) or inner.op_type != "Concat":
+        return None
+    if shape is None or axes is None or len(axes) != 1 or not starts or not ends:
+        return None
+    axis = axes[0] % len(shape)
+    if inner.attributes.get_int("axis", 0) % len(shape) != axis:
+        return None
+    first, last, _ = slice(starts[0], ends[0]).indices(shape[axis])
+    at = 0
+    for part in inner.inputs:
+        sizes = static_shape(part)
+        if sizes is None or at > first:
+            return None
+        if (at, at + sizes[axis]) == (first, last):
+            return part
+        at += sizes[axis]
+    return None
 
 
 def _pad(node: ir.Node, opset: int) -> ir.Value | None:
@@ -177,6 +202,8 @@ def _one(array: Array) -> bool:
 
 
 def _where(node: ir.Node, opset: int) -> ir.Value | None:
+    if node.inputs[1] is node.inputs[2] and same_shape(node.inputs[1], node.outputs[0]):
+        return node.inputs[1]
     chosen = array_of(node.inputs[0])
     if chosen is None or not chosen.size:
         return None

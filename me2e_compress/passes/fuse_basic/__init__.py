@@ -11,9 +11,11 @@ from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fuse_basic import (
     activations,
     affine,
+    any_of,
     factors,
     layer_norm,
     linear,
+    scalars,
 )
 
 __all__ = ["FuseBasic"]
@@ -55,6 +57,8 @@ class FuseBasic(Pass):
             layer_norm.FUSION,
             *activations.fusions(swish=self.swish),
             *linear.CHAIN,
+            any_of.FUSION,
+            scalars.FUSION,
         )
 
 
