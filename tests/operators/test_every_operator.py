@@ -130,12 +130,16 @@ def pool(
 def attention(
     dialect: Dialect, random: np.random.Generator
 ) -> tuple[Arrays, Mapping[str, Any]]:
-    batch, queries, keys, width = random.integers(1, 6, 4)
+    batch, queries, keys, width, heads = (
+        int(each) for each in random.integers(1, 6, 5)
+    )
+    heads = heads if dialect.attributes else 1
+    width *= heads
     return single(
         query=random.normal(size=(batch, queries, width)),
         key=random.normal(size=(batch, keys, width)),
         value=random.normal(size=(batch, keys, width)),
-    ), {}
+    ), {"heads": heads} if dialect.attributes else {}
 
 
 def convolution(
@@ -254,6 +258,18 @@ def test_bicubic_samples_have_no_body_without_grid_sample() -> None:
     )
     with pytest.raises(PreconditionError, match="fused: bicubic sampling needs"):
         expand(model.graph[0], opset=13, by="test")
+
+
+def test_heads_side_by_side_have_no_plugin() -> None:
+    operator = next(each for each in operators() if each.name == "multi-head-attention")
+    arrays, _ = attention(operator.dialects[0], np.random.default_rng(0))
+    model = graph_of(operator.own, arrays, opset=17, attributes={"heads": 1})
+    translate(model.graph[0], operator.dialects[0], opset=17, by="test")
+    (node,) = model.graph
+    assert node.op_type == "QKVTRT"
+    model = graph_of(operator.own, arrays, opset=17, attributes={"heads": 2})
+    with pytest.raises(PreconditionError, match="heads in the batch, and these are 2"):
+        translate(model.graph[0], operator.dialects[0], opset=17, by="test")
 
 
 def test_onnx_runs_the_deformable_convolution_itself() -> None:

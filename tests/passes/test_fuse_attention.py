@@ -1,0 +1,191 @@
+"""Attention becomes one node with a kernel, in every layout; near misses stay."""
+
+from typing import Any
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from me2e_compress.operators import find
+from me2e_compress.passes.fuse_kernels import FuseKernels
+from me2e_compress.runtime import runnable
+from me2e_compress.runtime.session import Session
+from tests.passes.small import apply, compute, ops, read
+from tests.profiles import scaled
+
+Q, K, H, C = 9, 70, 2, 16
+HEAD = '<ir_version: 9, opset_import: ["" : 17]>'
+TURNED = {
+    "heads in the batch": f"""
+    m (float[1,{H},{Q},{C}] q, float[1,{H},{K},{C}] k, float[1,{H},{K},{C}] v)
+        => (float[1,{H},{Q},{C}] y) <float s = {{SCALE}}, float t = {{TIMES}}> {{
+        qt = Identity(q) kt = Transpose<perm=[0,1,3,2]>(k) vt = Identity(v)
+        BODY
+        y = Identity(z)
+    }}""",
+    "keys that are turned": f"""
+    m (float[{H},{Q},{C}] q, float[{H},{C},{K}] k, float[{H},{K},{C}] v)
+        => (float[{H},{Q},{C}] y) <float s = {{SCALE}}, float t = {{TIMES}}> {{
+        qt = Identity(q) kt = Identity(k) vt = Identity(v)
+        BODY
+        y = Identity(z)
+    }}""",
+    "side by side": f"""
+    m (float[2,{Q},{H},{C}] q, float[2,{K},{H},{C}] k, float[2,{K},{H},{C}] v)
+        => (float[2,{Q},{H},{C}] y) <float s = {{SCALE}}, float t = {{TIMES}}> {{
+        qt = Transpose<perm=[0,2,1,3]>(q)
+        kt = Transpose<perm=[0,2,3,1]>(k)
+        vt = Transpose<perm=[0,2,1,3]>(v)
+        BODY
+        y = Transpose<perm=[0,2,1,3]>(z)
+    }}""",
+    "side by side, of rank 3": f"""
+    m (float[{Q},{H},{C}] q, float[{K},{H},{C}] k, float[{K},{H},{C}] v)
+        => (float[{Q},{H},{C}] y) <float s = {{SCALE}}, float t = {{TIMES}}> {{
+        qt = Transpose<perm=[1,0,2]>(q)
+        kt = Transpose<perm=[1,2,0]>(k)
+        vt = Transpose<perm=[1,0,2]>(v)
+        BODY
+        y = Transpose<perm=[1,0,2]>(z)
+    }}""",
+}
+SCALED = {
+    "query": "a = Mul(qt, s) b = MatMul(a, kt) w = Softmax<axis=-1>(b)",
+    "key": "a = Mul(s, kt) b = MatMul(qt, a) w = Softmax(b)",
+    "product": "a = MatMul(qt, kt) b = Div(a, t) w = Softmax(b)",
+    "both": "a = Div(qt, t) c = Mul(kt, t) d = MatMul(a, c) b = Mul(d, s) "
+    "w = Softmax(b)",
+    "none": "b = MatMul(qt, kt) w = Softmax(b)",
+}
+
+
+def written(layout: str, scaled_by: str = "query", scale: float = C**-0.5) -> ir.Model:
+    text = HEAD + TURNED[layout].replace(
+        "BODY", SCALED[scaled_by] + " z = MatMul(w, vt)"
+    )
+    return read(text.replace("SCALE", str(scale)).replace("TIMES", str(1 / scale)))
+
+
+def drawn(model: ir.Model, seed: int = 0) -> dict[str, Any]:
+    random = np.random.default_rng(seed)
+    return {
+        str(port.name): random.normal(size=port.shape.numpy()).astype(np.float32)
+        for port in model.graph.inputs
+        if port.shape is not None
+    }
+
+
+def widened(model: ir.Model) -> ir.Model:
+    """Return a graph of standard operators, in float64."""
+    copy, _ = runnable.compiled_or_expanded(model.clone(), compiled=False)
+    kind = ir.TensorType(ir.DataType.DOUBLE)
+    for value in copy.graph.initializers.values():
+        assert value.const_value is not None
+        if value.const_value.dtype == ir.DataType.FLOAT:
+            wide = value.const_value.numpy().astype(np.float64)
+            value.const_value, value.type = ir.tensor(wide, name=value.name), kind
+    for node in copy.graph:
+        for value in node.outputs:
+            value.type = value.shape = None
+        if node.op_type == "Cast":
+            node.attributes["to"] = ir.AttrInt64("to", ir.DataType.DOUBLE)
+    for value in (*copy.graph.inputs, *copy.graph.outputs):
+        value.type = kind
+    del copy.graph.opset_imports["me2e"]
+    return copy
+
+
+@settings(max_examples=scaled(15))
+@given(
+    layout=st.sampled_from(sorted(TURNED)),
+    scaled_by=st.sampled_from(sorted(SCALED)),
+    scale=st.sampled_from([C**-0.5, 0.5, -2.0]),
+    seed=st.integers(0, 1000),
+)
+def test_fused_attention_is_the_same_in_float64(
+    layout: str, scaled_by: str, scale: float, seed: int
+) -> None:
+    model = written(layout, scaled_by, scale)
+    feeds = {name: each.astype(np.float64) for name, each in drawn(model, seed).items()}
+    plain = model.clone()
+    plain.graph.opset_imports["me2e"] = 1
+    wanted = compute(widened(plain), feeds)[0]
+
+    assert apply(FuseKernels(), model).changes == 1
+
+    assert np.allclose(compute(widened(model), feeds)[0], wanted, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("layout", sorted(TURNED))
+def test_fused_attention_runs_as_its_nodes_do(layout: str) -> None:
+    model = written(layout)
+    feeds = drawn(model)
+    wanted = Session(model.clone(), threads=1).run(feeds)["y"]
+
+    apply(FuseKernels(), model)
+
+    assert np.allclose(Session(model, threads=1).run(feeds)["y"], wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("layout", ["side by side", "side by side, of rank 3"])
+def test_transposes_around_attention_go(layout: str) -> None:
+    model = written(layout)
+
+    apply(FuseKernels(), model)
+
+    assert ops(model) == [*["Reshape"] * 3, "MultiHeadAttention", "Reshape"]
+    (heads,) = (node.attributes.get_int("heads") for node in model.graph if find(node))
+    assert heads == H
+
+
+def test_a_scale_that_is_not_the_usual_stays_on_the_query() -> None:
+    model = written("heads in the batch", scale=0.5)
+
+    apply(FuseKernels(), model)
+
+    assert "Mul" in ops(model)
+    assert "Transpose" not in ops(model)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "why"),
+    [
+        ("w = Softmax<axis=-1>(b)", "w = Softmax<axis=2>(b)", "over the last axis"),
+        ("(b) z", "(b) others = Abs(w) z", "others read its scores or weights"),
+        ("w = Softmax", "others = Abs(b) w = Softmax", "others read its scores"),
+        ("w = Softmax<axis=-1>(b)", "c = Add(b, t) w = Softmax<axis=-1>(c)", "a mask"),
+        ("float[1,2,70,16] k", "float[1,2,n,16] k", "its shapes are not known"),
+        ("float[1,2,9,16] q", "float[1,2,7,16] q", "are few: 7 and 70"),
+        ("70", "63", "are few: 9 and 63"),
+        ("16", "129", "more than 128 channels"),
+        ("float", "double", "it is not of float32 numbers"),
+        (" : 17]", " : 12]", "need opset 13"),
+        ("vt = Identity(v)", "vt = DequantizeLinear(i, t)", "its products are int8"),
+    ],
+)
+def test_near_misses_stay_and_say_why(old: str, new: str, why: str) -> None:
+    text = HEAD + TURNED["heads in the batch"]
+    text = text.replace("BODY", SCALED["query"] + " z = MatMul(w, vt)")
+    text = text.replace("SCALE", "0.25").replace("TIMES", "4")
+    if "others" in new:
+        text = text.replace("y)", f"y, float[1,{H},{Q},{K}] others)", 1)
+    if "DequantizeLinear" in new:
+        text = text.replace(f"float[1,{H},{K},{C}] v", f"int8[1,{H},{K},{C}] i")
+    assert old in text
+    model = read(text.replace(old, new))
+
+    result = apply(FuseKernels(), model)
+
+    assert not result.changes
+    assert why in "\n".join(result.notes)
+    assert not any(find(node) for node in model.graph)
+
+
+def test_attention_maps_that_are_outputs_stay() -> None:
+    model = written("heads in the batch")
+    (softmax,) = (node for node in model.graph if node.op_type == "Softmax")
+    model.graph.outputs.append(softmax.outputs[0])
+
+    assert not apply(FuseKernels(), model).changes
