@@ -2,10 +2,12 @@
 
     python -m benchmarks.bench_hoisting
 
-The keys of VAD-tiny's motion decoder as they are exported and behind the pass: CPU time
-of onnxruntime on two threads, the least of rounds that alternate; likewise the points
-of its BEV cells in every camera's image. First, how long ``hoist-linear`` itself takes
-on graphs of more and more products of repeated rows.
+The keys of VAD-tiny's motion decoder as the zoo exports them, its attention to the map
+as the original code does (keys and values written for every agent and mode), products
+of few rows whose matrix the batch shares, and the points of BEV cells in every camera's
+image: GMACs, and CPU time of onnxruntime on two threads, the least of rounds that
+alternate, before and behind the pass. First, how long ``hoist-linear`` itself takes on
+graphs of more and more products of repeated rows.
 """
 
 import time
@@ -43,6 +45,22 @@ POINTS = f"""<ir_version: 8, opset_import: ["" : 17]>
 points (float[{CAMERAS},1,1,4,4] matrices) => (float[A,B,C,D,E] places) {{
     places = MatMul(matrices, points)
 }}"""
+ATTENTION = f"""<ir_version: 8, opset_import: ["" : 17]>
+attention (float[1,1,{TOKENS - 1},{WIDTH}] map, float[{TOKENS},{AGENTS},2] position,
+           float[{AGENTS * HEADS},1,{CHANNELS}] q,
+           float[{AGENTS * HEADS},1,{TOKENS}] far) => (float[A,B,C] y) {{
+    many = Tile(map, times)  flat = Reshape(many, tiled)
+    more = Concat<axis = 1>(flat, empty)  lanes = Transpose<perm = [1, 0, 2]>(more)
+    linear = MatMul(position, embed)  wide = Add(linear, start)
+    query = Add(lanes, wide)  product = MatMul(query, weight)
+    keys = Add(product, bias)  split = Reshape(keys, heads)
+    turned = Transpose<perm = [1, 2, 0]>(split)  scores = MatMul(q, turned)
+    seen = Add(scores, far)  shares = Softmax<axis = -1>(seen)
+    rows = MatMul(lanes, weight)  values = Add(rows, bias)
+    cut = Reshape(values, heads)  moved = Transpose<perm = [1, 0, 2]>(cut)
+    y = MatMul(shares, moved)
+}}"""
+"""As VAD's motion reads the map: see :mod:`benchmarks.original_patterns`."""
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
@@ -91,6 +109,17 @@ def milliseconds(models: list[ir.Model], feeds: Arrays, runs: int) -> list[float
     return [min(seconds) / runs * 1e3 for seconds in taken]
 
 
+def show(name: str, text: str, weights: Arrays, feeds: Arrays) -> None:
+    """Print GMACs and milliseconds of a graph before and behind the pass."""
+    models = [model_of(text, weights), hoisted(text, weights)]
+    before, after = milliseconds(models, feeds, 1)
+    less, fewer = (sum(graph.macs(node) or 0 for node in m.graph) for m in models)
+    print(
+        f"{name}: {before:.1f} ms, hoisted {after:.1f} ms;"
+        f" {less / 1e9:.2f} GMACs, hoisted {fewer / 1e9:.2f}"
+    )
+
+
 def show_keys() -> None:
     weights = {
         "embed": normal(2, WIDTH), "start": normal(WIDTH),
@@ -102,9 +131,39 @@ def show_keys() -> None:
         "position": normal(AGENTS, TOKENS, 2),
         "q": normal(AGENTS, HEADS, 1, CHANNELS),
     }
-    models = [model_of(KEYS, weights), hoisted(KEYS, weights)]
-    before, after = milliseconds(models, feeds, 1)
-    print(f"keys of the motion decoder: {before:.1f} ms, hoisted {after:.1f} ms")
+    show("keys of the motion decoder", KEYS, weights, feeds)
+
+
+def show_attention() -> None:
+    weights = {
+        "times": np.array((1, AGENTS, 1, 1)),
+        "tiled": np.array((AGENTS, TOKENS - 1, WIDTH)),
+        "empty": np.zeros((AGENTS, 1, WIDTH), np.float32),
+        "embed": normal(2, WIDTH), "start": normal(WIDTH),
+        "weight": normal(WIDTH, WIDTH), "bias": normal(WIDTH),
+        "heads": np.array((TOKENS, AGENTS * HEADS, CHANNELS)),
+    }  # fmt: skip
+    feeds = {
+        "map": normal(1, 1, TOKENS - 1, WIDTH),
+        "position": normal(TOKENS, AGENTS, 2),
+        "q": normal(AGENTS * HEADS, 1, CHANNELS),
+        "far": normal(AGENTS * HEADS, 1, TOKENS),
+    }
+    show("motion's attention to the map, original", ATTENTION, weights, feeds)
+
+
+def show_joined(rows: int) -> None:
+    batch = AGENTS // rows
+    text = (
+        f'<ir_version: 8, opset_import: ["" : 17]>\njoined (float[{batch},{HEADS},'
+        f"{rows},{CHANNELS}] q, float[1,{HEADS},{CHANNELS},{TOKENS}] keys)"
+        " => (float[A,B,C,D] y) { y = MatMul(q, keys) }"
+    )
+    feeds = {
+        "q": normal(batch, HEADS, rows, CHANNELS),
+        "keys": normal(1, HEADS, CHANNELS, TOKENS),
+    }
+    show(f"shared keys, queries of {rows} rows", text, {}, feeds)
 
 
 def show_points() -> None:
@@ -142,3 +201,6 @@ if __name__ == "__main__":
         show_pass(products)
     show_keys()
     show_points()
+    show_attention()
+    for few in (1, 4, 8):
+        show_joined(few)

@@ -1,6 +1,7 @@
 """Multiply fewer rows: move products before nodes that repeat or add up rows."""
 
 import dataclasses
+from collections import Counter
 from typing import ClassVar
 
 import onnx_ir as ir
@@ -14,6 +15,7 @@ from me2e_compress.passes.hoist_linear.least_work import Prices
 from me2e_compress.passes.hoist_linear.linear_layers import layer_at
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.repeated_rows import do_before_repeats
+from me2e_compress.passes.hoist_linear.shared_products import join_products
 from me2e_compress.passes.hoist_linear.sunk_repeats import sink_repeats
 from me2e_compress.passes.work import BYTES_PER_NODE
 
@@ -32,11 +34,14 @@ class _Tally:
     others: int = 0
     operands: int = 0
     unread: int = 0
+    joined: int = 0
     macs: int = 0
+    left: Counter[str] = dataclasses.field(default_factory=Counter)
 
     @property
     def changes(self) -> int:
-        return self.products + self.others + self.operands + self.unread
+        moved = self.products + self.others + self.operands
+        return moved + self.joined + self.unread
 
     def notes(self) -> tuple[str, ...]:
         found = []
@@ -47,8 +52,13 @@ class _Tally:
             found.append(
                 f"moved {counted(self.others, 'other node')} before repeated rows"
             )
+        if self.joined:
+            found.append(f"joined {counted(self.joined, 'product')} of few rows")
         if self.unread:
             found.append(f"removed what nothing reads: {self.unread}")
+        for reason, count in sorted(self.left.items()):
+            whole = counted(count, "product")
+            found.append(f"left {whole} with keys or values as they are: {reason}")
         return tuple(found)
 
 
@@ -66,8 +76,10 @@ class HoistLinear(Pass):
     repeated. Two consecutive linear layers become one. Each rewrite is done only where
     it needs fewer multiply-accumulates and is cheaper in total: nodes, memory traffic
     and new weights (:mod:`me2e_compress.passes.work`). Other row-wise operators (a
-    bias, LayerNorm, Relu) also move in front of repetitions. Sizes must be known.
-    Outputs are equal up to rounding.
+    bias, LayerNorm, Relu) also move in front of repetitions. Keys and values that the
+    batch shares but for their positions are multiplied term by term, and products of
+    few rows whose matrices the batch shares become one of many rows. Sizes must be
+    known. Outputs are equal up to rounding.
 
     Attributes:
         bytes_per_node: how many bytes of new weights the work of one node may cost.
@@ -89,6 +101,7 @@ class HoistLinear(Pass):
         ]
         for _ in range(ROUNDS):
             before = tally.changes
+            tally.left.clear()
             for rewriter in rewriters:
                 self._round(rewriter, opset, tally)
             if tally.changes == before:
@@ -114,8 +127,12 @@ class HoistLinear(Pass):
                 node, rewriter, opset
             ):
                 tally.others += 1
-            elif (fewer := split_operand(node, rewriter)) is not None:
+            elif isinstance(fewer := split_operand(node, rewriter), int):
                 tally.operands += 1
                 tally.macs += fewer
+            elif join_products(node, rewriter):
+                tally.joined += 1
+            elif fewer is not None:
+                tally.left[fewer] += 1
             if tally.changes > before:
                 prices.forget()

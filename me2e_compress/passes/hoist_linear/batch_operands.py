@@ -4,8 +4,9 @@ Given:   keys = A + p P, A the same for every batch;  MatMul(q, heads of keys)
 
 Result:  MatMul(q, heads of A) + MatMul(MatMul(q, heads of P), p)
 
-Terms shared by the batch need not be repeated, and a term of few columns (positions:
-two) is multiplied by the queries before it becomes wide.
+Terms shared by the batch need not be repeated (they may be: an exporter writes A for
+every batch entry, behind stored rows), and a term of few columns (positions: two) is
+multiplied by the queries before it becomes wide.
 """
 
 import dataclasses
@@ -14,13 +15,18 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import macs, static_shape
-from me2e_compress.graph.rewrite import Array, maker, sole_reader
+from me2e_compress.graph.rewrite import maker, sole_reader
 from me2e_compress.passes.hoist_linear.head_layout import HeadLayout, layout_of
 from me2e_compress.passes.hoist_linear.least_work import terms_of
 from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
+from me2e_compress.passes.hoist_linear.node_writer import NodeWriter
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
-from me2e_compress.passes.hoist_linear.row_moves import without_repeats
+from me2e_compress.passes.hoist_linear.shared_rows import Shared, shared_along
 from me2e_compress.passes.work import work
+
+READ = "something else reads them, or the layer behind a term"
+OTHER = "a term is neither shared by the batch nor a layer of few columns"
+DEAR = "their terms apart are no less work"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,31 +34,33 @@ class BatchOperand:
     """The right operand of a batched product: shared terms and narrow layers."""
 
     layout: HeadLayout
-    shared: tuple[ir.Value, ...]
+    shared: tuple[Shared, ...]
     narrow: tuple[LinearLayer, ...]
     nodes: tuple[ir.Node, ...]
 
 
-def split_operand(product: ir.Node, rewriter: Rewriter) -> int | None:
-    """Multiply by the terms of an operand apart; return saved MACs, None if none."""
+def split_operand(product: ir.Node, rewriter: Rewriter) -> int | str | None:
+    """Multiply by the terms of an operand apart; return the saved MACs.
+
+    Of an operand with such terms that stays whole, return why; of others, None.
+    """
     found = _operand(product)
-    if found is None or product.inputs[0] is None:
-        return None
+    if found is None or isinstance(found, str):
+        return found
     # Write the alternative, then compare the work of both
     writer = _Writer(product, found, rewriter)
     new = writer.result()
     before = sum(map(work, (product, *found.nodes)))
     saved = sum(macs(node) or 0 for node in (product, *found.nodes))
-    made = [node for value in writer.values if (node := value.producer()) is not None]
-    saved -= sum(macs(node) or 0 for node in made)
-    if saved < 0 or before - sum(map(work, made)) < 1.0:
-        rewriter.undo(writer.values)
-        return None
+    saved -= sum(macs(node) or 0 for node in writer.nodes)
+    if saved < 0 or before - sum(map(work, writer.nodes)) < 1.0:
+        writer.undo()
+        return DEAR
     rewriter.swap(product.outputs[0], new)
     return saved
 
 
-def _operand(product: ir.Node) -> BatchOperand | None:
+def _operand(product: ir.Node) -> BatchOperand | str | None:
     if product.op_type != "MatMul" or product.domain not in ("", "ai.onnx"):
         return None
     # The batch axes of both operands must agree
@@ -63,57 +71,85 @@ def _operand(product: ir.Node) -> BatchOperand | None:
         return None
     if left[:-2] != (static_shape(right) or ())[:-2]:
         return None
-    terms = _terms(layout.value)
-    if terms is None:
-        return None
-    shared, narrow = [], []
-    nodes = [*layout.nodes, *terms[1]]
+    terms, sums = _terms(layout.value)
+    shared, narrow, others = [], [], 0
+    nodes = [*layout.nodes, *sums]
     # Every term must be shared by the batch, or narrow
-    for value in terms[0]:
-        layer = layer_behind(value)
-        if layout.is_shared(static_shape(value)):
-            shared.append(value)
+    for value in terms:
+        rows, layer = _shared(value, layout), layer_behind(value)
+        if rows is not None:
+            shared.append(rows)
+            nodes.extend(rows.nodes)
         elif layer is not None and layout.is_whole(static_shape(layer.source)):
-            if any(sole_reader(node.outputs[0]) is None for node in layer.nodes):
-                return None
             narrow.append(layer)
             nodes.extend(layer.nodes)
         else:
-            return None
-    if not shared and any(layer.bias() is not None for layer in narrow):
+            others += 1
+    if others:
+        return _reason(layout, bool(shared or narrow))
+    if any(
+        sole_reader(each.outputs[0]) is None for one in narrow for each in one.nodes
+    ):
+        return READ
+    if not shared and (not sums or any(layer.bias() is not None for layer in narrow)):
         return None
     return BatchOperand(layout, tuple(shared), tuple(narrow), tuple(nodes))
 
 
-def _terms(value: ir.Value) -> tuple[list[ir.Value], list[ir.Node]] | None:
-    if sole_reader(value) is None:
+def _reason(layout: HeadLayout, fits: bool) -> str | None:
+    """Return why an operand stays whole, if it has some terms that fit."""
+    if fits:
+        return OTHER
+    total = maker(layout.value, "Add")
+    if total is None or sole_reader(layout.value) is not None:
         return None
-    # A repetition is a sum of one term
-    node, source = value.producer(), without_repeats(value)
-    if node is not None and source is not None:
-        return [source], [node]
-    total = maker(value, "Add")
-    if total is None:
-        return None
-    # Nodes between the sum and its terms go, too
-    found = [term for term, _, _ in terms_of(total, static_shape(value) or ())]
-    between = [
-        repeat
-        for operand in total.inputs
-        if operand is not None
-        and operand not in found
-        and (repeat := operand.producer()) is not None
-        and sole_reader(operand) is not None
-    ]
-    return (found, [total, *between]) if found else None
+    terms = terms_of(total, static_shape(layout.value) or ())
+    found = (_shared(value, layout) for value, _, _ in terms)
+    return READ if any(each is not None for each in found) else None
 
 
-class _Writer:
+def _shared(value: ir.Value, layout: HeadLayout) -> Shared | None:
+    shape = static_shape(value)
+    if not layout.is_shared(shape) and not layout.has_rows(shape):
+        return None
+    return shared_along(value, layout.batch_axis)
+
+
+def _terms(value: ir.Value) -> tuple[list[ir.Value], list[ir.Node]]:
+    """Return the terms of a sum, and the nodes that go with it, the last one first."""
+    terms: list[ir.Value] = []
+    nodes: list[ir.Node] = []
+    waiting = [value]
+    while waiting:
+        last = waiting.pop()
+        total = maker(last, "Add")
+        if total is None or sole_reader(last) is None or layer_behind(last) is not None:
+            terms.append(last)
+            continue
+        found = [term for term, _, _ in terms_of(total, static_shape(last) or ())]
+        if not found:
+            terms.append(last)
+            continue
+        # Nodes between the sum and its terms go, too
+        between = [
+            repeat
+            for operand in total.inputs
+            if operand is not None
+            and operand not in found
+            and (repeat := operand.producer()) is not None
+            and sole_reader(operand) is not None
+        ]
+        nodes.extend((total, *between))
+        waiting.extend(reversed(found))
+    return terms, nodes
+
+
+class _Writer(NodeWriter):
     def __init__(
         self, product: ir.Node, found: BatchOperand, rewriter: Rewriter
     ) -> None:
-        self.product, self.found, self.rewriter = product, found, rewriter
-        self.values: list[ir.Value] = []
+        super().__init__(rewriter, (product, *found.nodes))
+        self.product, self.found = product, found
 
     def result(self) -> ir.Value:
         layout, out = self.found.layout, self.product.outputs[0]
@@ -121,25 +157,24 @@ class _Writer:
         assert left is not None
         # Give the queries axes of batch and heads, and their scale
         matrix = (static_shape(left) or ())[-2:]
-        left = self._shape(left, (layout.batch, layout.heads, *matrix))
+        left = self.shape(left, (layout.batch, layout.heads, *matrix))
         if layout.scale != 1.0:
-            factor = self._constant(np.array(layout.scale), "scale")
-            left = self._write("Mul", [left, factor], static_shape(left) or ())
-        total: ir.Value | None = None
-        # Biases are added to one shared term
-        biases = [layer.bias() for layer in self.found.narrow]
-        for value in self.found.shared:
-            for bias in biases:
-                if bias is not None:
-                    added = self._constant(bias, "bias")
-                    shape = static_shape(value) or ()
-                    value = self._write("Add", [value, added], shape)
-            biases = []
-            total = self._plus(total, self._multiply(left, self._heads(value)))
+            factor = self.constant(np.array(layout.scale), "scale")
+            left = self.write("Mul", [left, factor], static_shape(left) or ())
+        # One product with the sum of what the batch shares, the biases among it
+        shared: ir.Value | None = None
+        for rows in self.found.shared:
+            shared = self.plus(shared, rows.write(self))
         for layer in self.found.narrow:
-            total = self._plus(total, self._narrow(left, layer))
+            bias = layer.bias()
+            if bias is not None:
+                shared = self.plus(shared, self.constant(bias, "bias"))
+        # And one with every narrow layer
+        total = None if shared is None else self.multiply(left, self._heads(shared))
+        for layer in self.found.narrow:
+            total = self.plus(total, self._narrow(left, layer))
         assert total is not None
-        return self._shape(total, static_shape(out) or ())
+        return self.shape(total, static_shape(out) or ())
 
     def _narrow(self, left: ir.Value, layer: LinearLayer) -> ir.Value:
         """Multiply by a layer's matrix and its source, the smaller first."""
@@ -147,72 +182,25 @@ class _Writer:
         matrix = layer.matrix().reshape(-1, layout.heads, layout.channels)
         source = self._tokens(layer.source)
         if layout.turned:
-            turned = self._constant(matrix.transpose(1, 2, 0)[None], "heads")
-            return self._multiply(self._multiply(left, turned), source)
-        heads = self._constant(matrix.transpose(1, 0, 2)[None], "heads")
-        return self._multiply(self._multiply(left, source), heads)
+            turned = self.constant(matrix.transpose(1, 2, 0)[None], "heads")
+            return self.multiply(self.multiply(left, turned), source)
+        heads = self.constant(matrix.transpose(1, 0, 2)[None], "heads")
+        return self.multiply(self.multiply(left, source), heads)
 
     def _heads(self, value: ir.Value) -> ir.Value:
         """Split a value into heads: [1, H, J, D], or [1, H, D, J] if turned."""
         layout = self.found.layout
         ends = (layout.heads, layout.channels)
         tokens = (layout.tokens, 1) if layout.batch_axis else (1, layout.tokens)
-        split = self._shape(value, (*tokens, *ends))
+        split = self.shape(value, (*tokens, *ends))
         first, second = (1, 0) if layout.batch_axis else (0, 1)
         order = [first, 2, 3, second] if layout.turned else [first, 2, second, 3]
-        return self._transpose(split, order)
+        return self.transpose(split, order)
 
     def _tokens(self, value: ir.Value) -> ir.Value:
         """Give rows an axis of heads: [B, 1, J, C], or [B, 1, C, J] if turned."""
         layout = self.found.layout
         first, second = (1, 0) if layout.batch_axis else (0, 1)
         order = [first, 2, second] if layout.turned else [first, second, 2]
-        moved = self._transpose(value, order) if order != [0, 1, 2] else value
-        return self._shape(moved, (layout.batch, 1, *(static_shape(moved) or ())[1:]))
-
-    def _transpose(self, value: ir.Value, order: list[int]) -> ir.Value:
-        old = static_shape(value) or ()
-        shape = tuple(old[axis] for axis in order)
-        return self._write("Transpose", [value], shape, [ir.AttrInt64s("perm", order)])
-
-    def _shape(self, value: ir.Value, shape: tuple[int, ...]) -> ir.Value:
-        if static_shape(value) == shape:
-            return value
-        target = self.rewriter.target(shape, f"{self.product.name}_shape")
-        return self._write("Reshape", [value, target], shape)
-
-    def _multiply(self, left: ir.Value, right: ir.Value) -> ir.Value:
-        rows, columns = (
-            (static_shape(left) or ())[:-1],
-            (static_shape(right) or ())[-1:],
-        )
-        return self._write("MatMul", [left, right], (*rows, *columns))
-
-    def _plus(self, one: ir.Value | None, two: ir.Value) -> ir.Value:
-        if one is None:
-            return two
-        return self._write("Add", [one, two], static_shape(one) or ())
-
-    def _constant(self, numbers: Array, name: str) -> ir.Value:
-        dtype = self.product.outputs[0].dtype
-        assert dtype is not None
-        array = numbers.astype(dtype.numpy())
-        return self.rewriter.store(array, f"{self.product.name}_{name}")
-
-    def _write(
-        self,
-        op_type: str,
-        inputs: list[ir.Value],
-        shape: tuple[int, ...],
-        attributes: list[ir.Attr] | None = None,
-    ) -> ir.Value:
-        value = self.rewriter.write(
-            op_type,
-            inputs,
-            attributes or [],
-            shape,
-            sources=(self.product, *self.found.nodes),
-            like=self.product.outputs[0],
-        )
-        self.values.append(value)
-        return value
+        moved = self.transpose(value, order)
+        return self.shape(moved, (layout.batch, 1, *(static_shape(moved) or ())[1:]))
