@@ -35,8 +35,9 @@ class FlattenMatmul(Pass):
 
     Result:  MatMul(points [1, 40000, 4], transposed matrices [6, 4, 4])
 
-    The last batch axes along which one operand is broadcast become rows of the other;
-    of vectors, the transposed product is taken. Repetitions in front of a product that
+    The batch axes along which one operand is broadcast become rows of the other: the
+    last ones by a view, others behind a transposition, which is undone. Of vectors, the
+    transposed product is taken. Repetitions in front of a product that
     broadcasts by itself (Tile, Expand) are not read any more. A product is rewritten
     where that saves more starts of small products than the views around it cost
     (:mod:`me2e_compress.passes.work`). Sizes must be known. Products and their sums are
@@ -76,32 +77,55 @@ class FlattenMatmul(Pass):
 
 @dataclasses.dataclass(frozen=True)
 class _Form:
-    """A cheaper product: ``rows`` [*batch, R, K] times ``matrix`` [*batch, K, C].
+    """A cheaper product: rows [*batch, R, K] times a matrix [*batch, K, C].
 
-    ``turned`` says that the matrix is the left operand, to be transposed.
+    ``axes`` are those of the rows' operand, without those that are 1 in both, and
+    ``order`` brings the ``batch`` axes that stay to the front. ``turned`` says that the
+    matrix is the left operand, to be transposed.
     """
 
     rows: ir.Value
-    rows_shape: Shape
+    axes: Shape
+    order: tuple[int, ...]
+    batch: int
     matrix: ir.Value
     matrix_shape: Shape
     turned: bool
 
     @property
+    def sorted_axes(self) -> Shape:
+        """The sizes of the rows' axes in their new order."""
+        return tuple(self.axes[axis] for axis in self.order)
+
+    @property
+    def rows_shape(self) -> Shape:
+        """The shape of the rows, [*batch, R, K]."""
+        *sizes, width = self.sorted_axes
+        return (*sizes[: self.batch], math.prod(sizes[self.batch :]), width)
+
+    @property
     def shape(self) -> Shape:
-        """The shape of the product."""
+        """The shape of the product, [*batch, R, C]."""
         batch = np.broadcast_shapes(self.rows_shape[:-2], self.matrix_shape[:-2])
         return (*batch, self.rows_shape[-2], self.matrix_shape[-1])
 
     @property
+    def moves(self) -> bool:
+        """Whether rows are transposed, and the product is transposed back."""
+        return self.order != tuple(range(len(self.order)))
+
+    @property
     def price(self) -> float:
-        """What its views, its transposition and its products cost, in node starts."""
+        """What its views, its transpositions and its products cost, in node starts."""
         starts = small_products(self.rows_shape, self.matrix_shape)
-        price = 3.0 + starts / SMALL_PRODUCTS_PER_NODE
+        price, moved = 3.0 + starts / SMALL_PRODUCTS_PER_NODE, 0.0
         if self.turned:
-            moved = 2 * (value_bytes(self.matrix) or 0)
-            price += 1.0 + moved / MOVED_BYTES_PER_NODE
-        return price
+            price, moved = price + 1.0, float(value_bytes(self.matrix) or 0)
+        if self.moves:
+            rows = value_bytes(self.rows) or 0
+            share = math.prod(self.shape) / math.prod(self.rows_shape)
+            price, moved = price + 2.0, moved + rows * (1.0 + share)
+        return price + 2 * moved / MOVED_BYTES_PER_NODE
 
 
 def _flatten(product: ir.Node, rewriter: Rewriter) -> ir.Node | None:
@@ -110,9 +134,10 @@ def _flatten(product: ir.Node, rewriter: Rewriter) -> ir.Node | None:
     if shapes is None or left is None or right is None:
         return None
     # Rows of the left operand, or the right operand's vectors as rows
-    forms = [_form(left, shapes[0], right, shapes[1], turned=False)]
+    ways = [(left, shapes[0], right, shapes[1], False)]
     if shapes[1][-1] == 1:
-        forms.append(_form(right, _turned(shapes[1]), left, _turned(shapes[0])))
+        ways.append((right, _turned(shapes[1]), left, _turned(shapes[0]), True))
+    forms = [_form(*way, all_axes=each) for way in ways for each in (False, True)]
     found = min(filter(None, forms), key=lambda form: form.price, default=None)
     before = small_products(*shapes) / SMALL_PRODUCTS_PER_NODE
     if found is None or found.price >= before:
@@ -125,55 +150,75 @@ def _form(
     rows_shape: Shape,
     matrix: ir.Value,
     matrix_shape: Shape,
+    turned: bool,
     *,
-    turned: bool = True,
+    all_axes: bool,
 ) -> _Form | None:
-    """Move the last batch axes that the matrix lacks into the rows; None if none."""
+    """Make rows of the batch axes that the matrix lacks: the last ones, or all."""
     rank = max(len(rows_shape), len(matrix_shape))
-    rows_shape, matrix_shape = _widened(rows_shape, rank), _widened(matrix_shape, rank)
-    # Only the rows have the axes from here to the last
-    at = rank - 2
-    while at and matrix_shape[at - 1] == 1:
-        at -= 1
-    count = math.prod(rows_shape[at:-1])
-    if count == rows_shape[-2]:
+    *lead, count, width = _widened(rows_shape, rank)
+    shared = _widened(matrix_shape, rank)[:-2]
+    pairs = [pair for pair in zip(lead, shared, strict=True) if max(pair) > 1]
+    last = next((n for n, (_, size) in enumerate(reversed(pairs)) if size > 1), None)
+    end = 0 if last is None else len(pairs) - last
+    kept = [n for n, (_, m) in enumerate(pairs) if m > 1 or (n < end and not all_axes)]
+    if len(kept) == len(pairs):
         return None
-    # Axes of which neither has more than one element go too
-    batches = zip(rows_shape[:at], matrix_shape[:at], strict=True)
-    kept = [pair for pair in batches if max(pair) > 1]
+    others = [n for n in range(len(pairs)) if n not in kept]
     return _Form(
         rows,
-        (*(one for one, _ in kept), count, rows_shape[-1]),
+        (*(one for one, _ in pairs), count, width),
+        (*kept, *others, len(pairs), len(pairs) + 1),
+        len(kept),
         matrix,
-        (*(other for _, other in kept), *matrix_shape[-2:]),
+        (*(pairs[n][1] for n in kept), *matrix_shape[-2:]),
         turned,
     )
 
 
 def _write(product: ir.Node, form: _Form, rewriter: Rewriter) -> ir.Node:
     old = product.outputs[0]
-    rows = _viewed(form.rows, form.rows_shape, product, rewriter)
+    # Both operands as they are multiplied
+    rows = form.rows
+    if form.moves:
+        rows = _viewed(rows, form.axes, product, rewriter)
+        rows = _transposed(rows, form.order, product, rewriter)
+    rows = _viewed(rows, form.rows_shape, product, rewriter)
     shape = _turned(form.matrix_shape) if form.turned else form.matrix_shape
     matrix = _viewed(form.matrix, shape, product, rewriter)
     if form.turned:
         rank = len(shape)
-        order = [*range(rank - 2), rank - 1, rank - 2]
-        matrix = rewriter.write(
-            "Transpose",
-            [matrix],
-            [ir.AttrInt64s("perm", order)],
-            form.matrix_shape,
-            sources=(product,),
-            like=old,
-        )
-        matrix.type = form.matrix.type
+        order = (*range(rank - 2), rank - 1, rank - 2)
+        matrix = _transposed(matrix, order, product, rewriter)
     new = rewriter.write(
         "MatMul", [rows, matrix], [], form.shape, sources=(product,), like=old
     )
     node = new.producer()
     assert node is not None
+    # The product as it was
+    if form.moves:
+        sizes = (*form.sorted_axes[form.batch : -1], form.shape[-1])
+        new = _viewed(new, (*form.shape[: form.batch], *sizes), product, rewriter)
+        back = tuple(form.order.index(axis) for axis in range(len(form.order)))
+        new = _transposed(new, back, product, rewriter)
     rewriter.swap(old, _viewed(new, static_shape(old) or (), product, rewriter))
     return node
+
+
+def _transposed(
+    value: ir.Value, order: tuple[int, ...], product: ir.Node, rewriter: Rewriter
+) -> ir.Value:
+    shape = static_shape(value) or ()
+    result = rewriter.write(
+        "Transpose",
+        [value],
+        [ir.AttrInt64s("perm", order)],
+        tuple(shape[axis] for axis in order),
+        sources=(product,),
+        like=product.outputs[0],
+    )
+    result.type = value.type
+    return result
 
 
 def _viewed(

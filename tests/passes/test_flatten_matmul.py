@@ -79,6 +79,16 @@ def test_a_matrix_for_each_camera_times_all_points() -> None:
     np.testing.assert_allclose(got, given_["a"] @ given_["b"], rtol=0, atol=1e-9)
 
 
+def test_queries_of_one_row_move_behind_their_heads() -> None:
+    """Agents that attend to the same lanes: all of them at once, for each head."""
+    a, b = (400, 8, 1, 32), (1, 8, 32, 20)
+    model, given_ = read(product(a, b)), feeds(a, b)
+    assert apply(FlattenMatmul(), model).notes == ("flattened 1 product",)
+    assert matmul_shapes(model) == [(8, 400, 32), (8, 32, 20)]
+    (got,) = compute(model, given_)
+    np.testing.assert_allclose(got, given_["a"] @ given_["b"], rtol=0, atol=1e-9)
+
+
 def test_repetitions_are_not_read_in_front_of_a_product() -> None:
     """As BEVFormer is exported: matrices and points, each repeated for the other."""
     a, b = (1, 1, CAMERAS, 1, 4, 4), (HEIGHTS, 1, 1, CELLS, 4)
