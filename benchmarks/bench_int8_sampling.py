@@ -32,6 +32,15 @@ LAYER = """
     wf = DequantizeLinear<axis=1>(w, ws, wz)
     bf = DequantizeLinear<axis=0>(b, bs, b)
     value = Gemm(xf, wf, bf)"""
+CONVOLUTION = """
+    xq = QuantizeLinear(x, step, middle)  pixels = Reshape(xq, as_pixels)
+    image = Transpose<perm=[0,3,1,2]>(pixels)
+    imagef = DequantizeLinear(image, step, middle)
+    wf = DequantizeLinear<axis=0>(filter, ws, wz)
+    bf = DequantizeLinear<axis=0>(b, bs, b)
+    convolved = Conv(imagef, wf, bf)  cq = QuantizeLinear(convolved, step, middle)
+    turned = Transpose<perm=[0,2,3,1]>(cq)
+    v = DequantizeLinear(turned, step, middle)"""
 PAIR = "q = QuantizeLinear(value, step, middle)  v = DequantizeLinear(q, step, middle)"
 
 
@@ -49,10 +58,13 @@ class Case:
         """Write the call, with an int8 layer or a pair in front of it."""
         shape = f"1,{self.queries},{HEADS},{self.levels},{self.points}"
         made = LAYER if layer else "value = Identity(x)"
+        read = PAIR if pair else "v = Identity(value)"
+        if layer and pair:  # as lowering writes it
+            made, read = CONVOLUTION, ""
         text = f"""<ir_version: 8, opset_import: ["" : 17, "me2e" : 1]>
         g (float[{self.rows},{CHANNELS}] x, float[{shape},2] at, float[{shape}] shares)
             => (float[1,{self.queries},{HEADS},{WIDTH}] y) {{
-            {made}  {PAIR if pair else "v = Identity(value)"}
+            {made}  {read}
             r = Reshape(v, parted)
             y = me2e.MultiScaleDeformableAttention(r, sizes, starts, at, shares)
         }}"""
@@ -68,13 +80,16 @@ class Case:
         area = self.rows // self.levels
         height = max(n for n in range(1, int(area**0.5) + 1) if area % n == 0)
         weights = np.random.default_rng(0).integers(-127, 128, (CHANNELS, CHANNELS))
+        weights = weights.astype(np.int8)
         return {
+            "as_pixels": np.array([1, -1, 1, CHANNELS]),
+            "filter": np.ascontiguousarray(weights.T)[:, :, None, None],
             "parted": np.array([1, self.rows, HEADS, WIDTH]),
             "sizes": np.array([[height, area // height]] * self.levels),
             "starts": np.arange(self.levels) * area,
             "step": np.array(0.03, np.float32),
             "middle": np.array(128, np.uint8),
-            "w": weights.astype(np.int8),
+            "w": weights,
             "ws": np.full(CHANNELS, 0.001, np.float32),
             "wz": np.zeros(CHANNELS, np.int8),
             "b": np.zeros(CHANNELS, np.int32),

@@ -38,7 +38,7 @@ class CpuSeconds:
         int8_product: a float32 output element of a matrix product.
         float_sampled_mac: a multiply-accumulate of a fused operator that samples
             feature maps too large for the cache.
-        requantize: extra time for a uint8 output element of a matrix product.
+        int8_cached_mac: what uint8 adds to one on maps in the cache.
     """
 
     machine: str
@@ -56,7 +56,7 @@ class CpuSeconds:
     int8_weight: float
     float_sampled_mac: float
     int8_sampled_mac: float
-    requantize: float
+    int8_cached_mac: float
     quantize: float
     dequantize: float
 
@@ -81,13 +81,13 @@ ZEN5 = CpuSeconds(
     int8_weight=0.008,
     float_sampled_mac=0.1,
     int8_sampled_mac=0.075,
-    requantize=0.5,
+    int8_cached_mac=0.003,
     quantize=0.1,
     dequantize=0.17,
 )
 """Fitted to single layers and chains on an AMD EPYC (Zen 5), onnxruntime 1.31, by
-``python -m benchmarks.fit_cpu_costs``; sampling and ``requantize`` by hand, to the
-results of ``python -m benchmarks.bench_int8_sampling``. Ratios carry over to other
+``python -m benchmarks.fit_cpu_costs``; sampling by hand, to the results of
+``python -m benchmarks.bench_int8_sampling``. Ratios carry over to other
 processors with VNNI better than the seconds do."""
 
 
@@ -112,10 +112,9 @@ def costs_of(
         if work is not None:
             saved[layer] = machine.seconds(work[0]) - machine.seconds(work[1])
     for node in region.sampled.values():
-        macs = sampled_macs(node)
-        if macs is not None:
-            gain = machine.float_sampled_mac - machine.int8_sampled_mac
-            saved[node] = 1e-9 * gain * macs
+        counts = sampled_work(node)
+        if counts is not None:
+            saved[node] = machine.seconds(counts[0]) - machine.seconds(counts[1])
     # Each uint8 tensor may cost a conversion at its border.
     around = _Surroundings(region)
     borders = tuple(around.border(value, machine) for value in region.grids)
@@ -147,13 +146,18 @@ def work_of(layer: ir.Node) -> tuple[Counts, Counts] | None:
     return float_, int8
 
 
-def sampled_macs(node: ir.Node) -> int | None:
-    """Count a fused operator's products on maps larger than the cache, if known."""
+def sampled_work(node: ir.Node) -> tuple[Counts, Counts] | None:
+    """Count a fused operator's work in float and in int8; None where it is unknown.
+
+    On maps that fit the cache, only the conversion of the integers is counted.
+    """
     found, shape = find(node), static_shape(node.inputs[0])
     macs = None if found is None else found[0].cost(node, found[1]).macs
     if macs is None or shape is None:
         return None
-    return macs if 4 * math.prod(shape[1:]) > CACHE_BYTES else 0
+    if 4 * math.prod(shape[1:]) > CACHE_BYTES:
+        return {"float_sampled_mac": macs}, {"int8_sampled_mac": macs}
+    return {}, {"int8_cached_mac": macs}
 
 
 def _reordered(layer: ir.Node) -> int:
@@ -201,9 +205,11 @@ class _Surroundings:
         direct, carriers, others = self._uses(value)
         # Joins connect this tensor's layers with those of others.
         joins = [node for node in carriers if node.op_type in JOINS]
-        quantize = "requantize" if self._is_product(value) else "quantize"
+        # A product that is sampled is a convolution, whose rounding costs no more than
+        # the float32 that it would write.
+        rounded = 0 if self._is_product(value) else elements
         return Border(
-            machine.seconds({"kernel": 1, quantize: elements}),
+            machine.seconds({"kernel": 1, "quantize": rounded}),
             machine.seconds({"kernel": 1, "dequantize": elements}),
             self.makers(value),
             frozenset(direct),

@@ -13,7 +13,7 @@ from me2e_compress.graph.shapes import extent, is_one_matrix
 MOVES = frozenset(
     {
         "AveragePool", "Flatten", "GlobalAveragePool", "MaxPool", "Reshape", "Resize",
-        "Slice", "Squeeze", "Transpose", "Unsqueeze",
+        "Slice", "SpaceToDepth", "Squeeze", "Transpose", "Unsqueeze",
     }
 )  # fmt: skip
 """Operators that choose, move or average elements: their output lies on the input's

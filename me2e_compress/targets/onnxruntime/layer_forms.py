@@ -9,6 +9,12 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import rewrite
+from me2e_compress.targets.onnxruntime.convolution_form import (
+    filter_of,
+    quantize_of,
+    write_convolution,
+)
+from me2e_compress.targets.onnxruntime.insertion import Place
 from me2e_compress.targets.onnxruntime.kernels import biased_end
 from me2e_compress.targets.weights import QuantizedWeight
 from me2e_compress.targets.writer import Writer
@@ -27,6 +33,7 @@ def write_layer(
 
     ==================  ==============================================================
     Conv                remains: QLinearConv
+    read as uint8 only  becomes a Conv: QLinearConv
     Gemm                remains: QGemm
     MatMul, then Add    becomes a Gemm of two dimensions: QGemm. onnxruntime fuses the
                         two before it looks for int8, and then finds nothing
@@ -35,19 +42,26 @@ def write_layer(
 
     ``step`` is the scale of the uint8 tensor that the layer reads.
     """
-    channels = len(weight.scales)
-    bias = _bias(node, channels)
-    if bias is None:
-        _store(writer, node, 1, weight)
-        return
-    # The bias is in units of the product's steps.
-    weight, integers = with_bias(weight, bias, step)
-    units = (weight.scales * step).astype(np.float32)
-    if node.op_type == "MatMul":
+    bias = _bias(node, len(weight.scales))
+    integers = None
+    if bias is not None:
+        weight, integers = with_bias(weight, bias, step)
+    # Choose the form.
+    quantize = quantize_of(node)
+    if quantize is not None:
+        weight = filter_of(node, weight)
+        columns, depth = weight.integers.shape[:2]
+        node = write_convolution(writer, node, quantize, (columns, depth))
+    elif node.op_type == "MatMul" and bias is not None:
         node = _write_gemm(writer, node, weight.integers.shape)
+    # Write the weight, and the bias in units of the product's steps.
     _store(writer, node, 1, weight)
-    fresh = writer.dequantized(f"{weight.name}_bias", integers, units, 0, node)
-    node.replace_input_with(2, fresh)
+    if integers is None:
+        node.resize_inputs(2)
+    else:
+        units = (weight.scales * step).astype(np.float32)
+        fresh = writer.dequantized(f"{weight.name}_bias", integers, units, 0, node)
+        node.replace_input_with(2, fresh)
 
 
 def with_bias(
@@ -112,7 +126,7 @@ def _write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Nod
         raise PreconditionError(f"{product.name} is not a MatMul with a bias")
     old = addition.outputs[0]
     name = str(old.name)
-    place = _Place(writer, addition, [product, addition])
+    place = Place(writer, addition, [product, addition])
     # Flatten the leading dimensions, and restore them afterwards.
     leading = list(left.shape)[:-1]
     rows = left
@@ -126,51 +140,3 @@ def _write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Nod
     answer.shape, answer.type = old.shape, old.type
     rewrite.replace_value(old, answer)
     return gemm
-
-
-class _Place:
-    """Inserts new nodes at one place, with the provenance of the old ones."""
-
-    def __init__(
-        self, writer: Writer, before: ir.Node, sources: Sequence[ir.Node]
-    ) -> None:
-        self._writer = writer
-        self._before = before
-        self._sources = sources
-
-    def node(self, op: str, inputs: Sequence[ir.Value], name: str) -> ir.Node:
-        node = self._writer.node(op, inputs, name, self._sources)
-        node.outputs[0].dtype = ir.DataType.FLOAT
-        self._writer.graph.insert_before(self._before, node)
-        return node
-
-    def reshaped(self, value: ir.Value, shape: Sequence[int], name: str) -> ir.Value:
-        target = self._writer.constant(np.array(shape, np.int64), f"{name}_shape")
-        return self.node("Reshape", [value, target], name).outputs[0]
-
-    def restored(
-        self,
-        rows: ir.Value,
-        like: ir.Value,
-        leading: Sequence[int | ir.SymbolicDim],
-        columns: int,
-        name: str,
-    ) -> ir.Value:
-        """Reshape [rows, columns] to the leading dimensions of another value."""
-        # At most one open dimension: a constant shape suffices.
-        known = [dim if isinstance(dim, int) else -1 for dim in leading]
-        if known.count(-1) <= 1:
-            return self.reshaped(rows, [*known, columns], f"{name}_ranked")
-        # Several open dimensions must be read at run time.
-        numbers = [
-            self._writer.constant(np.array([number], np.int64), f"{name}_end")
-            for number in (0, -1, columns)
-        ]
-        whole = self.node("Shape", [like], f"{name}_dims").outputs[0]
-        front = self.node("Slice", [whole, *numbers[:2]], f"{name}_leading").outputs[0]
-        target = self.node("Concat", [front, numbers[2]], f"{name}_target")
-        target.attributes.add(ir.AttrInt64("axis", 0))
-        for value in (whole, front, target.outputs[0]):
-            value.dtype = ir.DataType.INT64
-        inputs = [rows, target.outputs[0]]
-        return self.node("Reshape", inputs, f"{name}_ranked").outputs[0]

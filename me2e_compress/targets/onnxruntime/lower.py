@@ -9,6 +9,11 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import FramesError
 from me2e_compress.graph import rewrite
+from me2e_compress.targets.onnxruntime.image_blocks import (
+    blocks_of,
+    filter_of_blocks,
+    read_blocks,
+)
 from me2e_compress.targets.onnxruntime.layer_forms import write_layer
 from me2e_compress.targets.onnxruntime.region import Grid, Region, find_region
 from me2e_compress.targets.quantized import QUANTIZE, is_dequantized
@@ -32,6 +37,7 @@ class Draft:
 
 def lower(draft: Draft) -> ir.Model:
     """Write the int8 part of a draft into its graph."""
+    draft = _with_image_blocks(draft)
     main = draft.model.graph
     region = find_region(main, {*draft.weights, *draft.sampled})
     if missing := [name for name in region.ranged if name not in draft.reach]:
@@ -57,6 +63,24 @@ def lower(draft: Draft) -> ir.Model:
     _screen_products(writer)
     rewrite.sweep(draft.model)
     return draft.model
+
+
+def _with_image_blocks(draft: Draft) -> Draft:
+    """Let strided convolutions of images read blocks of pixels as channels."""
+    main = draft.model.graph
+    weights, reach = dict(draft.weights), dict(draft.reach)
+    region = find_region(main, weights)
+    writer = Writer(main)
+    for layer, image in region.layers.items():
+        cut = None if image in region.written else blocks_of(layer)
+        if cut is not None:
+            name = str(layer.outputs[0].name)
+            weights[name] = filter_of_blocks(weights[name], cut)
+            blocks = read_blocks(writer, layer, cut)
+            # Blocks have the range of their pixels.
+            if str(image.name) in reach:
+                reach[str(blocks.name)] = reach[str(image.name)]
+    return dataclasses.replace(draft, weights=weights, reach=reach)
 
 
 def _write_pairs(
