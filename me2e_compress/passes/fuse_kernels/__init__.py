@@ -14,6 +14,7 @@ from me2e_compress.graph.nodes import STANDARD
 from me2e_compress.graph.rewrite import remove_dead, replace_value, value_names
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.fuse_kernels.raw_attention import raw_attention
 
 __all__ = ["FuseKernels"]
 
@@ -24,7 +25,9 @@ None where the node is no such pattern; a PreconditionError names what an almost
 matching one lacks. Nothing may be written before the last check.
 """
 
-_FUSERS: Mapping[str, Fuser] = {}
+_FUSERS: Mapping[str, Fuser] = {
+    "MultiScaleDeformableAttention": raw_attention,
+}
 """Fusers by the type of the last node of their pattern."""
 
 
@@ -32,9 +35,11 @@ _FUSERS: Mapping[str, Fuser] = {}
 class FuseKernels(Pass):
     """Fuse float operators that compiled kernels run faster than onnxruntime's own.
 
-    Given:   y = MatMul(Softmax(MatMul(q, k^T) / sqrt(C)), v)
+    Given:   y = me2e::MultiScaleDeformableAttention(
+                 value, sizes, starts, points + offsets, Softmax(scores) * mask)
 
-    Result:  y = me2e::MultiHeadAttention(q, k, v)
+    Result:  y = me2e::RawDeformableAttention(
+                 value, sizes, starts, points, offsets, scores, mask)
 
     It stands last in a recipe, behind quantization: what is int8 stays as it is. The
     bodies of the fused nodes are the standard operators that they replace, so a file
