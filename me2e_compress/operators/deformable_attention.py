@@ -23,6 +23,7 @@ from me2e_compress.operators.dialect import (
     Values,
     present,
 )
+from me2e_compress.operators.raw_attention import raw_own_form
 
 
 def _operands(integers: tuple[ir.DataType, ...]) -> tuple[Operand, ...]:
@@ -59,6 +60,8 @@ class DeformableAttention(Operator):
     plugin: value [N, S, M, D]; spatial_shapes int32 or int64 [L, 2] (H, W);
     level_start_index [L]; sampling_locations [N, Q, M, L, P, 2] (x, y) in 0..1;
     attention_weights [N, Q, M, L, P] after their softmax. Output [N, Q, M, D].
+    Before that softmax it is a dialect,
+    :class:`~me2e_compress.operators.raw_attention.RawOwnForm`.
     """
 
     name: ClassVar[str] = "deformable-attention"
@@ -91,6 +94,7 @@ class DeformableAttention(Operator):
             "DL4AGX uniad-trt",
         ),
         Dialect("msda-plugin", "MSDAPlugin", "", _operands(INT32), _DL4AGX),
+        raw_own_form(),
     )  # fmt: skip
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:

@@ -137,6 +137,10 @@ class Dialect:
         kinds = dict(zip((each.name for each in self.operands), inputs, strict=False))
         return self.in_types(call, kinds)
 
+    def by_kernel(self, call: FusedCall, inputs: Values) -> ir.Value | None:
+        """Call a compiled kernel that takes these inputs; None if there is none."""
+        return None
+
     def options_to_own(self, attributes: Attributes) -> Attributes:
         """Convert this dialect's attributes to the own form's."""
         known = [each for each in self.attributes if each.name in attributes]

@@ -102,6 +102,12 @@ def expand(
         )
     # Own form, body, and back to the layout of the dialect
     call = FusedCall(node, opset=opset, by=by, names=names, compiled=compiled)
+    if compiled:
+        dialect.check(node)
+        made = dialect.by_kernel(call, tuple(node.inputs))
+        if made is not None:
+            _take_place(call, made)
+            return
     inputs, attributes = _own_call(call, dialect)
     result = operator.body(call, inputs, attributes)
     _take_place(call, dialect.result_from_own(call, result, inputs))

@@ -36,7 +36,7 @@ def read_int8(node: ir.Node, opset: int, names: set[str] | None) -> None:
     Result: the same Reshape of the integers, read by the int8 kernel; nodes that nobody
         else reads are removed.
 
-    ``node`` is a call of ``MultiScaleDeformableAttention`` in the kernels' domain.
+    ``node`` calls a kernel of deformable attention that has an int8 kernel beside it.
     """
     value = node.inputs[0]
     assert value is not None

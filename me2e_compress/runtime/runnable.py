@@ -26,7 +26,7 @@ from me2e_compress.runtime.int8_values import read_int8
 from me2e_compress.runtime.providers import CPU, Provider
 
 _BY = "session"
-_FLOAT_KERNEL = kernels.KERNELS[0].op_type
+_FLOAT_KERNELS = ("MultiScaleDeformableAttention", "RawDeformableAttention")
 _COMPILED = {each.op_type: each for each in kernels.KERNELS}
 
 
@@ -139,7 +139,7 @@ def _expand(node: ir.Node, model: ir.Model, names: set[str], compiled: bool) -> 
 
 
 def _calls_kernel(node: ir.Node) -> bool:
-    return node.domain == kernels.DOMAIN and node.op_type == _FLOAT_KERNEL
+    return node.domain == kernels.DOMAIN and node.op_type in _FLOAT_KERNELS
 
 
 def _opset(node: ir.Node, model: ir.Model) -> int:

@@ -19,6 +19,7 @@ from me2e_compress.operators import (
 )
 from me2e_compress.operators.attention_layouts import RawAttention
 from me2e_compress.operators.deformable_attention import DeformableAttention
+from me2e_compress.operators.raw_attention import RawOwnForm
 from tests.operators.running import body_and_reference, graph_of, run
 from tests.profiles import scaled
 
@@ -57,7 +58,13 @@ def arrays_of(dialect: Dialect, call: dict[str, Any]) -> dict[str, npt.NDArray[A
     count, points = len(sizes), call["points"]
     value = random.normal(size=(batch, int(areas.sum()), heads, call["width"]))
     head = (batch, queries, heads)
-    if isinstance(dialect, RawAttention):
+    if isinstance(dialect, RawOwnForm):
+        parts = {
+            "spatial_shapes": sizes,
+            "level_start_index": areas.cumsum() - areas,
+            **repeating(random, head, count, points),
+        }
+    elif isinstance(dialect, RawAttention):
         parts = {
             "spatial_shapes": sizes,
             "reference_points": random.uniform(
@@ -76,6 +83,32 @@ def arrays_of(dialect: Dialect, call: dict[str, Any]) -> dict[str, npt.NDArray[A
     return {
         name: array.astype(np.float32) if array.dtype == np.float64 else array
         for name, array in {"value": value, **parts}.items()
+    }
+
+
+def repeating(
+    random: np.random.Generator, head: tuple[int, int, int], levels: int, points: int
+) -> dict[str, npt.NDArray[np.float64]]:
+    """Draw operands of the raw own form, each of which repeats where it may."""
+
+    def part(size: int) -> int:
+        divisors = [each for each in range(1, size + 1) if size % each == 0]
+        return int(random.choice(divisors))
+
+    def small() -> list[int]:
+        return [int(random.choice([1, size])) for size in head]
+
+    row = part(levels * points)
+    mask = random.normal(size=(*small(), part(levels), part(points)))
+    return {
+        "reference_points": random.uniform(
+            -0.1, 1.1, (*small(), part(levels), part(points), 2)
+        ),
+        "sampling_offsets": random.normal(size=(*head, part(levels), points, 2)) * 0.2,
+        "attention_scores": random.normal(
+            size=(*small(), part(levels * points // row), row), scale=4
+        ),
+        "mask": np.where(random.uniform(size=mask.shape) < 0.5, mask, 0),
     }
 
 
@@ -110,7 +143,7 @@ def test_sizes_that_only_the_run_tells(dialect: Dialect, opset: int) -> None:
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["me2e", "autoware", "derryhub"])
+@pytest.mark.parametrize("name", ["me2e", "autoware", "derryhub", "me2e-raw"])
 def test_in_float64_the_body_is_the_reference_to_rounding(name: str) -> None:
     dialect = dialect_of(OPERATOR, name)
     assert dialect is not None
@@ -197,6 +230,12 @@ def test_what_a_dialect_does_not_take_is_named(
     if attribute is not None:
         node.attributes.add(attribute)
     with pytest.raises(PreconditionError, match=message):
+        expand(node, opset=17, by="test")
+
+
+def test_operands_that_do_not_repeat_to_the_sizes_of_a_call_are_named() -> None:
+    node = node_of("me2e-raw", mask=np.ones((1, 1, 1, 1, 3), np.float32))
+    with pytest.raises(PreconditionError, match="mask has 3 of axis 4, which do not"):
         expand(node, opset=17, by="test")
 
 

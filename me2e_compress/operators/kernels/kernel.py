@@ -37,7 +37,16 @@ _DEFORMABLE = (
     "the scale of value must be one number, or one for every channel, its zero point"
     " one number",
 )
-_INPUTS = (FLOAT, ANY, ANY, FLOAT, FLOAT)
+_RAW = (
+    "the inputs have not the ranks that they must: value 4, spatial_shapes 2,"
+    " level_start_index 1, reference_points and sampling_offsets 6, attention_scores"
+    " and mask 5",
+    "the inputs do not fit each other: they must be value [N,S,M,D], spatial_shapes"
+    " [L,2], level_start_index [L], reference_points [n,q,m,l,p,2], sampling_offsets"
+    " [N,Q,M,l,P,2], attention_scores [n,q,m,r,c] and mask [n,q,m,l,p], where n, q and"
+    " m are 1 or N, Q and M, l and p divide L and P, and r*c divides L*P",
+    *_DEFORMABLE[2:],
+)
 
 ATTENTION = "MultiHeadAttention"
 WIDEST_HEAD = 256
@@ -50,20 +59,24 @@ _ATTENTION = (
     f"a head has more than {WIDEST_HEAD} channels",
 )
 
+
+def _attention(
+    name: str, module: str, others: int, messages: tuple[str, ...]
+) -> tuple[CompiledKernel, ...]:
+    """List the kernels for float, int8 and uint8 values, which come with a scale."""
+    rest = (ANY, ANY, *[FLOAT] * others)
+    return (
+        CompiledKernel(name, module, (FLOAT, *rest), messages),
+        *(
+            CompiledKernel(name + word, module, (kind, *rest, FLOAT, kind), messages)
+            for word, kind in (("Int8", INT8), ("Uint8", UINT8))
+        ),
+    )
+
+
 KERNELS = (
-    *(
-        CompiledKernel(
-            f"MultiScaleDeformableAttention{word}",
-            "deformable_kernel",
-            inputs,
-            _DEFORMABLE,
-        )
-        for word, inputs in (
-            ("", _INPUTS),
-            ("Int8", (INT8, *_INPUTS[1:], FLOAT, INT8)),
-            ("Uint8", (UINT8, *_INPUTS[1:], FLOAT, UINT8)),
-        )
-    ),
+    *_deformable("MultiScaleDeformableAttention", "deformable_kernel", 2, _DEFORMABLE),
+    *_deformable("RawDeformableAttention", "raw_attention_kernel", 4, _RAW),
     CompiledKernel(ATTENTION, "attention_kernel", (FLOAT, FLOAT, FLOAT), _ATTENTION),
 )
 """All compiled kernels."""

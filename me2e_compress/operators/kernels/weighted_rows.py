@@ -22,12 +22,13 @@ WIDTHS = (32, 16, 8, 4, 1)
 """Channels at a time, the widest first."""
 
 
-def weighted_rows(kind: Any) -> Any:
+def weighted_rows(kind: Any, *, onto: bool = False) -> Any:
     """Return the intrinsic ``(rows, offsets, weights, first, last, out, size)``.
 
     It writes ``size`` float32 numbers to the address ``out``: the sum over the points
-    ``first`` to ``last`` of four rows each, times their weights. A point whose first
-    offset is negative is skipped. Rows of ``kind`` are float32, int8 or uint8.
+    ``first`` to ``last`` of four rows each, times their weights, ``onto`` what is there
+    or not. A point whose first offset is negative is skipped. Rows of ``kind`` are
+    float32, int8 or uint8.
     """
 
     def typed(
@@ -42,7 +43,7 @@ def weighted_rows(kind: Any) -> Any:
     ) -> tuple[Any, Callable[..., Any]]:
         # Numba calls this with LLVM values
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            _Loops(builder, kind, *arguments).write()
+            _Loops(builder, kind, onto, *arguments).write()
             return context.get_dummy_value()
 
         word = types.intp
@@ -58,6 +59,7 @@ class _Loops:
         self,
         builder: Any,
         kind: Any,
+        onto: bool,
         rows: Any,
         offsets: Any,
         weights: Any,
@@ -66,7 +68,7 @@ class _Loops:
         out: Any,
         size: Any,
     ) -> None:
-        self.builder, self.kind = builder, kind
+        self.builder, self.kind, self.onto = builder, kind, onto
         self.rows = builder.inttoptr(rows, ELEMENTS[kind].as_pointer())
         self.out = builder.inttoptr(out, FLOAT.as_pointer())
         self.offsets, self.weights = offsets, weights
@@ -88,17 +90,18 @@ class _Loops:
             end = builder.add(at, WORD(width))
             builder.cbranch(builder.icmp_signed("<=", end, self.size), body, after)
             builder.position_at_end(body)
-            total = self._sum(builder.gep(self.rows, [at]), width)
-            place = builder.gep(self.out, [at])
-            builder.store(total, self._vector_at(place, FLOAT, width), align=4)
+            place = self._vector_at(builder.gep(self.out, [at]), FLOAT, width)
+            zeros = ir.VectorType(FLOAT, width)([0.0] * width)
+            begin = builder.load(place, align=4) if self.onto else zeros
+            total = self._sum(builder.gep(self.rows, [at]), begin, width)
+            builder.store(total, place, align=4)
             builder.store(end, done)
             builder.branch(head)
             builder.position_at_end(after)
 
-    def _sum(self, rows: Any, width: int) -> Any:
+    def _sum(self, rows: Any, begin: Any, width: int) -> Any:
         """Write the loop over points for ``width`` channels and return the sums."""
         builder, kind = self.builder, ir.VectorType(FLOAT, width)
-        nothing = kind([0.0] * width)
         before = builder.block
         loop, inside, ahead, end = (
             builder.append_basic_block(f"{part}{width}")
@@ -111,7 +114,7 @@ class _Loops:
         builder.position_at_end(loop)
         point, sums = builder.phi(WORD), builder.phi(kind)
         point.add_incoming(self.first, before)
-        sums.add_incoming(nothing, before)
+        sums.add_incoming(begin, before)
         offset = builder.load(builder.gep(self.offsets, [point]))
         builder.cbranch(builder.icmp_signed(">=", offset, INT(0)), inside, ahead)
 
@@ -140,7 +143,7 @@ class _Loops:
 
         builder.position_at_end(end)
         total = builder.phi(kind)
-        total.add_incoming(nothing, before)
+        total.add_incoming(begin, before)
         total.add_incoming(kept, ahead)
         return total
 

@@ -16,6 +16,7 @@ from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fuse_kernels import grid_sample
 from me2e_compress.passes.fuse_kernels.attention import fuse_attention
+from me2e_compress.passes.fuse_kernels.raw_attention import raw_attention
 
 __all__ = ["FuseKernels"]
 
@@ -29,6 +30,7 @@ matching one lacks. Nothing may be written before the last check.
 _FUSERS: Mapping[str, Fuser] = {
     "GridSample": grid_sample.fuse,
     "MatMul": fuse_attention,
+    "MultiScaleDeformableAttention": raw_attention,
 }
 """Fusers by the type of the last node of their pattern."""
 
@@ -37,9 +39,11 @@ _FUSERS: Mapping[str, Fuser] = {
 class FuseKernels(Pass):
     """Fuse float operators that compiled kernels run faster than onnxruntime's own.
 
-    Given:   y = MatMul(Softmax(MatMul(q, k^T) / sqrt(C)), v)
+    Given:   y = me2e::MultiScaleDeformableAttention(
+                 value, sizes, starts, points + offsets, Softmax(scores) * mask)
 
-    Result:  y = me2e::MultiHeadAttention(q, k, v)
+    Result:  y = me2e::RawDeformableAttention(
+                 value, sizes, starts, points, offsets, scores, mask)
 
     It stands last in a recipe, behind quantization: what is int8 stays as it is. The
     bodies of the fused nodes are the standard operators that they replace, so a file

@@ -25,6 +25,7 @@ from me2e_compress.passes.fuse_operators.numeric_check import (
     nodes_between,
     piece_of,
     run_piece,
+    take_back,
 )
 
 __all__ = ["FuseOperators"]
@@ -141,7 +142,7 @@ class _Run:
         try:
             self._prove(old, new, plan)
         except (PreconditionError, GraphError):
-            _take_back(body, made, known)
+            take_back(body, made, known)
             raise
         # Replace the old result and clean up
         for each in made:
@@ -178,12 +179,6 @@ class _Run:
             array = run_piece(piece_of(value, (), self.opset), ())
             name = f"{value.name}_constant"
             node.replace_input_with(index, add_constant(body, array, name, self.names))
-
-
-def _take_back(body: ir.Graph, made: Sequence[ir.Node], known: set[str]) -> None:
-    body.remove(reversed(made), safe=True)
-    for name in [name for name in body.initializers if name not in known]:
-        del body.initializers[name]
 
 
 def _drop_dead(nodes: Sequence[ir.Node]) -> None:

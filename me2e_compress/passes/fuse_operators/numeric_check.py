@@ -76,6 +76,13 @@ def run_piece(piece: ir.Model, feeds: Sequence[Array]) -> Array:
     return result
 
 
+def take_back(body: ir.Graph, made: Sequence[ir.Node], known: set[str]) -> None:
+    """Remove nodes, in graph order, and all initializers but the known ones."""
+    body.remove(reversed(made), safe=True)
+    for name in [name for name in body.initializers if name not in known]:
+        del body.initializers[name]
+
+
 DRAWS = 8
 """Number of draws until a result is not zero: a single position lies outside the
 feature map in a third of all draws."""

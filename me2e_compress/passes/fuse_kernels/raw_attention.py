@@ -1,0 +1,279 @@
+"""Fuse positions and weights into the deformable attention that reads them."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import array_of, is_standard, static_shape
+from me2e_compress.graph.nodes import producer_of, sole_reader
+from me2e_compress.operators import OWN_DOMAIN, FusedCall
+from me2e_compress.operators.raw_attention import RAW_ATTENTION, raw_own_form
+from me2e_compress.passes.digits import Digit, Layout, flat, merged, whole
+from me2e_compress.passes.digits import sizes as sizes_of
+from me2e_compress.passes.fuse_operators.laid_out import combined, laid_out
+from me2e_compress.passes.fuse_operators.numeric_check import (
+    Proofs,
+    nodes_between,
+    take_back,
+)
+from me2e_compress.passes.fuse_operators.operand_sources import cost_of, whole_views
+from me2e_compress.passes.fuse_operators.views import View, aligned, sources, terms
+
+BATCH, QUERY, HEAD, LEVEL, POINT = "batch", "query", "head", "level", "point"
+XY = "x, y"
+"""The axes of locations, which are in 0..1: not the ``xy`` of a grid's in -1..1."""
+
+TOLERANCE = 1e-5
+"""Largest difference, relative to the largest position or weight: the same float32
+operations in another order."""
+
+SOFTMAX_OPSET = 13
+"""Before, Softmax was over all axes from one on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sizes:
+    """N, Q, M, L and P of a call."""
+
+    batch: int
+    queries: int
+    heads: int
+    levels: int
+    points: int
+
+    @property
+    def weights(self) -> Layout:
+        """The layout of attention weights."""
+        axes = (BATCH, QUERY, HEAD, LEVEL, POINT)
+        return tuple(map(whole, axes, dataclasses.astuple(self)))
+
+    def form(self, views: Sequence[View]) -> Layout:
+        """Return the smallest layout of an operand that has the digits of views.
+
+        It lacks batch, queries or heads as a whole, and repeats over levels and points.
+        """
+        digits = [digit for view in views for digit in flat(view.layout)]
+        ends = {axis: 1 for axis in (BATCH, QUERY, HEAD, LEVEL, POINT)}
+        for digit in digits:
+            ends[digit.axis] = max(ends.get(digit.axis, 1), digit.end)
+        outer = tuple(
+            all_digits if ends[axis] > 1 else ()
+            for axis, all_digits in zip(
+                (BATCH, QUERY, HEAD), self.weights, strict=False
+            )
+        )
+        return (*outer, whole(LEVEL, ends[LEVEL]), whole(POINT, ends[POINT]))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Found:
+    """Where the operands of a call are read; what there is none of is None.
+
+    ``rows`` is the layout of the scores, whose last dimension is a row of the softmax.
+    """
+
+    sizes: _Sizes
+    near: View | None
+    away: View
+    scores: View | None
+    rows: Layout
+    masks: tuple[View, ...]
+    scale: float
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """All values that are read."""
+        read = (self.near, self.away, self.scores, *self.masks)
+        return tuple(each for each in read if each is not None)
+
+
+def raw_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
+    """Fuse the sum of reference points and offsets, and the softmax and its mask.
+
+    Given:   y = me2e::MultiScaleDeformableAttention(
+                 value, sizes, starts, points + offsets, Softmax(scores) * mask)
+
+    Result:  y = me2e::RawDeformableAttention(
+                 value, sizes, starts, points, offsets, scores, mask)
+
+    Operands are read before they are repeated. What is no such sum or softmax, or is
+    read by others too, is read as it is.
+    """
+    found = _find(node) if call.opset >= SOFTMAX_OPSET else None
+    if found is None:
+        return None
+    body = node.graph
+    assert isinstance(body, ir.Graph)
+    known = set(body.initializers)
+    result = call.add(
+        RAW_ATTENTION, [*node.inputs[:3], *_written(call, found)], domain=OWN_DOMAIN
+    )
+    result.shape, result.type = node.outputs[0].shape, node.outputs[0].type
+    error = _error(call, result, found.views)
+    if not error <= TOLERANCE:
+        stops = [*(view.value for view in found.views), *filter(None, node.inputs)]
+        take_back(body, nodes_between(result, stops), known)
+        raise PreconditionError(f"its positions or weights differ by {error:.1e}")
+    return result
+
+
+def _find(node: ir.Node) -> _Found | None:
+    locations, weights = node.inputs[3], node.inputs[4]
+    shape = static_shape(locations)
+    if locations is None or weights is None or shape is None:
+        raise PreconditionError("the shape of its locations is unknown")
+    if shape[:5] != static_shape(weights):
+        raise PreconditionError("its weights have another shape than its locations")
+    sizes = _Sizes(*shape[:5])
+    at = View(locations, (*sizes.weights, whole(XY, 2)))
+    share = View(weights, sizes.weights)
+    plain = _Found(sizes, None, at, None, ((),) * 5, (share,), 1.0)
+    # The sum and the softmax, if they are there
+    found = _product(share, plain) or plain
+    places = _sum(at)
+    if places is not None:
+        found = dataclasses.replace(found, near=places[0], away=places[1])
+    return None if found == plain else _with_cheapest(found)
+
+
+def _with_cheapest(found: _Found) -> _Found:
+    """Read every operand where that moves the least data."""
+    sizes = found.sizes
+    near, scores = found.near, found.scores
+    return dataclasses.replace(
+        found,
+        near=near and _cheapest(near, lambda each: _pairs(sizes.form([each]))),
+        away=_cheapest(found.away, lambda each: _away(sizes, each)),
+        scores=scores and _cheapest(scores, lambda each: found.rows),
+        masks=tuple(
+            _cheapest(mask, lambda each: sizes.form([each])) for mask in found.masks
+        ),
+    )
+
+
+def _cheapest(view: View, form: Callable[[View], Layout]) -> View:
+    def cost(each: View) -> float:
+        return cost_of(each, form(each)) + 4 * math.prod(sizes_of(form(each)))
+
+    best = min(reversed(whole_views(view)), key=cost)
+    if math.isinf(cost(best)):
+        raise PreconditionError(f"{view.value.name} repeats in another order")
+    return best
+
+
+def _pairs(layout: Layout) -> Layout:
+    return (*layout, whole(XY, 2))
+
+
+def _away(sizes: _Sizes, view: View) -> Layout:
+    """Return the layout of offsets, which may lack levels only."""
+    *outer, _, points = sizes.weights
+    return _pairs((*outer, sizes.form([view])[3], points))
+
+
+def _written(call: FusedCall, found: _Found) -> list[ir.Value]:
+    """Write the operands from reference points to mask."""
+    zeros, like, form = np.zeros((1, 1, 1, 1, 1, 2)), found.away.value, found.sizes.form
+    # Zeros stand for no reference point, and for weights without a softmax
+    near = call.numbers(zeros, like)
+    if found.near is not None:
+        near = laid_out(call, found.near, _pairs(form([found.near])))
+    away = laid_out(call, found.away, _away(found.sizes, found.away))
+    scores = call.numbers(zeros[..., 0], like)
+    if found.scores is not None:
+        scores = laid_out(call, found.scores, found.rows)
+    mask = call.numbers(np.full((1, 1, 1, 1, 1), found.scale), like)
+    if found.masks:
+        product = combined(call, "Mul", found.masks, form(found.masks))
+        mask = product if found.scale == 1.0 else call.add("Mul", [product, mask])
+    return [near, away, scores, mask]
+
+
+@functools.cache
+def _proofs(opset: int) -> Proofs:
+    return Proofs(opset, seed=0)  # it knows the layers that are alike
+
+
+def _error(call: FusedCall, result: ir.Value, views: Sequence[View]) -> float:
+    """Return the difference of positions and weights on random numbers."""
+    fused, body = result.producer(), call.node.graph
+    assert fused is not None
+    assert isinstance(body, ir.Graph)
+    known, stops = set(body.initializers), list(filter(None, fused.inputs))
+    after = raw_own_form().inputs_to_own(call, tuple(fused.inputs), {})[3:]
+    errors = [
+        _proofs(call.opset).error(old, new, views)
+        for old, new in zip(call.node.inputs[3:], after, strict=True)
+        if old is not None and new is not None
+    ]
+    # The nodes were for this only
+    added = (n for new in after if new is not None for n in nodes_between(new, stops))
+    take_back(body, list(dict.fromkeys(added)), known)
+    return max(errors)
+
+
+def _sum(view: View) -> tuple[View, View] | None:
+    """Return reference points and offsets, if a value is their sum and nothing else."""
+    parts = terms(whole_views(view)[-1])
+    if parts is None:
+        return None
+    near, away = sorted(parts, key=lambda each: math.prod(sizes_of(each.layout)))
+    needed = _axes(view) - {BATCH, LEVEL}
+    if not needed <= _axes(away):
+        near, away = away, near
+    # A bias is no reference point: it stays with its product
+    bias = array_of(near.value) is not None and QUERY not in _axes(near)
+    return None if bias or not needed <= _axes(away) else (near, away)
+
+
+def _axes(view: View) -> set[str]:
+    return {digit.axis for digit in flat(view.layout)}
+
+
+def _product(view: View, plain: _Found) -> _Found | None:
+    """Return the factors of weights, if one of them is a softmax over points."""
+    *_, last = (each for each in sources(view) if isinstance(each, View))
+    node = producer_of(last.value)
+    if node is None or not is_standard(node) or last.shift != 0.0:
+        return None
+    if sole_reader(last.value) is None:
+        return None
+    if node.op_type == "Softmax":
+        return _softmax(node, last, plain)
+    shapes = [static_shape(each) for each in node.inputs]
+    if node.op_type != "Mul" or None in shapes:
+        return None
+    # One factor is the softmax, perhaps behind other products
+    left, right = (
+        View(each, aligned(last.layout, shape))
+        for each, shape in zip(node.inputs, shapes, strict=True)
+        if each is not None and shape is not None
+    )
+    for one, other in ((left, right), (right, left)):
+        found = _product(one, plain)
+        if found is not None:
+            masks, scale = (*found.masks, other), found.scale * last.scale
+            return dataclasses.replace(found, masks=masks, scale=scale)
+    return None
+
+
+def _softmax(node: ir.Node, view: View, plain: _Found) -> _Found | None:
+    """Return the scores of a softmax over the points of one level or of several."""
+    source = node.inputs[0]
+    assert source is not None
+    row = merged(view.layout[node.attributes.get_int("axis", -1)])
+    levels = math.prod(digit.size for digit in row if digit.axis == LEVEL)
+    if row != (*whole(LEVEL, levels), *whole(POINT, plain.sizes.points)):
+        return None
+    # Rows that differ by level stand beside each other
+    *outer, repeated, _ = plain.sizes.form([view])
+    others = math.prod(digit.size for digit in repeated) // levels
+    beside = (Digit(LEVEL, levels, others),) if others > 1 else ()
+    scores = View(source, view.layout)
+    rows, scale = (*outer, beside, row), view.scale
+    return dataclasses.replace(plain, scores=scores, rows=rows, masks=(), scale=scale)
