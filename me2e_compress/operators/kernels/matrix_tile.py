@@ -1,0 +1,239 @@
+"""A float32 matrix product whose accumulators stay in registers.
+
+A tile of C, some rows by some vectors, is summed over the whole depth before anything
+of it is stored (Goto and van de Geijn, Anatomy of high-performance matrix
+multiplication, 2008, section 4): each step loads the vectors of one row of B, and
+multiplies them by one broadcast number of A for each row of C. It is written as LLVM
+instructions, since Numba's loops over arrays do not keep tiles in registers.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from llvmlite import binding as llvm
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from me2e_compress.operators.kernels.intrinsics import FLOAT, INT, WORD
+
+
+@dataclasses.dataclass(frozen=True)
+class Tile:
+    """Rows and vectors of a tile of C; each vector has ``lanes`` float32 numbers."""
+
+    rows: int
+    vectors: int
+    lanes: int
+
+    @property
+    def width(self) -> int:
+        """Columns of a tile."""
+        return self.vectors * self.lanes
+
+
+_VECTORS = {"avx512f": (16, 32), "avx": (8, 16), "sse2": (4, 16)}
+"""Lanes and number of the vector registers of x86-64, by the feature that adds them."""
+
+_OTHERS = (4, 32)
+"""Those of aarch64."""
+
+
+@functools.cache
+def host_tile(vectors: int = 2) -> Tile:
+    """Return the largest tile of so many vectors that this processor's registers hold.
+
+    Beside the tile, they hold one row of B and one number of A.
+    """
+    features = llvm.get_host_cpu_features()
+    lanes, registers = next(
+        (size for name, size in _VECTORS.items() if features.get(name)), _OTHERS
+    )
+    return Tile((registers - vectors - 1) // vectors, vectors, lanes)
+
+
+def matrix_product(tile: Tile) -> Any:
+    """Return the intrinsic ``(a, b, c, a_row, a_step, b_step, c_row, m, n, k, add)``.
+
+    It writes C [m, n], or adds to it if ``add`` is not 0: the product of A [m, k] and
+    B [k, n]. ``a``, ``b`` and ``c`` are addresses of float32 numbers, the next four are
+    strides in numbers: from row to row of A, from one step of k to the next in A and in
+    B, and from row to row of C. Rows of B and of C are contiguous. What is constant
+    where it is called is compiled as a constant.
+
+    All of B's ``k`` rows by ``tile.width`` columns are read again for each tile of rows
+    and should fit into the first-level cache: callers divide larger ``k``.
+    """
+
+    def typed(
+        context: Any,
+        a: Any, b: Any, c: Any,
+        a_row: Any, a_step: Any, b_step: Any, c_row: Any,
+        m: Any, n: Any, k: Any, add: Any,
+    ) -> tuple[Any, Callable[..., Any]]:  # fmt: skip
+        # Numba calls this with LLVM values
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            _Product(builder, tile, *arguments).write()
+            return context.get_dummy_value()
+
+        return types.void(*[types.intp] * 11), generate
+
+    return intrinsic(typed)
+
+
+class _Product:
+    """Writes loops over panels of columns, tiles of rows, and steps of the depth."""
+
+    def __init__(
+        self,
+        builder: Any,
+        tile: Tile,
+        a: Any, b: Any, c: Any,
+        a_row: Any, a_step: Any, b_step: Any, c_row: Any,
+        m: Any, n: Any, k: Any, add: Any,
+    ) -> None:  # fmt: skip
+        self.builder, self.tile = builder, tile
+        self.kind = ir.VectorType(FLOAT, tile.lanes)
+        numbers = FLOAT.as_pointer()
+        self.a, self.b, self.c = (builder.inttoptr(at, numbers) for at in (a, b, c))
+        self.a_row, self.a_step, self.b_step, self.c_row = a_row, a_step, b_step, c_row
+        self.m, self.n, self.k, self.add = m, n, k, add
+
+    def write(self) -> None:
+        done = cgutils.alloca_once(self.builder, WORD)
+        self.builder.store(WORD(0), done)
+        with self._while_fit(done, self.tile.width, self.n) as column:
+            self._rows(column, self.tile.vectors, None)
+        # The columns left, one vector at a time, the last one masked
+        with self._while_fit(done, self.tile.lanes, self.n, part=True) as column:
+            left = self.builder.sub(self.n, column)
+            self._rows(column, 1, self._mask(left))
+
+    @contextmanager
+    def _while_fit(
+        self, done: Any, step: int, end: Any, *, part: bool = False
+    ) -> Iterator[Any]:
+        """Repeat what is written inside while ``step`` more, or a part, fit."""
+        builder = self.builder
+        head, body, after = (
+            builder.append_basic_block(name) for name in ("head", "body", "after")
+        )
+        builder.branch(head)
+        builder.position_at_end(head)
+        at = builder.load(done)
+        needed = builder.add(at, WORD(1 if part else step))
+        builder.cbranch(builder.icmp_signed("<=", needed, end), body, after)
+        builder.position_at_end(body)
+        yield at
+        builder.store(builder.add(at, WORD(step)), done)
+        builder.branch(head)
+        builder.position_at_end(after)
+
+    def _rows(self, column: Any, vectors: int, mask: Any) -> None:
+        done = cgutils.alloca_once(self.builder, WORD)
+        self.builder.store(WORD(0), done)
+        rows = self.tile.rows
+        while rows:
+            with self._while_fit(done, rows, self.m) as row:
+                self._tile(row, column, rows, vectors, mask)
+            rows //= 2
+
+    def _tile(self, row: Any, column: Any, rows: int, vectors: int, mask: Any) -> None:
+        """Write the loop over the depth for one tile."""
+        builder = self.builder
+        places = self._places(row, column, rows, vectors)
+        zeros, adding, head, body, after = (
+            builder.append_basic_block(name)
+            for name in ("zeros", "adding", "depth", "step", "done")
+        )
+        # Start with what C holds, or with zeros
+        wanted = builder.icmp_signed("!=", self.add, WORD(0))
+        builder.cbranch(wanted, adding, zeros)
+        builder.position_at_end(adding)
+        held = [self._load(place, mask) for place in places]
+        builder.branch(head)
+        builder.position_at_end(zeros)
+        builder.branch(head)
+        builder.position_at_end(head)
+        step = self._from(WORD(0), WORD(0), zeros, adding)
+        nothing = self.kind([0.0] * self.tile.lanes)
+        sums = [self._from(nothing, each, zeros, adding) for each in held]
+        builder.cbranch(builder.icmp_signed("<", step, self.k), body, after)
+        # Each step multiplies a row of B by one number of A for each row of C
+        builder.position_at_end(body)
+        first = builder.gep(self.b, [builder.mul(step, self.b_step)])
+        lanes = WORD(self.tile.lanes)
+        numbers = [
+            builder.gep(first, [builder.add(column, builder.mul(lanes, WORD(each)))])
+            for each in range(vectors)
+        ]
+        across = [self._load(place, mask) for place in numbers]
+        start = builder.gep(self.a, [builder.mul(step, self.a_step)])
+        for index in range(rows):
+            at = builder.mul(builder.add(row, WORD(index)), self.a_row)
+            factor = self._spread(builder.load(builder.gep(start, [at])))
+            for each in range(vectors):
+                total = sums[index * vectors + each]
+                product = builder.fmul(factor, across[each], flags=("contract",))
+                more = builder.fadd(total, product, flags=("contract",))
+                total.add_incoming(more, body)
+        step.add_incoming(builder.add(step, WORD(1)), body)
+        builder.branch(head)
+        builder.position_at_end(after)
+        for total, place in zip(sums, places, strict=True):
+            self._store(total, place, mask)
+
+    def _from(self, one: Any, two: Any, first: Any, second: Any) -> Any:
+        found = self.builder.phi(one.type)
+        found.add_incoming(one, first)
+        found.add_incoming(two, second)
+        return found
+
+    def _places(self, row: Any, column: Any, rows: int, vectors: int) -> list[Any]:
+        builder, places = self.builder, []
+        for index in range(rows):
+            at = builder.mul(builder.add(row, WORD(index)), self.c_row)
+            for each in range(vectors):
+                across = builder.add(column, WORD(each * self.tile.lanes))
+                places.append(builder.gep(self.c, [builder.add(at, across)]))
+        return places
+
+    def _mask(self, left: Any) -> Any:
+        """Write which lanes lie within the columns left."""
+        builder, lanes = self.builder, self.tile.lanes
+        kind = ir.VectorType(WORD, lanes)
+        blank = builder.insert_element(kind(ir.Undefined), left, INT(0))
+        same = ir.VectorType(INT, lanes)([0] * lanes)
+        spread = builder.shuffle_vector(blank, blank, same)
+        return builder.icmp_signed("<", kind(list(range(lanes))), spread)
+
+    def _load(self, place: Any, mask: Any) -> Any:
+        at = self.builder.bitcast(place, self.kind.as_pointer())
+        if mask is None:
+            return self.builder.load(at, align=4)
+        nothing = self.kind([0.0] * self.tile.lanes)
+        arguments = [at, INT(4), mask, nothing]
+        return self._masked("load", self.kind, arguments)
+
+    def _store(self, vector: Any, place: Any, mask: Any) -> None:
+        at = self.builder.bitcast(place, self.kind.as_pointer())
+        if mask is None:
+            self.builder.store(vector, at, align=4)
+        else:
+            self._masked("store", ir.VoidType(), [vector, at, INT(4), mask])
+
+    def _masked(self, name: str, result: Any, arguments: list[Any]) -> Any:
+        kind = ir.FunctionType(result, [each.type for each in arguments])
+        name = f"llvm.masked.{name}.v{self.tile.lanes}f32.p0"
+        found = cgutils.get_or_insert_function(self.builder.module, kind, name)
+        return self.builder.call(found, arguments)
+
+    def _spread(self, number: Any) -> Any:
+        blank = self.kind(ir.Undefined)
+        first = self.builder.insert_element(blank, number, INT(0))
+        lanes = ir.VectorType(INT, self.tile.lanes)([0] * self.tile.lanes)
+        return self.builder.shuffle_vector(first, blank, lanes)
