@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from me2e_compress.operators.kernels.abi import ANY, FLOAT, INT8, UINT8
+from me2e_compress.operators.kernels.abi import ANY, FLOAT, INT8, INT64, UINT8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,14 +39,32 @@ _DEFORMABLE = (
 )
 _INPUTS = (FLOAT, ANY, ANY, FLOAT, FLOAT)
 
-KERNELS = tuple(
+_WINOGRAD = (
+    "the inputs have not the ranks that they must: X 4, W 4, B 1, options 1",
+    "the inputs do not fit each other: they must be X [N,C,H,W], W [3,3,C,K], B [K] and"
+    " options [5] (four pads, none below 0, and whether negative results become 0), and"
+    " the image with its pads at least 2 x 2",
+)
+
+KERNELS = (
+    *(
+        CompiledKernel(
+            f"MultiScaleDeformableAttention{word}",
+            "deformable_kernel",
+            inputs,
+            _DEFORMABLE,
+        )
+        for word, inputs in (
+            ("", _INPUTS),
+            ("Int8", (INT8, *_INPUTS[1:], FLOAT, INT8)),
+            ("Uint8", (UINT8, *_INPUTS[1:], FLOAT, UINT8)),
+        )
+    ),
     CompiledKernel(
-        f"MultiScaleDeformableAttention{word}", "deformable_kernel", inputs, _DEFORMABLE
-    )
-    for word, inputs in (
-        ("", _INPUTS),
-        ("Int8", (INT8, *_INPUTS[1:], FLOAT, INT8)),
-        ("Uint8", (UINT8, *_INPUTS[1:], FLOAT, UINT8)),
-    )
+        "WinogradConvolution",
+        "winograd_kernel",
+        (FLOAT, FLOAT, FLOAT, INT64),
+        _WINOGRAD,
+    ),
 )
 """All compiled kernels."""
