@@ -14,6 +14,10 @@ from me2e_compress.graph.nodes import STANDARD
 from me2e_compress.graph.rewrite import remove_dead, replace_value, value_names
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.fuse_kernels.convolution import (
+    fuse_convolution,
+    fuse_rectified_convolution,
+)
 
 __all__ = ["FuseKernels"]
 
@@ -24,7 +28,10 @@ None where the node is no such pattern; a PreconditionError names what an almost
 matching one lacks. Nothing may be written before the last check.
 """
 
-_FUSERS: Mapping[str, Fuser] = {}
+_FUSERS: Mapping[str, Fuser] = {
+    "Conv": fuse_convolution,
+    "Relu": fuse_rectified_convolution,
+}
 """Fusers by the type of the last node of their pattern."""
 
 
