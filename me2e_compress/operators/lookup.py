@@ -33,6 +33,7 @@ OPERATORS: Registry[Operator] = Registry(
         "deformable-convolution": (
             f"{_HERE}.deformable_convolution:DeformableConvolution"
         ),
+        "winograd-convolution": f"{_HERE}.winograd_convolution:WinogradConvolution",
     },
 )
 

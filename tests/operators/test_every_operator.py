@@ -164,6 +164,18 @@ def convolution(
     return arrays, dict(zip((a.name for a in dialect.attributes), values, strict=True))
 
 
+def winograd(
+    dialect: Dialect, random: np.random.Generator
+) -> tuple[Arrays, Mapping[str, Any]]:
+    batch, deep, out, high, wide = random.integers(1, 6, 5)
+    pads = tuple(int(each) for each in random.integers(1, 3, 4))
+    return single(
+        X=random.normal(size=(batch, deep, high, wide)),
+        W=random.normal(size=(out, deep, 3, 3)),
+        B=random.normal(size=out),
+    ), {"pads": pads, "relu": int(random.integers(2))}
+
+
 DRAWS: dict[str, Draw] = {
     "deformable-aggregation": aggregation,
     "rotate": rotate,
@@ -174,6 +186,7 @@ DRAWS: dict[str, Draw] = {
     "bev-pool": pool,
     "multi-head-attention": attention,
     "deformable-convolution": convolution,
+    "winograd-convolution": winograd,
 }
 ROWS = [
     (operator, dialect)

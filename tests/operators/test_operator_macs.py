@@ -1,5 +1,7 @@
 """Multiply-accumulates of fused operators, counted by hand."""
 
+from typing import Any
+
 import onnx_ir as ir
 import pytest
 
@@ -38,11 +40,17 @@ GRID, CUBE = (2, 4, 5, 2), (2, 4, 5, 6, 3)
             {},
             4 * (9 * 5 * 2 * 2) * 6,
         ),
+        (
+            "winograd-convolution",
+            [(2, 3, 8, 9), (5, 3, 3, 3), (5,)],
+            {"pads": (0, 1, 0, 1), "relu": 1},
+            2 * (6 * 9) * 5 * 3 * 9,
+        ),
         ("select-and-pad", [(2, 5, 3), (2, 5), (3,)], {"P": 4}, 0),
     ],
 )
 def test_macs_by_hand(
-    name: str, shapes: Shapes, attributes: dict[str, int], expected: int
+    name: str, shapes: Shapes, attributes: dict[str, Any], expected: int
 ) -> None:
     operator = next(each for each in operators() if each.name == name)
 

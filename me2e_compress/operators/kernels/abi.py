@@ -10,7 +10,7 @@ API_VERSION = 17
 OP_VERSION = 16
 """The first with ``KernelComputeV2``, which returns a status."""
 
-CREATE_DOMAIN, ADD_OP, ADD_DOMAIN = 26, 27, 28
+CREATE_DOMAIN, ADD_OP, ADD_DOMAIN, CREATE_MEMORY = 26, 27, 28, 69
 
 CALLED_BY_KERNELS = (
     0,  # CreateStatus
@@ -23,6 +23,10 @@ CALLED_BY_KERNELS = (
     62,  # GetDimensions
     99,  # ReleaseTensorTypeAndShapeInfo
     274,  # KernelContext_ParallelFor
+    253,  # KernelContext_GetAllocator
+    75,  # AllocatorAlloc
+    76,  # AllocatorFree
+    132,  # ReleaseAllocator
 )
 (
     CREATE_STATUS,
@@ -35,13 +39,22 @@ CALLED_BY_KERNELS = (
     GET_DIMS,
     RELEASE_INFO,
     PARALLEL_FOR,
+    GET_ALLOCATOR,
+    ALLOCATE,
+    FREE,
+    RELEASE_ALLOCATOR,
 ) = range(len(CALLED_BY_KERNELS))
 """Words of a kernel's state: the addresses of those functions, then"""
 BLOCK = len(CALLED_BY_KERNELS)
 """the address of the kernel's own ``block``, which ``ParallelFor`` calls, then"""
-MESSAGES = BLOCK + 1
+MEMORY = BLOCK + 1
+"""what describes the memory of the CPU, then"""
+MESSAGES = MEMORY + 1
 """the addresses of its error messages."""
 STATE_WORDS = MESSAGES + 16
+
+ARENA, DEFAULT = 1, 0
+"""``OrtArenaAllocator`` and ``OrtMemTypeDefault``."""
 
 INVALID_ARGUMENT = 2
 """``ORT_INVALID_ARGUMENT``."""

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from me2e_compress.operators.kernels.abi import ANY, FLOAT, INT8, UINT8
+from me2e_compress.operators.kernels.abi import ANY, FLOAT, INT8, INT64, UINT8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,9 +58,15 @@ _ATTENTION = (
     " [N,K,M,D], with one key at least",
     f"a head has more than {WIDEST_HEAD} channels",
 )
+_WINOGRAD = (
+    "the inputs have not the ranks that they must: X 4, W 4, B 1, options 1",
+    "the inputs do not fit each other: they must be X [N,C,H,W], W [3,3,C,K], B [K] and"
+    " options [5] (four pads, none below 0, and whether negative results become 0), and"
+    " the image with its pads at least 2 x 2",
+)
 
 
-def _attention(
+def _deformable(
     name: str, module: str, others: int, messages: tuple[str, ...]
 ) -> tuple[CompiledKernel, ...]:
     """List the kernels for float, int8 and uint8 values, which come with a scale."""
@@ -78,5 +84,11 @@ KERNELS = (
     *_deformable("MultiScaleDeformableAttention", "deformable_kernel", 2, _DEFORMABLE),
     *_deformable("RawDeformableAttention", "raw_attention_kernel", 4, _RAW),
     CompiledKernel(ATTENTION, "attention_kernel", (FLOAT, FLOAT, FLOAT), _ATTENTION),
+    CompiledKernel(
+        "WinogradConvolution",
+        "winograd_kernel",
+        (FLOAT, FLOAT, FLOAT, INT64),
+        _WINOGRAD,
+    ),
 )
 """All compiled kernels."""

@@ -16,6 +16,10 @@ from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fuse_kernels import grid_sample
 from me2e_compress.passes.fuse_kernels.attention import fuse_attention
+from me2e_compress.passes.fuse_kernels.convolution import (
+    fuse_convolution,
+    fuse_rectified_convolution,
+)
 from me2e_compress.passes.fuse_kernels.raw_attention import raw_attention
 
 __all__ = ["FuseKernels"]
@@ -31,6 +35,8 @@ _FUSERS: Mapping[str, Fuser] = {
     "GridSample": grid_sample.fuse,
     "MatMul": fuse_attention,
     "MultiScaleDeformableAttention": raw_attention,
+    "Conv": fuse_convolution,
+    "Relu": fuse_rectified_convolution,
 }
 """Fusers by the type of the last node of their pattern."""
 

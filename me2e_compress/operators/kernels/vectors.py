@@ -1,0 +1,153 @@
+"""Vectors of 16 float32 numbers, for kernels that Numba does not vectorize itself.
+
+LLVM splits them where the processor's are shorter.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from me2e_compress.operators.kernels.intrinsics import FLOAT, INT
+
+LANES = 16
+"""Numbers of a vector."""
+
+_VECTOR = ir.VectorType(FLOAT, LANES)
+_LANE = ir.VectorType(INT, LANES)
+_FAST = ("contract",)
+
+
+class Vectors:
+    """Writes arithmetic, loads and stores of vectors at addresses."""
+
+    def __init__(self, builder: Any) -> None:
+        self.builder = builder
+
+    def place(self, address: Any, offset: Any) -> Any:
+        """Return the pointer to the number ``offset`` behind an address."""
+        first = self.builder.inttoptr(address, FLOAT.as_pointer())
+        return self.builder.gep(first, [offset])
+
+    def load(self, place: Any) -> Any:
+        """Load a vector from any place."""
+        at = self.builder.bitcast(place, _VECTOR.as_pointer())
+        return self.builder.load(at, align=4)
+
+    def store(self, vector: Any, place: Any) -> None:
+        """Store a vector to any place."""
+        at = self.builder.bitcast(place, _VECTOR.as_pointer())
+        self.builder.store(vector, at, align=4)
+
+    def load_some(self, place: Any, mask: Any) -> Any:
+        """Load the lanes of a mask, and 0 into the others."""
+        at = self.builder.bitcast(place, _VECTOR.as_pointer())
+        return self._masked("load", _VECTOR, [at, INT(4), mask, self.spread(0.0)])
+
+    def store_some(self, vector: Any, place: Any, mask: Any) -> None:
+        """Store the lanes of a mask."""
+        at = self.builder.bitcast(place, _VECTOR.as_pointer())
+        self._masked("store", ir.VoidType(), [vector, at, INT(4), mask])
+
+    def fetch(self, place: Any) -> None:
+        """Begin to bring what is there into the caches; nothing need be there."""
+        kind = ir.FunctionType(ir.VoidType(), [place.type, INT, INT, INT])
+        found = cgutils.get_or_insert_function(
+            self.builder.module, kind, "llvm.prefetch.p0"
+        )
+        self.builder.call(found, [place, INT(0), INT(3), INT(1)])
+
+    def _masked(self, name: str, result: Any, arguments: list[Any]) -> Any:
+        kind = ir.FunctionType(result, [each.type for each in arguments])
+        name = f"llvm.masked.{name}.v{LANES}f32.p0"
+        found = cgutils.get_or_insert_function(self.builder.module, kind, name)
+        return self.builder.call(found, arguments)
+
+    def within(self, first: Any, limit: Any) -> Any:
+        """Return the lanes whose position, counted from ``first``, is in 0..limit."""
+        builder, lanes = self.builder, _LANE(list(range(LANES)))
+        start = self._same(builder.trunc(first, INT), _LANE)
+        end = self._same(builder.trunc(limit, INT), _LANE)
+        return builder.icmp_unsigned("<", builder.add(start, lanes), end)
+
+    def spread(self, number: Any) -> Any:
+        """Return a vector of one number."""
+        if isinstance(number, float):
+            return _VECTOR([number] * LANES)
+        return self._same(number, _VECTOR)
+
+    def _same(self, number: Any, kind: Any) -> Any:
+        blank = kind(ir.Undefined)
+        first = self.builder.insert_element(blank, number, INT(0))
+        return self.builder.shuffle_vector(first, blank, _LANE([0] * LANES))
+
+    def add(self, one: Any, two: Any) -> Any:
+        """Return one + two."""
+        return self.builder.fadd(one, two, flags=_FAST)
+
+    def subtract(self, one: Any, two: Any) -> Any:
+        """Return one - two."""
+        return self.builder.fsub(one, two, flags=_FAST)
+
+    def plus(self, one: Any, factor: float, two: Any) -> Any:
+        """Return one + factor * two."""
+        scaled = self.builder.fmul(self.spread(factor), two, flags=_FAST)
+        return self.add(one, scaled)
+
+    def times(self, factor: float, one: Any) -> Any:
+        """Return factor * one."""
+        return self.builder.fmul(self.spread(factor), one, flags=_FAST)
+
+    def at_least(self, one: Any, least: Any) -> Any:
+        """Return the larger one; NaN stays NaN."""
+        below = self.builder.fcmp_ordered("<", one, least)
+        return self.builder.select(below, least, one)
+
+    def choose(self, one: Any, two: Any, lanes: Sequence[int]) -> Any:
+        """Return lanes of two vectors, those of the second counted from 16."""
+        return self.builder.shuffle_vector(one, two, _LANE(list(lanes)))
+
+    def take_apart(self, v: Sequence[Any]) -> tuple[Any, ...]:
+        """Return every fourth of 64 numbers, from the first, second, third, fourth."""
+        pairs = [
+            self.choose(v[2 * half], v[2 * half + 1], range(part, 32, 2))
+            for part in range(2)
+            for half in range(2)
+        ]
+        return tuple(
+            self.choose(pairs[2 * odd], pairs[2 * odd + 1], range(second, 32, 2))
+            for second in range(2)
+            for odd in range(2)
+        )
+
+    def put_together(self, v: Sequence[Any]) -> tuple[Any, ...]:
+        """Undo :meth:`take_apart`."""
+        even = [self.choose(v[0], v[2], _between(half)) for half in range(2)]
+        odd = [self.choose(v[1], v[3], _between(half)) for half in range(2)]
+        return tuple(
+            self.choose(even[k // 2], odd[k // 2], _between(k % 2)) for k in range(4)
+        )
+
+
+def _between(half: int) -> list[int]:
+    """Return the lanes that put one half of two vectors between each other."""
+    first = half * LANES // 2
+    return [lane for k in range(LANES // 2) for lane in (first + k, LANES + first + k)]
+
+
+def vector_intrinsic(write: Callable[..., None]) -> Any:
+    """Return an intrinsic of seven words that writes instructions."""
+
+    def typed(
+        context: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any
+    ) -> tuple[Any, Callable[..., Any]]:
+        def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+            write(Vectors(builder), *given)
+            return context.get_dummy_value()
+
+        return types.void(*[types.intp] * 7), generate
+
+    return intrinsic(typed)

@@ -1,0 +1,120 @@
+"""3x3 convolution by Winograd's algorithm (Lavin and Gray, arXiv 1509.09308)."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of
+from me2e_compress.graph.shapes import Dims, open_shape, product
+from me2e_compress.operators.base import Operator
+from me2e_compress.operators.call import Attributes, FusedCall
+from me2e_compress.operators.dialect import (
+    FLOATS,
+    OWN_DOMAIN,
+    Arrays,
+    Attribute,
+    Dialect,
+    NdArray,
+    Operand,
+    Values,
+    number,
+    numbers,
+    present,
+)
+from me2e_compress.operators.kernels.kernel import DOMAIN
+
+TAPS = 3
+"""Rows and columns of a filter."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WinogradConvolution(Operator):
+    """A convolution with filters of 3 x 3 at stride 1, with 4 times fewer products.
+
+    Own form ``me2e::WinogradConvolution``, inputs as of ONNX's Conv: X [N, C, H, W];
+    W [K, C, 3, 3]; B [K]. Attributes: ``pads`` (top, left, bottom, right), and
+    ``relu``, 1 for negative results to become 0. Output [N, K, H', W']: H' is H + top
+    + bottom - 2, W' likewise.
+
+    The body is a Conv. The compiled kernel is F(4x4, 3x3) in float32: its results have
+    117 to 124 dB of SQNR where a Conv's have 131 to 139 (inputs and filters normally
+    distributed, 64 to 512 channels).
+    """
+
+    name: ClassVar[str] = "winograd-convolution"
+    own: ClassVar[Dialect] = Dialect(
+        "me2e",
+        "WinogradConvolution",
+        OWN_DOMAIN,
+        (
+            Operand("X", "N C H W", FLOATS),
+            Operand("W", "K C 3 3", FLOATS),
+            Operand("B", "K", FLOATS),
+        ),
+        "me2e",
+        (Attribute("pads", (0, 0, 0, 0)), Attribute("relu", 0, choices=(0, 1))),
+    )
+    dialects: ClassVar[tuple[Dialect, ...]] = ()
+
+    def output_shape(
+        self, shapes: Sequence[Dims | None], attributes: Attributes
+    ) -> Dims | None:
+        """Return [N, K, H', W'], smaller than the padded image by 2."""
+        batch, out, *image = self._sizes("N K H W", shapes, attributes)
+        pads = numbers(attributes, "pads")
+        sizes = (
+            None if size is None else size + pads[axis] + pads[axis + 2] - TAPS + 1
+            for axis, size in enumerate(image)
+        )
+        return (batch, out, *sizes)
+
+    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+        """Count those of the convolution, not of the algorithm."""
+        made = self.output_shape(shapes, attributes)
+        (deep,) = self._sizes("C", shapes, attributes)
+        return None if made is None else product((*made, deep, TAPS, TAPS))
+
+    def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
+        """Write the kernel's call, or a Conv and a Relu."""
+        image, weight, bias = present(inputs)
+        pads, relu = numbers(attributes, "pads"), number(attributes, "relu")
+        if call.compiled and image.dtype in (None, ir.DataType.FLOAT):
+            return self._by_kernel(call, (image, weight, bias), attributes)
+        result = call.add("Conv", [image, weight, bias], {"pads": list(pads)})
+        return call.add("Relu", [result]) if relu else result
+
+    def _by_kernel(
+        self,
+        call: FusedCall,
+        inputs: tuple[ir.Value, ir.Value, ir.Value],
+        attributes: Attributes,
+    ) -> ir.Value:
+        image, weight, bias = inputs
+        # The kernel reads filters beside each other: [3, 3, C, K]
+        order, known = (2, 3, 1, 0), array_of(weight)
+        if known is None:
+            weight = call.transpose(weight, order)
+        else:
+            weight = call.constant(np.ascontiguousarray(known.transpose(order)))
+        options = (*numbers(attributes, "pads"), number(attributes, "relu"))
+        given = [image, weight, bias, call.integers(options)]
+        result = call.add(self.own.op_type, given, domain=DOMAIN)
+        made = self.output_shape([open_shape(each) for each in inputs], attributes)
+        result.shape = None if made is None else ir.Shape(made)
+        result.type = ir.TensorType(ir.DataType.FLOAT)
+        return result
+
+    def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
+        """Compute it in numpy, [N, K, H', W'] float64."""
+        image, weight, bias = (
+            np.asarray(each, np.float64) for each in inputs if each is not None
+        )
+        top, left, bottom, right = numbers(attributes, "pads")
+        padded = np.pad(image, ((0, 0), (0, 0), (top, bottom), (left, right)))
+        taken = np.lib.stride_tricks.sliding_window_view(padded, (TAPS, TAPS), (2, 3))
+        result: NdArray = np.einsum("nchwij,kcij->nkhw", taken, weight, optimize=True)
+        result = result + bias[:, None, None]
+        return np.maximum(result, 0) if number(attributes, "relu") else result
