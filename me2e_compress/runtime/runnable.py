@@ -22,10 +22,12 @@ from me2e_compress.errors import GraphError, PreconditionError
 from me2e_compress.graph.nodes import array_of, bodies_of, input_at, is_standard, maker
 from me2e_compress.graph.rewrite import value_names
 from me2e_compress.operators import OWN_DOMAIN, kernels
+from me2e_compress.runtime.float_products import write_float_products
 from me2e_compress.runtime.int8_values import read_int8
 from me2e_compress.runtime.providers import CPU, Provider
 
 _BY = "session"
+_AS_WRITTEN = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
 _FLOAT_KERNELS = ("MultiScaleDeformableAttention", "RawDeformableAttention")
 _COMPILED = {each.op_type: each for each in kernels.KERNELS}
 
@@ -66,14 +68,17 @@ def runnable(
     compiled = provider.native == CPU.native and kernels.why_not() is None
     theirs = provider.claims
     made, needed = compiled_or_expanded(model, compiled=compiled, theirs=theirs)
-    if not needed:
-        return made
-    from me2e_compress.operators.kernels import custom_ops  # needs the extra `fast`
+    if needed:
+        from me2e_compress.operators.kernels import custom_ops  # needs the extra `fast`
 
-    try:
-        custom_ops.register(options, needed)
-    except (ImportError, OSError):
-        made, _ = compiled_or_expanded(model, compiled=False, theirs=theirs)
+        try:
+            custom_ops.register(options, needed)
+        except (ImportError, OSError):
+            made, _ = compiled_or_expanded(model, compiled=False, theirs=theirs)
+    # Files without fused nodes are opened unread, so their products stay, too.
+    optimizes = options.graph_optimization_level != _AS_WRITTEN
+    if made is not model and provider.native == CPU.native and optimizes:
+        write_float_products(made.graph)
     return made
 
 
