@@ -115,11 +115,20 @@ def test_repetitions_are_not_read_in_front_of_a_product() -> None:
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-9)
 
 
-def test_a_repetition_of_rows_stays() -> None:
-    """A Tile of the matrix's own rows is no broadcast of the product."""
-    before = "times = Constant<value_ints = [1, 1, 5]>() p = Tile(a, times) q = Relu(b)"
-    model = read(product((2, 3, 5), (2, 5, 4), before))
-    model.graph.inputs[0].shape = ir.Shape((2, 3, 1))
+@pytest.mark.parametrize(
+    ("small", "times", "whole", "other"),
+    [
+        ((2, 3, 1), "1, 1, 5", (2, 3, 5), (2, 5, 4)),  # of the matrix itself
+        ((1, 3, 5), "4, 1, 1", (4, 3, 5), (5, 4)),  # the product has no such batch
+        ((2, 3, 5), "2, 1, 1", (4, 3, 5), (4, 5, 4)),  # of more than one
+    ],
+)
+def test_repetitions_that_a_product_does_not_do_stay(
+    small: tuple[int, ...], times: str, whole: tuple[int, ...], other: tuple[int, ...]
+) -> None:
+    before = f"times = Constant<value_ints = [{times}]>() p = Tile(a, times)"
+    model = read(product(whole, other, f"{before} q = Relu(b)"))
+    model.graph.inputs[0].shape = ir.Shape(small)
     assert apply(FlattenMatmul(), model).changes == 0
 
 
