@@ -12,6 +12,8 @@ from me2e_compress.graph import static_shape
 from me2e_compress.passes import flatten_matmul
 from me2e_compress.passes.flatten_matmul import FlattenMatmul
 from me2e_compress.passes.work import small_products
+from me2e_compress.quantization.plan import FLOAT, make_plan
+from me2e_compress.quantization.scheme import QuantScheme
 from tests.passes.hoisted import graph_of
 from tests.passes.small import apply, compute, ops, read
 
@@ -113,11 +115,20 @@ def test_repetitions_are_not_read_in_front_of_a_product() -> None:
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-9)
 
 
-def test_a_repetition_of_rows_stays() -> None:
-    """A Tile of the matrix's own rows is no broadcast of the product."""
-    before = "times = Constant<value_ints = [1, 1, 5]>() p = Tile(a, times) q = Relu(b)"
-    model = read(product((2, 3, 5), (2, 5, 4), before))
-    model.graph.inputs[0].shape = ir.Shape((2, 3, 1))
+@pytest.mark.parametrize(
+    ("small", "times", "whole", "other"),
+    [
+        ((2, 3, 1), "1, 1, 5", (2, 3, 5), (2, 5, 4)),  # of the matrix itself
+        ((1, 3, 5), "4, 1, 1", (4, 3, 5), (5, 4)),  # the product has no such batch
+        ((2, 3, 5), "2, 1, 1", (4, 3, 5), (4, 5, 4)),  # of more than one
+    ],
+)
+def test_repetitions_that_a_product_does_not_do_stay(
+    small: tuple[int, ...], times: str, whole: tuple[int, ...], other: tuple[int, ...]
+) -> None:
+    before = f"times = Constant<value_ints = [{times}]>() p = Tile(a, times)"
+    model = read(product(whole, other, f"{before} q = Relu(b)"))
+    model.graph.inputs[0].shape = ir.Shape(small)
     assert apply(FlattenMatmul(), model).changes == 0
 
 
@@ -162,3 +173,18 @@ def test_a_wide_matrix_must_save_more_starts_than_it_moves_bytes() -> None:
     a = (1, 1000, 1000)
     assert apply(FlattenMatmul(), read(product(a, (9000, 1000, 1)))).changes == 0
     assert apply(FlattenMatmul(), read(product(a, (12000, 1000, 1)))).changes == 1
+
+
+@pytest.mark.parametrize("constant", [False, True])
+def test_projections_stay_in_float(constant: bool) -> None:
+    """The geometry of a camera is none of int8's business, whatever stands where."""
+    points = "" if constant else ", float[1,4,1000,4,1] points"
+    text = graph_of(
+        f"(float[6,1,1,4,4] lidar2img{points}) => (float[6,4,1000,4,1] y)",
+        "y = MatMul(lidar2img, points)",
+    )
+    weights = {"points": RANDOM.normal(size=POINTS).astype(np.float32)}
+    model = read(text, **(weights if constant else {}))
+    apply(FlattenMatmul(), model)
+    plan = make_plan(model, QuantScheme("modules", ("all",)))
+    assert {decision.dtype for decision in plan.decisions} == {FLOAT}
