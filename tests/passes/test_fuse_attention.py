@@ -50,6 +50,15 @@ TURNED = {
         BODY
         y = Transpose<perm=[1,0,2]>(z)
     }}""",
+    "one of them otherwise": f"""
+    m (float[2,{H},{C},{Q}] q, float[2,{K},{H},{C}] k, float[2,{K},{H},{C}] v)
+        => (float[2,{Q},{H},{C}] y) <float s = {{SCALE}}, float t = {{TIMES}}> {{
+        qt = Transpose<perm=[0,1,3,2]>(q)
+        kt = Transpose<perm=[0,2,3,1]>(k)
+        vt = Transpose<perm=[0,2,1,3]>(v)
+        BODY
+        y = Transpose<perm=[0,2,1,3]>(z)
+    }}""",
 }
 SCALED = {
     "query": "a = Mul(qt, s) b = MatMul(a, kt) w = Softmax<axis=-1>(b)",
@@ -154,9 +163,12 @@ def test_a_scale_that_is_not_the_usual_stays_on_the_query() -> None:
     [
         ("w = Softmax<axis=-1>(b)", "w = Softmax<axis=2>(b)", "over the last axis"),
         ("(b) z", "(b) others = Abs(w) z", "others read its scores or weights"),
-        ("w = Softmax", "others = Abs(b) w = Softmax", "others read its scores"),
+        ("b = Div(a, t)", "b = Div(a, t) others = Abs(a)", "others read its scores"),
+        ("b = Div(a, t)", "b = Div(a, t) others = Abs(b)", "others read its scores"),
         ("w = Softmax<axis=-1>(b)", "c = Add(b, t) w = Softmax<axis=-1>(c)", "a mask"),
         ("float[1,2,70,16] k", "float[1,2,n,16] k", "its shapes are not known"),
+        ("float[1,2,70,16] k", "float[1,1,70,16] k", "of different batches"),
+        ("float[1,2,70,16] v", "float[1,1,70,16] v", "of different batches"),
         ("float[1,2,9,16] q", "float[1,2,7,16] q", "are few: 7 and 70"),
         ("70", "63", "are few: 9 and 63"),
         ("16", "129", "more than 128 channels"),
@@ -169,6 +181,8 @@ def test_near_misses_stay_and_say_why(old: str, new: str, why: str) -> None:
     text = HEAD + TURNED["heads in the batch"]
     text = text.replace("BODY", SCALED["query"] + " z = MatMul(w, vt)")
     text = text.replace("SCALE", "0.25").replace("TIMES", "4")
+    if "Div" in old:
+        text = text.replace(SCALED["query"], SCALED["product"])
     if "others" in new:
         text = text.replace("y)", f"y, float[1,{H},{Q},{K}] others)", 1)
     if "DequantizeLinear" in new:
