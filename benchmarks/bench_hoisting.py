@@ -2,11 +2,11 @@
 
     python -m benchmarks.bench_hoisting
 
-The keys of VAD-tiny's motion decoder as the zoo exports them, its attention to the map
-as the original code does (keys and values written for every agent and mode), and
-products of few rows whose matrix the batch shares: GMACs, and CPU time of onnxruntime
-on two threads, the least of rounds that alternate, before and behind the pass. First,
-how long the pass itself takes on graphs of more and more products of repeated rows.
+The keys of VAD-tiny's motion decoder as the zoo exports them, and its attention to the
+map as the original code does (keys and values written for every agent and mode): GMACs,
+and CPU time of onnxruntime on two threads, the least of rounds that alternate, before
+and behind the pass. First, how long the pass itself takes on graphs of more and more
+products of repeated rows.
 """
 
 import time
@@ -145,20 +145,6 @@ def show_attention() -> None:
     show("motion's attention to the map, original", ATTENTION, weights, feeds)
 
 
-def show_joined(rows: int) -> None:
-    batch = AGENTS // rows
-    text = (
-        f'<ir_version: 8, opset_import: ["" : 17]>\njoined (float[{batch},{HEADS},'
-        f"{rows},{CHANNELS}] q, float[1,{HEADS},{CHANNELS},{TOKENS}] keys)"
-        " => (float[A,B,C,D] y) { y = MatMul(q, keys) }"
-    )
-    feeds = {
-        "q": normal(batch, HEADS, rows, CHANNELS),
-        "keys": normal(1, HEADS, CHANNELS, TOKENS),
-    }
-    show(f"shared keys, queries of {rows} rows", text, {}, feeds)
-
-
 def show_pass(count: int) -> None:
     body = "z0 = Relu(x0)  " + "".join(
         f"t{at} = Expand(x{at}, shape)  r{at} = Relu(t{at})  y{at} = MatMul(r{at}, w)"
@@ -181,5 +167,3 @@ if __name__ == "__main__":
         show_pass(products)
     show_keys()
     show_attention()
-    for few in (1, 4, 8):
-        show_joined(few)

@@ -15,7 +15,6 @@ from me2e_compress.passes.hoist_linear.least_work import Prices
 from me2e_compress.passes.hoist_linear.linear_layers import layer_at
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.repeated_rows import do_before_repeats
-from me2e_compress.passes.hoist_linear.shared_products import join_products
 from me2e_compress.passes.work import BYTES_PER_NODE
 
 __all__ = ["HoistLinear"]
@@ -33,14 +32,12 @@ class _Tally:
     others: int = 0
     operands: int = 0
     unread: int = 0
-    joined: int = 0
     macs: int = 0
     left: Counter[str] = dataclasses.field(default_factory=Counter)
 
     @property
     def changes(self) -> int:
-        moved = self.products + self.others + self.operands
-        return moved + self.joined + self.unread
+        return self.products + self.others + self.operands + self.unread
 
     def notes(self) -> tuple[str, ...]:
         found = []
@@ -51,8 +48,6 @@ class _Tally:
             found.append(
                 f"moved {counted(self.others, 'other node')} before repeated rows"
             )
-        if self.joined:
-            found.append(f"joined {counted(self.joined, 'product')} of few rows")
         if self.unread:
             found.append(f"removed what nothing reads: {self.unread}")
         for reason, count in sorted(self.left.items()):
@@ -76,8 +71,7 @@ class HoistLinear(Pass):
     it needs fewer multiply-accumulates and is cheaper in total: nodes, memory traffic
     and new weights (:mod:`me2e_compress.passes.work`). Other row-wise operators (a
     bias, LayerNorm, Relu) also move in front of repetitions. Keys and values that the
-    batch shares but for their positions are multiplied term by term, and products of
-    few rows whose matrices the batch shares become one of many rows. Sizes must be
+    batch shares but for their positions are multiplied term by term. Sizes must be
     known. Outputs are equal up to rounding.
 
     Attributes:
@@ -127,8 +121,6 @@ class HoistLinear(Pass):
             elif isinstance(fewer := split_operand(node, rewriter), int):
                 tally.operands += 1
                 tally.macs += fewer
-            elif join_products(node, rewriter):
-                tally.joined += 1
             elif fewer is not None:
                 tally.left[fewer] += 1
             if tally.changes > before:
