@@ -33,7 +33,7 @@ class _Tally:
     operands: int = 0
     unread: int = 0
     macs: int = 0
-    left: Counter[str] = dataclasses.field(default_factory=Counter)
+    refused: Counter[str] = dataclasses.field(default_factory=Counter)
 
     @property
     def changes(self) -> int:
@@ -50,7 +50,7 @@ class _Tally:
             )
         if self.unread:
             found.append(f"removed what nothing reads: {self.unread}")
-        for reason, count in sorted(self.left.items()):
+        for reason, count in sorted(self.refused.items()):
             whole = counted(count, "product")
             found.append(f"left {whole} with keys or values as they are: {reason}")
         return tuple(found)
@@ -94,7 +94,7 @@ class HoistLinear(Pass):
         ]
         for _ in range(ROUNDS):
             before = tally.changes
-            tally.left.clear()
+            tally.refused.clear()
             for rewriter in rewriters:
                 self._round(rewriter, opset, tally)
             if tally.changes == before:
@@ -122,6 +122,6 @@ class HoistLinear(Pass):
                 tally.operands += 1
                 tally.macs += fewer
             elif fewer is not None:
-                tally.left[fewer] += 1
+                tally.refused[fewer] += 1
             if tally.changes > before:
                 prices.forget()
