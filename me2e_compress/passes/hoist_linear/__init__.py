@@ -32,6 +32,7 @@ class _Tally:
     others: int = 0
     operands: int = 0
     unread: int = 0
+    left: int = 0
     macs: int = 0
 
     @property
@@ -46,6 +47,11 @@ class _Tally:
         if self.others:
             found.append(
                 f"moved {counted(self.others, 'other node')} before repeated rows"
+            )
+        if self.left:
+            what = counted(self.left, "node")
+            found.append(
+                f"left {what} behind what repeats: others read it too, or it is small"
             )
         if self.unread:
             found.append(f"removed what nothing reads: {self.unread}")
@@ -66,8 +72,9 @@ class HoistLinear(Pass):
     repeated. Two consecutive linear layers become one. Each rewrite is done only where
     it needs fewer multiply-accumulates and is cheaper in total: nodes, memory traffic
     and new weights (:mod:`me2e_compress.passes.work`). Other row-wise operators (a
-    bias, LayerNorm, Relu) also move in front of repetitions. Sizes must be known.
-    Outputs are equal up to rounding.
+    bias, LayerNorm, Relu) also move in front of repetitions, as do Transpose and Concat
+    (of constants that repeat, too), also where views have split or merged the axes
+    behind those that repeat. Sizes must be known. Outputs are equal up to rounding.
 
     Attributes:
         bytes_per_node: how many bytes of new weights the work of one node may cost.
@@ -89,6 +96,7 @@ class HoistLinear(Pass):
         ]
         for _ in range(ROUNDS):
             before = tally.changes
+            tally.left = 0  # those of the last round are left
             for rewriter in rewriters:
                 self._round(rewriter, opset, tally)
             if tally.changes == before:
@@ -110,10 +118,11 @@ class HoistLinear(Pass):
                 if rewriter.replace(layer, found.way):
                     tally.products += 1
                     tally.macs += found.macs
-            elif do_before_repeats(node, rewriter, opset) or sink_repeats(
-                node, rewriter, opset
-            ):
+            elif do_before_repeats(node, rewriter, opset):
                 tally.others += 1
+            elif (sunk := sink_repeats(node, rewriter, opset)) is not None:
+                tally.others += sunk
+                tally.left += not sunk
             elif (fewer := split_operand(node, rewriter)) is not None:
                 tally.operands += 1
                 tally.macs += fewer
