@@ -8,7 +8,13 @@ import onnx_ir as ir
 from me2e_compress.graph import array_of
 from me2e_compress.graph.rewrite import Fusion, fuse, maker
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.fuse_basic import activations, affine, layer_norm, linear
+from me2e_compress.passes.fuse_basic import (
+    activations,
+    affine,
+    factors,
+    layer_norm,
+    linear,
+)
 
 __all__ = ["FuseBasic"]
 
@@ -17,9 +23,10 @@ __all__ = ["FuseBasic"]
 class FuseBasic(Pass):
     """Fuse patterns of standard operators into fewer standard operators.
 
-    Given:   Conv -> BatchNormalization -> Relu;  x * 0.5 * (1 + Erf(x / sqrt 2))
+    Given:   Conv -> BatchNormalization -> Relu;  x * 0.5 * (1 + Erf(x / sqrt 2));
+             Reshape(x W + b) / c
 
-    Result:  Conv -> Relu;  Gelu(x) where the opset has it
+    Result:  Conv -> Relu;  Gelu(x) where the opset has it;  Reshape(x (W / c) + b / c)
 
     Outputs are equal up to rounding. A residual Conv + Add stays, in the form that
     TensorRT and onnxruntime fuse with the next activation.
@@ -43,7 +50,7 @@ class FuseBasic(Pass):
         """Return the fusions in the order in which they are tried."""
         return (
             affine.FUSION,
-            linear.SCALE,
+            *factors.FUSIONS,
             linear.GEMM,
             layer_norm.FUSION,
             *activations.fusions(swish=self.swish),

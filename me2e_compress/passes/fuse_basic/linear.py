@@ -1,8 +1,8 @@
 """Fuse matrix products with constants, and chains of constants.
 
-Given:   MatMul(x, weight) + bias, x of rank 2;  MatMul(x, weight) * c;  (x * c) * d
+Given:   MatMul(x, weight) + bias, x of rank 2;  (x * c) * d
 
-Result:  Gemm;  MatMul(x, c weight);  x * (c d)
+Result:  Gemm;  x * (c d)
 
 At rank 3 MatMul + Add stays: Reshape, Gemm, Reshape would hide the product from
 attention patterns and misplace the quantizers.
@@ -19,66 +19,13 @@ from me2e_compress.graph.rewrite import (
     Kit,
     Match,
     Numbers,
-    Pattern,
     constant,
-    either,
     op,
-    overflow,
-    sole_reader,
     var,
 )
 
 CANCELLATION = 1e3
 """Constants that cancel more than three decimal digits are not added in advance."""
-
-X = var("x")
-WEIGHT, BIAS, FACTOR = constant(), constant(), constant()
-PRODUCT = op("MatMul", X, WEIGHT)
-SUM = op("Add", PRODUCT, BIAS)
-SCALED = op(("Mul", "Div"), either(SUM, PRODUCT), FACTOR)
-
-
-def _is_per_column(match: Match, facts: Facts) -> bool:
-    weight, factor = match.array(WEIGHT).shape, match.array(FACTOR).shape
-    if len(weight) != 2 or factor not in ((), (1,), (weight[1],)):
-        return False
-    numbers = match.numbers(FACTOR)  # zero times a sum loses its sign
-    divides = match.root.op_type == "Div"
-    return bool(numbers.all()) and not (divides and np.isinf(numbers).any())
-
-
-def _shares(match: Match, facts: Facts) -> str | None:
-    if not _is_owned(match, PRODUCT, WEIGHT):
-        return "a factor after a MatMul that shares its weight"
-    if SUM in match:
-        vector = match.array(BIAS).ndim == 1
-        if not vector or not _is_owned(match, SUM, BIAS):
-            return "a factor after a MatMul that shares its bias"
-    return None
-
-
-def _is_owned(match: Match, layer: Pattern, part: Pattern) -> bool:
-    value = match[part]
-    return value.is_initializer() and sole_reader(value) is match.node(layer)
-
-
-def _scale(match: Match, kit: Kit) -> str | None:
-    factor = match.numbers(FACTOR)
-    factor = factor if match.root.op_type == "Mul" else 1 / factor
-    parts = [("weight", PRODUCT, WEIGHT)]
-    if SUM in match:
-        parts.insert(0, ("bias", SUM, BIAS))
-    scaled = [match.numbers(part) * factor for _, _, part in parts]
-    for (what, _, part), numbers in zip(parts, scaled, strict=True):
-        if overflow(numbers, match.array(part)):
-            return f"a factor under which a {what} would overflow"
-    for (_, layer, part), numbers in zip(parts, scaled, strict=True):
-        node, kind = match.node(layer), match.array(part).dtype
-        index = list(node.inputs).index(match[part])
-        kit.refill(node, index, numbers.astype(kind), str(match[part].name))
-    kit.absorb(*(match.node(layer) for _, layer, _ in parts))
-    return None
-
 
 LEFT, RIGHT, OFFSET = var("left"), var("right"), constant(floating=False)
 INNER = op("MatMul", LEFT, RIGHT)
@@ -138,6 +85,5 @@ def _fits(numbers: Numbers, kind: ir.DataType) -> bool:
     return bool(np.all((size <= limits.max) & (size >= limits.tiny)))
 
 
-SCALE = Fusion("factors into MatMul weights", SCALED, _scale, _shares, _is_per_column)
 GEMM = Fusion("MatMul + bias", PLUS, _gemm, where=_is_of_matrices)
 CHAIN = tuple(Fusion("constant chains", pattern, _chain) for pattern in CHAINS.values())

@@ -15,6 +15,7 @@ from me2e_compress.passes.hoist_linear.least_work import Prices
 from me2e_compress.passes.hoist_linear.linear_layers import layer_at
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.repeated_rows import do_before_repeats
+from me2e_compress.passes.hoist_linear.sunk_repeats import sink_repeats
 from me2e_compress.passes.work import BYTES_PER_NODE
 
 __all__ = ["HoistLinear"]
@@ -32,6 +33,7 @@ class _Tally:
     others: int = 0
     operands: int = 0
     unread: int = 0
+    left: int = 0
     macs: int = 0
     refused: Counter[str] = dataclasses.field(default_factory=Counter)
 
@@ -47,6 +49,11 @@ class _Tally:
         if self.others:
             found.append(
                 f"moved {counted(self.others, 'other node')} before repeated rows"
+            )
+        if self.left:
+            what = counted(self.left, "node")
+            found.append(
+                f"left {what} behind what repeats: others read it too, or it is small"
             )
         if self.unread:
             found.append(f"removed what nothing reads: {self.unread}")
@@ -70,9 +77,11 @@ class HoistLinear(Pass):
     repeated. Two consecutive linear layers become one. Each rewrite is done only where
     it needs fewer multiply-accumulates and is cheaper in total: nodes, memory traffic
     and new weights (:mod:`me2e_compress.passes.work`). Other row-wise operators (a
-    bias, LayerNorm, Relu) also move in front of repetitions. Keys and values that the
-    batch shares but for their positions are multiplied term by term. Sizes must be
-    known. Outputs are equal up to rounding.
+    bias, LayerNorm, Relu) also move in front of repetitions, as do Transpose and Concat
+    (of constants that repeat, too), also where views have split or merged the axes
+    behind those that repeat. Keys and values that the batch shares but for their
+    positions are multiplied term by term. Sizes must be known. Outputs are equal up to
+    rounding.
 
     Attributes:
         bytes_per_node: how many bytes of new weights the work of one node may cost.
@@ -94,6 +103,7 @@ class HoistLinear(Pass):
         ]
         for _ in range(ROUNDS):
             before = tally.changes
+            tally.left = 0  # those of the last round are left
             tally.refused.clear()
             for rewriter in rewriters:
                 self._round(rewriter, opset, tally)
@@ -118,6 +128,9 @@ class HoistLinear(Pass):
                     tally.macs += found.macs
             elif do_before_repeats(node, rewriter, opset):
                 tally.others += 1
+            elif (sunk := sink_repeats(node, rewriter, opset)) is not None:
+                tally.others += sunk
+                tally.left += not sunk
             elif isinstance(fewer := split_operand(node, rewriter), int):
                 tally.operands += 1
                 tally.macs += fewer

@@ -75,7 +75,7 @@ class Move:
 
 def do_before_repeats(node: ir.Node, rewriter: Rewriter, opset: int) -> bool:
     """Move a node in front of the repetition of its rows; False if it does not pay."""
-    if not _is_row_wise(node, opset):
+    if not is_row_wise(node, opset):
         return False
     shape = static_shape(node.outputs[0])
     operands = node.inputs[: 2 if node.op_type in BINARY else 1]
@@ -94,7 +94,8 @@ def do_before_repeats(node: ir.Node, rewriter: Rewriter, opset: int) -> bool:
     return False
 
 
-def _is_row_wise(node: ir.Node, opset: int) -> bool:
+def is_row_wise(node: ir.Node, opset: int) -> bool:
+    """Return whether a node maps every element, or every row of the last axis."""
     if not is_standard(node) or any(map(is_read, node.outputs[1:])):
         return False
     if any((rank_of(value) or 0) > 1 for value in node.inputs[2:]):
@@ -192,7 +193,7 @@ def _traffic(values: Sequence[ir.Value | None]) -> float:
 
 def _rewrite(node: ir.Node, move: Move, rewriter: Rewriter) -> None:
     old, found = node.outputs[0], move.found
-    inputs, attributes = _along_last(node, move, rewriter)
+    inputs, attributes = along_last(node, move.inputs, len(move.shape), rewriter)
     # Write the node on the source, then repeat its result
     new = rewriter.write(
         node.op_type, inputs, attributes, move.shape, sources=(node,), like=old
@@ -213,16 +214,18 @@ def _rewrite(node: ir.Node, move: Move, rewriter: Rewriter) -> None:
     rewriter.swap(old, new)
 
 
-def _along_last(
-    node: ir.Node, move: Move, rewriter: Rewriter
+def along_last(
+    node: ir.Node,
+    inputs: Sequence[ir.Value | None],
+    rank: int,
+    rewriter: Rewriter,
 ) -> tuple[list[ir.Value | None], list[ir.Attr]]:
     """Return a moved node's inputs and attributes, its axis being the last."""
-    inputs, attributes = list(move.inputs), dict(node.attributes)
-    last = len(move.shape) - 1
+    given, attributes = list(inputs), dict(node.attributes)
     if node.op_type in ALONG_AXIS:
-        attributes["axis"] = ir.AttrInt64("axis", last)
+        attributes["axis"] = ir.AttrInt64("axis", rank - 1)
     elif "axes" in attributes:
-        attributes["axes"] = ir.AttrInt64s("axes", [last])
+        attributes["axes"] = ir.AttrInt64s("axes", [rank - 1])
     elif node.op_type in REDUCTIONS:
-        inputs[1] = rewriter.target((last,), f"{node.outputs[0].name}_axes")
-    return inputs, list(attributes.values())
+        given[1] = rewriter.target((rank - 1,), f"{node.outputs[0].name}_axes")
+    return given, list(attributes.values())

@@ -1,0 +1,268 @@
+"""Compute nodes once for all that a repetition repeats, and repeat their result.
+
+Given:   Reshape(Tile(x)) -> Div(c) -> Add(points);  Reshape(Tile(x)) -> Softmax
+
+Result:  Reshape(x) -> Div(c) -> Add(points), which repeats by itself;
+         Reshape(x) -> Softmax -> Expand
+
+Spatial cross attention repeats its queries for every camera (Li et al., BEVFormer,
+2022, section 3.3): sampling offsets and weights are the same for all of them.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of, is_standard, static_shape
+from me2e_compress.graph.nodes import permutation_of
+from me2e_compress.graph.rewrite import Array, holds_numbers, sole_reader
+from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
+from me2e_compress.passes.hoist_linear.repeated_axes import RepeatedAxes, repeated_axes
+from me2e_compress.passes.hoist_linear.repeated_rows import (
+    BINARY,
+    UNARY,
+    along_last,
+    is_row_wise,
+)
+from me2e_compress.passes.work import MOVED_BYTES_PER_NODE, work
+
+
+@dataclasses.dataclass(frozen=True)
+class _Operand:
+    """What a node reads instead: a value as it is, or every element once.
+
+    Attributes:
+        value: what it reads now.
+        shape: the shape of what it reads instead.
+        found: where the elements are that it reads once.
+        numbers: or those of a constant.
+    """
+
+    value: ir.Value
+    shape: tuple[int, ...]
+    found: RepeatedAxes | None = None
+    numbers: Array | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Plan:
+    """A node on other operands: the shape of its result, and that of all repeats."""
+
+    operands: tuple[_Operand, ...]
+    small: tuple[int, ...]
+    large: tuple[int, ...]
+
+
+def sink_repeats(node: ir.Node, rewriter: Rewriter, opset: int) -> bool | None:
+    """Compute a node before the repetition of what it reads.
+
+    Returns False where that does not pay, and None where nothing it reads repeats.
+    """
+    plan = _plan(node, opset)
+    if plan is None:
+        return None
+    if not _pays(node, plan):
+        return False
+    _rewrite(node, plan, rewriter)
+    return True
+
+
+def _plan(node: ir.Node, opset: int) -> _Plan | None:
+    shape = static_shape(node.outputs[0])
+    if not shape or not is_standard(node):
+        return None
+    if node.op_type == "Concat":
+        return _joined(node, shape)
+    value = node.inputs[0] if node.inputs else None
+    if node.op_type == "Transpose" and value is not None:
+        return _turned(node, value)
+    if value is None or not is_row_wise(node, opset):
+        return None
+    if node.op_type in BINARY:
+        return _combined(node, shape)
+    # An operator along the last axis needs it whole
+    found, given = repeated_axes(value), static_shape(value) or ()
+    if found is None:
+        return None
+    operand = _Operand(value, found.small, found)
+    if node.op_type in UNARY:
+        return _Plan((operand,), found.small, found.large)
+    if not found.small[-1] == found.large[-1] == given[-1]:
+        return None
+    return _Plan(
+        (operand,), (*found.small[:-1], shape[-1]), (*found.large[:-1], shape[-1])
+    )
+
+
+def _turned(node: ir.Node, value: ir.Value) -> _Plan | None:
+    found, order = repeated_axes(value), permutation_of(node)
+    if found is None or order is None or found.large != static_shape(value):
+        return None
+    small, large = (
+        tuple(sizes[axis] for axis in order) for sizes in (found.small, found.large)
+    )
+    return _Plan((_Operand(value, found.small, found),), small, large)
+
+
+def _combined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
+    """Plan an element-wise operator of two operands, each of which may repeat."""
+    operands: list[_Operand] = []
+    for value in node.inputs:
+        given = static_shape(value)
+        if value is None or given is None:
+            return None
+        same = value.dtype == node.outputs[0].dtype and not holds_numbers(value)
+        found = repeated_axes(value) if same else None
+        if found is not None and found.large != given:
+            return _split(node, found, shape)
+        small = given if found is None else found.small
+        operands.append(_Operand(value, small, found))
+    if all(each.found is None for each in operands):
+        return None
+    small = np.broadcast_shapes(*(each.shape for each in operands))
+    return _Plan(tuple(operands), small, shape)
+
+
+def _split(node: ir.Node, found: RepeatedAxes, shape: tuple[int, ...]) -> _Plan | None:
+    """Plan the same where an axis repeats in part: the other varies behind it alone."""
+    operands: list[_Operand] = []
+    for value in node.inputs:
+        given = static_shape(value)
+        if value is None or given is None:
+            return None
+        mine = repeated_axes(value) if given == shape else None
+        if mine is not None and mine.large == found.large:
+            operands.append(_Operand(value, mine.small, mine))
+        elif found.large[-len(given) :] == shape[-len(given) :] or given == ():
+            operands.append(_Operand(value, given))
+        else:
+            return None
+    small = np.broadcast_shapes(*(each.shape for each in operands))
+    return _Plan(tuple(operands), small, found.large)
+
+
+def _joined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
+    """Plan a Concat whose operands all repeat along the same axes, constants too."""
+    values = [value for value in node.inputs if value is not None]
+    axis = node.attributes.get_int("axis", 0) % len(shape)
+    stored = {value: array_of(value) for value in values if holds_numbers(value)}
+    common = set(range(len(shape))) - {axis}
+    found: dict[ir.Value, RepeatedAxes] = {}
+    if len(stored) == len(values):
+        return None
+    # The axes along which every operand repeats
+    for value in values:
+        one = None if value in stored else repeated_axes(value)
+        if one is not None and one.large == static_shape(value):
+            found[value] = one
+            common = {at for at in common if one.small[at] != one.large[at]}
+        elif value not in stored:
+            return None
+    for array in stored.values():
+        common = {at for at in common if array is not None and _repeats(array, at)}
+    if not common:
+        return None
+    operands = tuple(
+        _once(value, common, found.get(value), stored.get(value)) for value in values
+    )
+    small = [1 if at in common else size for at, size in enumerate(shape)]
+    return _Plan(operands, tuple(small), shape)
+
+
+def _repeats(array: Array, axis: int) -> bool:
+    first = np.take(array, [0], axis)
+    return bool(np.all(array == first))
+
+
+def _once(
+    value: ir.Value, axes: set[int], found: RepeatedAxes | None, array: Array | None
+) -> _Operand:
+    shape = tuple(
+        1 if at in axes else size for at, size in enumerate(static_shape(value) or ())
+    )
+    if array is not None:
+        array = array[
+            tuple(slice(1 if at in axes else None) for at in range(len(shape)))
+        ]
+    return _Operand(value, shape, found, array)
+
+
+def _pays(node: ir.Node, plan: _Plan) -> bool:
+    """Return whether all that is computed once is more than what is written anew."""
+    result = node.outputs[0]
+    item = 4.0 if result.dtype is None else result.dtype.itemsize
+    before, moved = work(node), math.prod(plan.small) * item
+    after = 1.0
+    for operand in plan.operands:
+        moved += math.prod(operand.shape) * item
+        if operand.found is None:
+            continue
+        before += sum(map(work, _owned(node, operand.found)))
+        if static_shape(operand.found.source) != operand.found.small:
+            after += 1.0
+        if operand.shape != operand.found.small:
+            moved += (math.prod(operand.shape) + math.prod(operand.found.small)) * item
+            after += 1.0
+    # Repeating the result, and giving it its shape
+    if plan.small != plan.large:
+        moved += (math.prod(plan.small) + math.prod(plan.large)) * item
+        after += 1.0
+    after += plan.large != static_shape(result)
+    return before - after > moved / MOVED_BYTES_PER_NODE
+
+
+def _owned(node: ir.Node, found: RepeatedAxes) -> list[ir.Node]:
+    """List the nodes of a repetition that only the node needs."""
+    owned: list[ir.Node] = []
+    for each in found.nodes:
+        if sole_reader(each.outputs[0]) is None:
+            break
+        owned.append(each)
+    return owned
+
+
+def _rewrite(node: ir.Node, plan: _Plan, rewriter: Rewriter) -> None:
+    old = node.outputs[0]
+    inputs: list[ir.Value | None] = [
+        _written(node, operand, rewriter) for operand in plan.operands
+    ]
+    inputs.extend(node.inputs[len(inputs) :])
+    attributes = list(node.attributes.values())
+    if node.op_type not in ("Concat", "Transpose"):
+        inputs, attributes = along_last(node, inputs, len(plan.small), rewriter)
+    new = rewriter.write(
+        node.op_type, inputs, attributes, plan.small, sources=(node,), like=old
+    )
+    # Repeat the result, unless its readers see no difference
+    found = [each.found for each in plan.operands if each.found is not None]
+    sources = (node, *dict.fromkeys(one for each in found for one in each.nodes))
+    forms = {"Expand": plan.large, "Reshape": static_shape(old) or ()}
+    for op_type, shape in forms.items():
+        if shape != static_shape(new):
+            target = rewriter.target(shape, f"{old.name}_shape")
+            new = rewriter.write(
+                op_type, [new, target], [], shape, sources=sources, like=old
+            )
+    rewriter.swap(old, new)
+
+
+def _written(node: ir.Node, operand: _Operand, rewriter: Rewriter) -> ir.Value:
+    """Return what a node reads instead, written where needed."""
+    value, old = operand.value, node.outputs[0]
+    if operand.numbers is not None:
+        return rewriter.store(operand.numbers, f"{value.name}_once")
+    if operand.found is None:
+        return value
+    value = operand.found.source
+    for op_type, shape in {
+        "Reshape": operand.found.small, "Expand": operand.shape
+    }.items():  # fmt: skip
+        if shape != static_shape(value):
+            target = rewriter.target(shape, f"{operand.value.name}_shape")
+            value = rewriter.write(
+                op_type, [value, target], [], shape, sources=operand.found.nodes,
+                like=old,
+            )  # fmt: skip
+    return value
