@@ -1,12 +1,13 @@
-"""What ``hoist-linear`` and ``flatten-matmul`` save.
+"""What ``hoist-linear``, ``flatten-matmul`` and the factors of ``fuse-basic`` save.
 
     python -m benchmarks.bench_hoisting
 
-The keys of VAD-tiny's motion decoder as the zoo exports them, its attention to the map
-as the original code does (keys and values written for every agent and mode), products
-of few rows whose matrix the batch shares, and the points of BEV cells in every camera's
-image: GMACs, and CPU time of onnxruntime on two threads, the least of rounds that
-alternate, before and behind the pass. First, how long ``hoist-linear`` itself takes on
+Parts of VAD-tiny as they are exported and behind the pass: the keys of the motion
+decoder, motion's attention to the map as the original code has it (keys and values
+written for every agent and mode), the sampling places of the spatial cross attention
+(10,000 queries for six cameras), the rows of a planner of which one is stored, and the
+points of BEV cells in every camera's image. CPU time of onnxruntime on two threads, the
+least of rounds that alternate. First, how long ``hoist-linear`` itself takes on
 graphs of more and more products of repeated rows.
 """
 
@@ -27,6 +28,7 @@ from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.flatten_matmul import FlattenMatmul
+from me2e_compress.passes.fuse_basic import FuseBasic
 from me2e_compress.passes.hoist_linear import HoistLinear
 
 ROUNDS = 10
@@ -61,6 +63,27 @@ attention (float[1,1,{TOKENS - 1},{WIDTH}] map, float[{TOKENS},{AGENTS},2] posit
     y = MatMul(shares, moved)
 }}"""
 """As VAD's motion reads the map: see :mod:`benchmarks.original_patterns`."""
+CAMERAS, CELLS = 6, 10_000
+QUERIES = f"""<ir_version: 8, opset_import: ["" : 17]>
+queries (float[1,{CELLS},{WIDTH}] query, float[1,{CELLS},{WIDTH}] position,
+         float[{CAMERAS},{CELLS},1,1,4,2] points)
+    => (float[{CAMERAS},{CELLS},8,1,8,2] places, float[{CAMERAS},{CELLS},8,1,8] shares)
+{{
+    single = Unsqueeze(query, one)  tiled = Tile(single, times)
+    rows = Reshape(tiled, flat)  both = Add(rows, position)
+    product = MatMul(both, wo)  linear = Add(product, bo)
+    offsets = Reshape(linear, eight)  steps = Div(offsets, size)
+    pillars = Reshape(steps, four)  at = Add(points, pillars)
+    places = Reshape(at, eight)
+    scores = MatMul(both, ww)  biased = Add(scores, bw)  heads = Reshape(biased, split)
+    soft = Softmax<axis = -1>(heads)  shares = Reshape(soft, levels)
+}}"""
+PLANNER = f"""<ir_version: 8, opset_import: ["" : 17]>
+planner (float[1,100,{WIDTH}] agents) => (float[101,300,{WIDTH}] keys) {{
+    tiled = Tile(agents, times)  rows = Concat<axis = 1>(tiled, ego)
+    turned = Transpose<perm = [1, 0, 2]>(rows)
+    product = MatMul(turned, weight)  keys = Add(product, bias)
+}}"""
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
@@ -84,7 +107,9 @@ def model_of(text: str, weights: Arrays) -> ir.Model:
 def hoisted(text: str, weights: Arrays) -> ir.Model:
     model = model_of(text, weights)
     context = Context(ModuleMap.whole())
-    return HoistLinear().run(model, context).model
+    model = HoistLinear().run(model, context).model
+    graph.infer_shapes(model)
+    return FuseBasic().run(model, context).model
 
 
 def session_of(model: ir.Model) -> onnxruntime.InferenceSession:
@@ -109,17 +134,6 @@ def milliseconds(models: list[ir.Model], feeds: Arrays, runs: int) -> list[float
     return [min(seconds) / runs * 1e3 for seconds in taken]
 
 
-def show(name: str, text: str, weights: Arrays, feeds: Arrays) -> None:
-    """Print GMACs and milliseconds of a graph before and behind the pass."""
-    models = [model_of(text, weights), hoisted(text, weights)]
-    before, after = milliseconds(models, feeds, 1)
-    less, fewer = (sum(graph.macs(node) or 0 for node in m.graph) for m in models)
-    print(
-        f"{name}: {before:.1f} ms, hoisted {after:.1f} ms;"
-        f" {less / 1e9:.2f} GMACs, hoisted {fewer / 1e9:.2f}"
-    )
-
-
 def show_keys() -> None:
     weights = {
         "embed": normal(2, WIDTH), "start": normal(WIDTH),
@@ -131,7 +145,7 @@ def show_keys() -> None:
         "position": normal(AGENTS, TOKENS, 2),
         "q": normal(AGENTS, HEADS, 1, CHANNELS),
     }
-    show("keys of the motion decoder", KEYS, weights, feeds)
+    compare("keys of the motion decoder", KEYS, weights, feeds)
 
 
 def show_attention() -> None:
@@ -149,21 +163,47 @@ def show_attention() -> None:
         "q": normal(AGENTS * HEADS, 1, CHANNELS),
         "far": normal(AGENTS * HEADS, 1, TOKENS),
     }
-    show("motion's attention to the map, original", ATTENTION, weights, feeds)
+    compare("motion's attention to the map, original", ATTENTION, weights, feeds)
 
 
-def show_joined(rows: int) -> None:
-    batch = AGENTS // rows
-    text = (
-        f'<ir_version: 8, opset_import: ["" : 17]>\njoined (float[{batch},{HEADS},'
-        f"{rows},{CHANNELS}] q, float[1,{HEADS},{CHANNELS},{TOKENS}] keys)"
-        " => (float[A,B,C,D] y) { y = MatMul(q, keys) }"
-    )
+def show_cameras() -> None:
+    lead = (CAMERAS, CELLS, HEADS)
+    weights = {
+        "one": np.array([1]), "times": np.array((1, CAMERAS, 1, 1)),
+        "flat": np.array((CAMERAS, CELLS, WIDTH)), "eight": np.array((*lead, 1, 8, 2)),
+        "four": np.array((*lead, 2, 4, 2)), "split": np.array((*lead, 8)),
+        "levels": np.array((*lead, 1, 8)),
+        "size": np.array((20, 12), np.float32).reshape(1, 1, 1, 1, 1, 2),
+        "wo": normal(WIDTH, 128), "bo": normal(128),
+        "ww": normal(WIDTH, 64), "bw": normal(64),
+    }  # fmt: skip
     feeds = {
-        "q": normal(batch, HEADS, rows, CHANNELS),
-        "keys": normal(1, HEADS, CHANNELS, TOKENS),
-    }
-    show(f"shared keys, queries of {rows} rows", text, {}, feeds)
+        "query": normal(1, CELLS, WIDTH), "position": normal(1, CELLS, WIDTH),
+        "points": normal(CAMERAS, CELLS, 1, 1, 4, 2),
+    }  # fmt: skip
+    compare("sampling places for six cameras", QUERIES, weights, feeds)
+
+
+def show_planner() -> None:
+    weights = {
+        "times": np.array((300, 1, 1)), "ego": np.repeat(normal(1, 1, WIDTH), 300, 0),
+        "weight": normal(WIDTH, WIDTH), "bias": normal(WIDTH),
+    }  # fmt: skip
+    feeds = {"agents": normal(1, 100, WIDTH)}
+    compare("100 repeated rows and a stored one", PLANNER, weights, feeds)
+
+
+def compare(name: str, text: str, weights: Arrays, feeds: Arrays) -> None:
+    models = [model_of(text, weights), hoisted(text, weights)]
+    before, after = milliseconds(models, feeds, 1)
+    graph.infer_shapes(models[1])
+    first, last = (
+        sum(graph.macs(node) or 0 for node in model.graph) / 1e9 for model in models
+    )
+    print(
+        f"{name}: {first:.3f} GMACs in {before:.1f} ms,"
+        f" hoisted {last:.3f} GMACs in {after:.1f} ms"
+    )
 
 
 def show_points() -> None:
@@ -202,5 +242,5 @@ if __name__ == "__main__":
     show_keys()
     show_points()
     show_attention()
-    for few in (1, 4, 8):
-        show_joined(few)
+    show_cameras()
+    show_planner()

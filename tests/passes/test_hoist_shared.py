@@ -150,54 +150,6 @@ def _value(body: str) -> ir.Value:
     return next(v for node in model.graph for v in node.outputs if v.name == "x")
 
 
-JOINED = {
-    "the first axis": ("9,4,1,5", "1,4,5,6", 2),
-    "the axis next to the rows": ("9,4,2,5", "9,1,5,6", 0),
-    "a missing axis": ("3,2,2,5", "2,5,6", 2),
-    "two axes": ("3,4,2,1,5", "1,4,1,5,6", 2),
-}
-
-
-@pytest.mark.parametrize("case", JOINED)
-def test_products_of_few_rows_become_one_of_many(case: str) -> None:
-    rows, columns, turns = JOINED[case]
-    batch, count = rows.rsplit(",", 1)[0], columns.rsplit(",", 1)[1]
-    model = hoist(
-        graph_of(
-            f"(float[{rows}] x, float[{columns}] k) => (float[{batch},{count}] y)",
-            "y = MatMul(x, k)",
-        )
-    )
-    assert ops(model).count("Transpose") == turns
-    (product,) = (node for node in model.graph if node.op_type == "MatMul")
-    left, right = map(static_shape, product.inputs)
-    assert left is not None
-    assert right is not None
-    assert left[:-2] == right[:-2]
-
-
-@pytest.mark.parametrize(
-    ("rows", "columns"),
-    [
-        pytest.param("9,4,9,5", "1,4,5,6", id="many rows"),
-        pytest.param("9,4,1,5", "1,1,5,6", id="one matrix"),
-        pytest.param("9,4,1,5", "9,4,5,6", id="a matrix for each"),
-        pytest.param("1,4,1,5", "9,4,5,6", id="shared rows"),
-        pytest.param("9,1,5", "5,6", id="a matrix without batch"),
-    ],
-)
-def test_other_products_stay(rows: str, columns: str) -> None:
-    model = hoist(
-        graph_of(
-            f"(float[{rows}] x, float[{columns}] k) => (float[A,B,C,D] y)"
-            if rows.count(",") == 3
-            else f"(float[{rows}] x, float[{columns}] k) => (float[A,B,C] y)",
-            "y = MatMul(x, k)",
-        )
-    )
-    assert ops(model) == ["MatMul"]
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.data())
 def test_split_attention_is_exact_in_float64(data: st.DataObject) -> None:
@@ -267,26 +219,3 @@ def _attention(
         "root": np.array(1.7), "low": np.array(-3.0),
     }  # fmt: skip
     return text, held
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.data())
-def test_joined_products_are_exact_in_float64(data: st.DataObject) -> None:
-    """Any batch axes, of which the right operand has some, shares some, or lacks."""
-    batch = data.draw(st.lists(st.integers(1, 4), min_size=1, max_size=4))
-    rows, depth, columns = (data.draw(st.integers(1, 4)) for _ in range(3))
-    others = [data.draw(st.sampled_from([1, size])) for size in batch]
-    others = others[data.draw(st.integers(0, len(others))) :]
-    left, right = (*batch, rows, depth), (*others, depth, columns)
-    ports = {"x": left, "k": right, "y": (*batch, rows, columns)}
-    x, k, y = (f"double{list(shape)} {name}" for name, shape in ports.items())
-    model = read(graph_of(f"({x}, {k}) => ({y})", "y = MatMul(x, k)"))
-    feeds = {"x": RANDOM.normal(size=left), "k": RANDOM.normal(size=right)}
-    (found,) = compute(apply(HoistLinear(), model).model, feeds)
-    assert np.abs(feeds["x"] @ feeds["k"] - found).max() <= 1e-9
-    (product,) = (node for node in model.graph if node.op_type == "MatMul")
-    own, its = map(static_shape, product.inputs)
-    # Each matrix once, unless there is only one
-    assert own is not None
-    assert its is not None
-    assert np.prod(its[:-2]) == 1 or own[:-2] == its[:-2]

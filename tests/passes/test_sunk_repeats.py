@@ -14,7 +14,7 @@ from me2e_compress.graph import infer_shapes, static_shape
 from me2e_compress.passes import work
 from me2e_compress.passes.hoist_linear import HoistLinear, sunk_repeats
 from tests.passes.hoisted import RANDOM, graph_of, hoist, integers, normal, products
-from tests.passes.small import NO_MODULES, compute, ops, read
+from tests.passes.small import NO_MODULES, apply, compute, ops, read
 from tests.profiles import scaled
 
 CAMERAS, CELLS, WIDE = 6, 200, 32
@@ -66,7 +66,9 @@ GIVEN = {
     "split": integers(*LEAD, 8), "levels": integers(*LEAD, 1, 8),
     "wo": normal(WIDE, 128), "bo": normal(128),
     "ww": normal(WIDE, 64), "bw": normal(64), "each": normal(CAMERAS, CELLS, WIDE),
-    "zero": integers(0), "two": integers(2), "small": integers(CAMERAS, 2, WIDE),
+    "flat": integers(CAMERAS * CELLS, WIDE), "flats": normal(CAMERAS * CELLS, WIDE),
+    "twice": integers(2 * CELLS), "three": integers(3, 1), "zero": integers(0),
+    "two": integers(2), "small": integers(CAMERAS, 2, WIDE),
 }  # fmt: skip
 
 
@@ -124,12 +126,68 @@ DIFFERS = {
         "t = Tile(x, times) r = Reshape(t, rows) e = Exp(r) y = Mul(each, e)",
         {"Exp": 1, "Mul": 6},
     ),
+    "flat rows that differ by camera": (
+        "t = Tile(x, times) r = Reshape(t, flat) a = Add(r, flats)"
+        " y = Reshape(a, rows)",
+        {"Add": 6 * CELLS},
+    ),
+    "flat rows that repeat otherwise": (
+        "t = Tile(x, times) r = Reshape(t, flat)"
+        " p = Slice(flats, zero, twice, zero) s = Tanh(p) q = Tile(s, three)"
+        " a = Add(r, q) y = Reshape(a, rows)",
+        {"Add": 6 * CELLS},
+    ),
+    "rows behind each other along the repeated axis": (
+        "t = Tile(x, times) r = Reshape(t, rows) y = Concat<axis = 0>(r, position)",
+        {"Concat": 7},
+    ),
     "few rows that others read, too": (
         "s = Slice(x, zero, two, two) t = Tile(s, times) r = Reshape(t, small)"
         " g = Sigmoid(r) y = Concat<axis = 0>(g, r)",
         {"Sigmoid": 6},
     ),
 }
+
+
+def test_flat_rows_are_regrouped_behind_what_is_computed_once() -> None:
+    body = (
+        "t = Tile(x, times) r = Reshape(t, flat) v = Tile(position, times)"
+        " p = Reshape(v, flat) a = Add(r, p) e = Tanh(a) y = Add(e, flats)"
+    )
+    text = graph_of(
+        f"(float[1,1,{CELLS},{WIDE}] x, float[1,1,{CELLS},{WIDE}] position)"
+        f" => (float[{CAMERAS * CELLS},{WIDE}] y)",
+        body,
+    )
+    given = {name: each for name, each in used(body).items() if name != "position"}
+
+    model = hoist(text, **given)
+
+    assert rows_of(model, "Tanh") == {1}
+    assert ops(model)[-3:] == ["Expand", "Reshape", "Add"]
+
+
+def test_an_exponent_of_another_type_stays_repeated() -> None:
+    text = graph_of(
+        f"(float[1,1,{CELLS},{WIDE}] x, int64[1,1,{CELLS},{WIDE}] n)"
+        f" => (float[{CAMERAS},{CELLS},{WIDE}] y)",
+        "t = Tile(n, times) r = Reshape(t, rows) e = Reshape(x, row) y = Pow(e, r)",
+    )
+    row = integers(1, CELLS, WIDE)
+    given = {name: GIVEN[name] for name in ("times", "rows")}
+
+    assert apply(HoistLinear(), read(text, row=row, **given)).changes == 0
+
+
+def test_what_does_not_pay_is_noted() -> None:
+    body = DIFFERS["few rows that others read, too"][0]
+    text = graph_of(f"(float[1,1,{CELLS},{WIDE}] x) => (float[A,B,C] y)", body)
+
+    result = apply(HoistLinear(), read(text, **used(body)))
+
+    assert result.notes == (
+        "left 1 node behind what repeats: others read it too, or it is small",
+    )
 
 
 @pytest.mark.parametrize("case", DIFFERS)

@@ -62,8 +62,7 @@ def _is_before(match: Match, facts: Facts) -> bool:
     numbers, source = _factor(match, match.node(SCALED)), match[SOURCE].shape
     if numbers is None or numbers.size != 1:
         return False
-    turned = match.root.attributes.get_int("transA", 0)
-    is_layer = len(match.array(WEIGHT).shape) == 2 and not turned
+    is_layer = len(match.array(WEIGHT).shape) == 2
     return is_layer and numbers.ndim <= (0 if source is None else len(source))
 
 
@@ -200,11 +199,11 @@ def _scale(
     """Write all scaled weights and biases, or none if one would overflow."""
     made: list[Array] = []
     for what, node, index in parts:
-        rows = what == "weight" and product.attributes.get_int("transB", 0)
+        flips = product.attributes.get_int("transB", 0)
         stored, numbers = array_of(node.inputs[index]), numbers_of(node.inputs[index])
         assert stored is not None
         assert numbers is not None
-        numbers = numbers * (factor[:, None] if rows else factor)
+        numbers = numbers * (factor[:, None] if flips and what == "weight" else factor)
         if overflow(numbers, stored):
             return f"a factor under which a {what} would overflow"
         made.append(numbers.astype(stored.dtype))

@@ -15,7 +15,6 @@ from me2e_compress.passes.hoist_linear.least_work import Prices
 from me2e_compress.passes.hoist_linear.linear_layers import layer_at
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.repeated_rows import do_before_repeats
-from me2e_compress.passes.hoist_linear.shared_products import join_products
 from me2e_compress.passes.hoist_linear.sunk_repeats import sink_repeats
 from me2e_compress.passes.work import BYTES_PER_NODE
 
@@ -34,14 +33,13 @@ class _Tally:
     others: int = 0
     operands: int = 0
     unread: int = 0
-    joined: int = 0
+    left: int = 0
     macs: int = 0
-    left: Counter[str] = dataclasses.field(default_factory=Counter)
+    refused: Counter[str] = dataclasses.field(default_factory=Counter)
 
     @property
     def changes(self) -> int:
-        moved = self.products + self.others + self.operands
-        return moved + self.joined + self.unread
+        return self.products + self.others + self.operands + self.unread
 
     def notes(self) -> tuple[str, ...]:
         found = []
@@ -52,11 +50,14 @@ class _Tally:
             found.append(
                 f"moved {counted(self.others, 'other node')} before repeated rows"
             )
-        if self.joined:
-            found.append(f"joined {counted(self.joined, 'product')} of few rows")
+        if self.left:
+            what = counted(self.left, "node")
+            found.append(
+                f"left {what} behind what repeats: others read it too, or it is small"
+            )
         if self.unread:
             found.append(f"removed what nothing reads: {self.unread}")
-        for reason, count in sorted(self.left.items()):
+        for reason, count in sorted(self.refused.items()):
             whole = counted(count, "product")
             found.append(f"left {whole} with keys or values as they are: {reason}")
         return tuple(found)
@@ -76,10 +77,11 @@ class HoistLinear(Pass):
     repeated. Two consecutive linear layers become one. Each rewrite is done only where
     it needs fewer multiply-accumulates and is cheaper in total: nodes, memory traffic
     and new weights (:mod:`me2e_compress.passes.work`). Other row-wise operators (a
-    bias, LayerNorm, Relu) also move in front of repetitions. Keys and values that the
-    batch shares but for their positions are multiplied term by term, and products of
-    few rows whose matrices the batch shares become one of many rows. Sizes must be
-    known. Outputs are equal up to rounding.
+    bias, LayerNorm, Relu) also move in front of repetitions, as do Transpose and Concat
+    (of constants that repeat, too), also where views have split or merged the axes
+    behind those that repeat. Keys and values that the batch shares but for their
+    positions are multiplied term by term. Sizes must be known. Outputs are equal up to
+    rounding.
 
     Attributes:
         bytes_per_node: how many bytes of new weights the work of one node may cost.
@@ -101,7 +103,8 @@ class HoistLinear(Pass):
         ]
         for _ in range(ROUNDS):
             before = tally.changes
-            tally.left.clear()
+            tally.left = 0  # those of the last round are left
+            tally.refused.clear()
             for rewriter in rewriters:
                 self._round(rewriter, opset, tally)
             if tally.changes == before:
@@ -123,16 +126,15 @@ class HoistLinear(Pass):
                 if rewriter.replace(layer, found.way):
                     tally.products += 1
                     tally.macs += found.macs
-            elif do_before_repeats(node, rewriter, opset) or sink_repeats(
-                node, rewriter, opset
-            ):
+            elif do_before_repeats(node, rewriter, opset):
                 tally.others += 1
+            elif (sunk := sink_repeats(node, rewriter, opset)) is not None:
+                tally.others += sunk
+                tally.left += not sunk
             elif isinstance(fewer := split_operand(node, rewriter), int):
                 tally.operands += 1
                 tally.macs += fewer
-            elif join_products(node, rewriter):
-                tally.joined += 1
             elif fewer is not None:
-                tally.left[fewer] += 1
+                tally.refused[fewer] += 1
             if tally.changes > before:
                 prices.forget()

@@ -55,10 +55,15 @@ class _Plan:
     large: tuple[int, ...]
 
 
-def sink_repeats(node: ir.Node, rewriter: Rewriter, opset: int) -> bool:
-    """Compute a node before the repetition of what it reads; False if none pays."""
+def sink_repeats(node: ir.Node, rewriter: Rewriter, opset: int) -> bool | None:
+    """Compute a node before the repetition of what it reads.
+
+    Returns False where that does not pay, and None where nothing it reads repeats.
+    """
     plan = _plan(node, opset)
-    if plan is None or not _pays(node, plan):
+    if plan is None:
+        return None
+    if not _pays(node, plan):
         return False
     _rewrite(node, plan, rewriter)
     return True
@@ -128,14 +133,12 @@ def _split(node: ir.Node, found: RepeatedAxes, shape: tuple[int, ...]) -> _Plan 
         if value is None or given is None:
             return None
         mine = repeated_axes(value) if given == shape else None
-        if mine is not None and (mine.small, mine.large) == (found.small, found.large):
+        if mine is not None and mine.large == found.large:
             operands.append(_Operand(value, mine.small, mine))
         elif found.large[-len(given) :] == shape[-len(given) :] or given == ():
             operands.append(_Operand(value, given))
         else:
             return None
-    if all(each.found is None for each in operands):
-        return None
     small = np.broadcast_shapes(*(each.shape for each in operands))
     return _Plan(tuple(operands), small, found.large)
 
@@ -147,7 +150,7 @@ def _joined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
     stored = {value: array_of(value) for value in values if holds_numbers(value)}
     common = set(range(len(shape))) - {axis}
     found: dict[ir.Value, RepeatedAxes] = {}
-    if len(set(values)) == 1 or len(stored) == len(values):
+    if len(stored) == len(values):
         return None
     # The axes along which every operand repeats
     for value in values:
