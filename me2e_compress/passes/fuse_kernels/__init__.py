@@ -14,7 +14,7 @@ from me2e_compress.graph.nodes import STANDARD
 from me2e_compress.graph.rewrite import remove_dead, replace_value, value_names
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.fuse_kernels.raw_attention import raw_attention
+from me2e_compress.passes.fuse_kernels.raw_attention import fuse_raw_attention
 
 __all__ = ["FuseKernels"]
 
@@ -26,7 +26,7 @@ matching one lacks. Nothing may be written before the last check.
 """
 
 _FUSERS: Mapping[str, Fuser] = {
-    "MultiScaleDeformableAttention": raw_attention,
+    "MultiScaleDeformableAttention": fuse_raw_attention,
 }
 """Fusers by the type of the last node of their pattern."""
 
