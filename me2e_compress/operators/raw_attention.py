@@ -43,8 +43,10 @@ class RawOwnForm(Dialect):
       those of the L * P points of a head in sequence;
     * mask [n, q, m, l, p], a factor of the weights. Points where it is 0 are not read.
 
-    n, q and m are N, Q and M, or 1; l and p divide L and P, and r * c divides L * P. An
-    operand that is smaller repeats: level k takes what level k % l does.
+    n, q and m are N, Q and M, or 1; l and p divide L and P, and r * c divides L * P.
+    Smaller operands repeat. Levels are those of one camera after the other: offsets and
+    scores are of a level of every camera, k % l of level k; reference points and mask
+    are of all levels of a camera, k * l // L.
     """
 
     def inputs_to_own(
@@ -56,8 +58,11 @@ class RawOwnForm(Dialect):
         levels, points = call.size(shapes, 0), call.size(offsets, 4)
         full = {3: levels, 4: points}
         # The sum of reference points and offsets
-        away = _tiled(call, offsets, full)
-        locations = call.add("Add", [_tiled(call, reference, full, beside=True), away])
+        near, factor = (
+            _tiled(call, _by_camera(call, each, levels), {4: points}, beside=True)
+            for each in (reference, mask)
+        )
+        locations = call.add("Add", [near, _tiled(call, offsets, full)])
         # The softmax, then the mask
         soft = call.add("Softmax", [scores], {"axis": -1})
         heads = [call.size(scores, axis) for axis in range(3)]
@@ -65,7 +70,7 @@ class RawOwnForm(Dialect):
         soft = call.reshape(soft, (*heads, row))
         soft = _tiled(call, soft, {3: call.product(levels, points)})
         soft = call.reshape(soft, (*heads, levels, points))
-        weights = call.add("Mul", [soft, _tiled(call, mask, full, beside=True)])
+        weights = call.add("Mul", [soft, factor])
         whole = [*sizes, levels, points]
         if [call.size(weights, axis) for axis in range(5)] != whole:
             weights = call.add("Expand", [weights, call.sizes(whole)])
@@ -97,8 +102,10 @@ class RawOwnForm(Dialect):
         value, shapes, starts, *rest = (np.asarray(each) for each in arrays)
         reference, offsets, scores, mask = (each.astype(np.float64) for each in rest)
         levels, points = len(shapes), offsets.shape[4]
-        near, away, factor = (
-            _whole(each, (levels, points)) for each in (reference, offsets, mask)
+        away = _repeated(offsets, {3: levels, 4: points})
+        near, factor = (
+            _repeated(each, {4: points}).repeat(levels // (each.shape[3] or 1), axis=3)
+            for each in (reference, mask)
         )
         powers = np.exp(scores - scores.max(axis=-1, keepdims=True))
         soft = powers / powers.sum(axis=-1, keepdims=True)
@@ -162,7 +169,19 @@ def _tiled(
     return call.add("Tile", [value, counts])
 
 
-def _whole(array: NdArray, full: tuple[int, int]) -> NdArray:
-    sizes = zip(full, array.shape[3:5], strict=True)
-    times = [wanted // size if size else 1 for wanted, size in sizes]
-    return np.tile(array, (1, 1, 1, *times, *([1] * (array.ndim - 5))))
+def _by_camera(call: FusedCall, value: ir.Value, levels: Size) -> ir.Value:
+    """Take for each level what its camera has; sizes of 1 are left to broadcasting."""
+    size = call.size(value, 3)
+    if size in (1, levels):
+        return value
+    count, total = call.value_of(size), call.value_of(levels)
+    product = call.add("Mul", [call.counting(levels), count])
+    index = call.add("Div", [product, total])
+    return call.add("Gather", [value, index], {"axis": 3})
+
+
+def _repeated(array: NdArray, full: Mapping[int, int]) -> NdArray:
+    times = [
+        full.get(axis, size) // (size or 1) for axis, size in enumerate(array.shape)
+    ]
+    return np.tile(array, times)

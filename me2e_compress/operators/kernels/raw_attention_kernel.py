@@ -47,7 +47,7 @@ QUERIES = 64
 :mod:`deformable_kernel` to balance the threads."""
 
 # an operand's words: its address, its steps along batch, queries and heads, and how
-# many levels and points it has before it repeats
+# many levels and points it has
 STEP_N, STEP_Q, STEP_M, LEVELS, POINTS, OPERAND = range(1, 7)
 REFERENCE, OFFSETS, SCORES, MASK, WORDS = range(OTHERS, OTHERS + 5 * OPERAND, OPERAND)
 
@@ -77,7 +77,7 @@ def _places(a: Any, at: Any, near: Any, away: Any, group: int, heads: int) -> No
     j = 0
     for m in range(heads):
         for k in range(together):
-            level = (group * together + k) % levels
+            level = (group * together + k) * levels // a[L]
             first = m * a[REFERENCE + STEP_M] + level * points * 2
             for _ in range(a[P] // points):
                 for i in range(2 * points):
@@ -93,7 +93,7 @@ def _seen(a: Any, mask: Any, group: int, heads: int) -> Word:
     many = heads if a[MASK + STEP_M] else 1
     for m in range(many):
         for k in range(together):
-            level = (group * together + k) % levels
+            level = (group * together + k) * levels // a[L]
             for p in range(points):
                 if mask[m * a[MASK + STEP_M] + level * points + p] != F(0):
                     return 1
@@ -110,8 +110,8 @@ def _shares(a: Any, w: Any, soft: Any, mask: Any, group: int, heads: int) -> Non
     # One factor for the whole group, and one score for each of its points
     alike = row == each and (a[SCORES + STEP_M] != 0 or heads == 1)
     one = points == 1 and a[MASK + STEP_M] == 0
-    if alike and one and (together == 1 or levels == 1):
-        factor = mask[group % levels]
+    if alike and one and a[L] // levels % together == 0:
+        factor = mask[group * together * levels // a[L]]
         for j in range(heads * each):
             w[j] = soft[j] * factor
         return
@@ -119,7 +119,7 @@ def _shares(a: Any, w: Any, soft: Any, mask: Any, group: int, heads: int) -> Non
         own = m * row if a[SCORES + STEP_M] else 0
         score = group * each % row
         for k in range(together):
-            level = (group * together + k) % levels
+            level = (group * together + k) * levels // a[L]
             first = m * a[MASK + STEP_M] + level * points
             p = 0
             for j in range((m * together + k) * a[P], (m * together + k + 1) * a[P]):

@@ -14,13 +14,13 @@ from me2e_compress.graph.nodes import STANDARD
 from me2e_compress.graph.rewrite import remove_dead, replace_value, value_names
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.fuse_kernels import (
-    attention,
-    choices,
-    convolution,
-    grid_sample,
-    raw_attention,
+from me2e_compress.passes.fuse_kernels.attention import fuse_attention
+from me2e_compress.passes.fuse_kernels.convolution import (
+    fuse_convolution,
+    fuse_rectified_convolution,
 )
+from me2e_compress.passes.fuse_kernels.grid_sample import fuse_grid_sample
+from me2e_compress.passes.fuse_kernels.raw_attention import fuse_raw_attention
 
 __all__ = ["FuseKernels"]
 
@@ -32,13 +32,11 @@ matching one lacks. Nothing may be written before the last check.
 """
 
 _FUSERS: Mapping[str, Fuser] = {
-    "Concat": choices.fuse,
-    "Conv": convolution.fuse_convolution,
-    "GridSample": grid_sample.fuse,
-    "MatMul": attention.fuse_attention,
-    "MultiScaleDeformableAttention": raw_attention.raw_attention,
-    "Relu": convolution.fuse_rectified_convolution,
-    "Where": choices.fuse,
+    "Conv": fuse_convolution,
+    "GridSample": fuse_grid_sample,
+    "MatMul": fuse_attention,
+    "MultiScaleDeformableAttention": fuse_raw_attention,
+    "Relu": fuse_rectified_convolution,
 }
 """Fusers by the type of the last node of their pattern."""
 

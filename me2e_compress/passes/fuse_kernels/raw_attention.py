@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
+from me2e_compress.errors import GraphError, PreconditionError
 from me2e_compress.graph import array_of, is_standard, static_shape
 from me2e_compress.graph.nodes import producer_of, sole_reader
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
@@ -52,22 +52,28 @@ class _Sizes:
         axes = (BATCH, QUERY, HEAD, LEVEL, POINT)
         return tuple(map(whole, axes, dataclasses.astuple(self)))
 
-    def form(self, views: Sequence[View]) -> Layout:
+    def form(self, views: Sequence[View], *, of_camera: bool = True) -> Layout:
         """Return the smallest layout of an operand that has the digits of views.
 
-        It lacks batch, queries or heads as a whole, and repeats over levels and points.
+        It lacks batch, queries or heads as a whole, and repeats over points. Levels are
+        the outer ones ``of_camera``, else inner ones that repeat.
         """
         digits = [digit for view in views for digit in flat(view.layout)]
-        ends = {axis: 1 for axis in (BATCH, QUERY, HEAD, LEVEL, POINT)}
-        for digit in digits:
-            ends[digit.axis] = max(ends.get(digit.axis, 1), digit.end)
-        outer = tuple(
-            all_digits if ends[axis] > 1 else ()
-            for axis, all_digits in zip(
-                (BATCH, QUERY, HEAD), self.weights, strict=False
-            )
+
+        def ends(axis: str) -> int:
+            return max((d.end for d in digits if d.axis == axis), default=1)
+
+        outer = (
+            full if ends(axis) > 1 else ()
+            for axis, full in zip((BATCH, QUERY, HEAD), self.weights, strict=False)
         )
-        return (*outer, whole(LEVEL, ends[LEVEL]), whole(POINT, ends[POINT]))
+        strides = [digit.stride for digit in digits if digit.axis == LEVEL]
+        least = min(strides, default=self.levels)
+        levels = whole(LEVEL, ends(LEVEL))
+        if of_camera:
+            count = self.levels // least
+            levels = (Digit(LEVEL, least, count),) if count > 1 else ()
+        return (*outer, levels, whole(POINT, ends(POINT)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +98,7 @@ class _Found:
         return tuple(each for each in read if each is not None)
 
 
-def raw_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
+def fuse_raw_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
     """Fuse the sum of reference points and offsets, and the softmax and its mask.
 
     Given:   y = me2e::MultiScaleDeformableAttention(
@@ -114,11 +120,12 @@ def raw_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
         RAW_ATTENTION, [*node.inputs[:3], *_written(call, found)], domain=OWN_DOMAIN
     )
     result.shape, result.type = node.outputs[0].shape, node.outputs[0].type
-    error = _error(call, result, found.views)
-    if not error <= TOLERANCE:
+    try:
+        _prove(call, result, found.views)
+    except (PreconditionError, GraphError) as reason:
         stops = [*(view.value for view in found.views), *filter(None, node.inputs)]
         take_back(body, nodes_between(result, stops), known)
-        raise PreconditionError(f"its positions or weights differ by {error:.1e}")
+        raise PreconditionError(str(reason)) from reason
     return result
 
 
@@ -173,7 +180,7 @@ def _pairs(layout: Layout) -> Layout:
 def _away(sizes: _Sizes, view: View) -> Layout:
     """Return the layout of offsets, which may lack levels only."""
     *outer, _, points = sizes.weights
-    return _pairs((*outer, sizes.form([view])[3], points))
+    return _pairs((*outer, sizes.form([view], of_camera=False)[3], points))
 
 
 def _written(call: FusedCall, found: _Found) -> list[ir.Value]:
@@ -199,22 +206,24 @@ def _proofs(opset: int) -> Proofs:
     return Proofs(opset, seed=0)  # it knows the layers that are alike
 
 
-def _error(call: FusedCall, result: ir.Value, views: Sequence[View]) -> float:
-    """Return the difference of positions and weights on random numbers."""
+def _prove(call: FusedCall, result: ir.Value, views: Sequence[View]) -> None:
+    """Compare positions and weights before and after on random numbers."""
     fused, body = result.producer(), call.node.graph
     assert fused is not None
     assert isinstance(body, ir.Graph)
     known, stops = set(body.initializers), list(filter(None, fused.inputs))
-    after = raw_own_form().inputs_to_own(call, tuple(fused.inputs), {})[3:]
-    errors = [
-        _proofs(call.opset).error(old, new, views)
-        for old, new in zip(call.node.inputs[3:], after, strict=True)
-        if old is not None and new is not None
-    ]
-    # The nodes were for this only
-    added = (n for new in after if new is not None for n in nodes_between(new, stops))
-    take_back(body, list(dict.fromkeys(added)), known)
-    return max(errors)
+    own = raw_own_form().inputs_to_own(call, tuple(fused.inputs), {})
+    after = [each for each in own[3:] if each is not None]
+    try:
+        for old, new in zip(call.node.inputs[3:], after, strict=True):
+            if old is None or any(view.value is old for view in views):
+                continue  # it is read as it is
+            error = _proofs(call.opset).error(old, new, views)
+            if not error <= TOLERANCE:
+                raise PreconditionError(f"{old.name} would differ by {error:.1e}")
+    finally:
+        added = (each for new in after for each in nodes_between(new, stops))
+        take_back(body, list(dict.fromkeys(added)), known)
 
 
 def _sum(view: View) -> tuple[View, View] | None:
@@ -271,7 +280,7 @@ def _softmax(node: ir.Node, view: View, plain: _Found) -> _Found | None:
     if row != (*whole(LEVEL, levels), *whole(POINT, plain.sizes.points)):
         return None
     # Rows that differ by level stand beside each other
-    *outer, repeated, _ = plain.sizes.form([view])
+    *outer, repeated, _ = plain.sizes.form([view], of_camera=False)
     others = math.prod(digit.size for digit in repeated) // levels
     beside = (Digit(LEVEL, levels, others),) if others > 1 else ()
     scores = View(source, view.layout)

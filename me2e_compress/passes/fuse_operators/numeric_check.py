@@ -130,8 +130,8 @@ class Proofs:
 
 
 def _draw(view: View, random: np.random.Generator) -> Array:
-    shape = sizes(view.layout)
+    shape, kind = sizes(view.layout), (view.value.dtype or ir.DataType.FLOAT).numpy()
     if not any(digit.axis == XY for digit in flat(view.layout)):
-        return random.standard_normal(shape).astype(np.float32)
+        return random.standard_normal(shape).astype(kind)
     places = random.uniform(-1 - 2 * OUTSIDE, 1 + 2 * OUTSIDE, shape)
-    return ((places - view.shift) / view.scale).astype(np.float32)
+    return ((places - view.shift) / view.scale).astype(kind)

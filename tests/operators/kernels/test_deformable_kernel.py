@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from me2e_compress.operators import Dialect, kernels
 from me2e_compress.operators.deformable_aggregation import DeformableAggregation
 from me2e_compress.operators.deformable_attention import DeformableAttention
+from me2e_compress.operators.raw_attention import raw_own_form
 from me2e_compress.runtime import runnable
 from me2e_compress.runtime.session import Session
 from tests.operators.running import graph_of
@@ -22,6 +23,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 OPERATOR = DeformableAttention()
+RAW = raw_own_form()
 calls = st.fixed_dictionaries(
     {
         "sizes": st.lists(
@@ -111,6 +113,68 @@ def test_what_has_no_weight_is_not_read() -> None:
 
     assert np.allclose(one, expected, rtol=1e-4, atol=1e-4)
     assert np.array_equal(one, two)
+
+
+def raw_call() -> dict[str, Any]:
+    """Draw 3 cameras of 2 levels, and more heads than the kernel's tables hold."""
+    random = np.random.default_rng(6)
+    shown = random.uniform(size=(1, 90, 1, 3, 1)) < 0.4
+    drawn = {
+        "value": random.normal(size=(1, 36, 23, 8)),
+        "spatial_shapes": np.array([[2, 3], [3, 2]] * 3),
+        "level_start_index": np.arange(6) * 6,
+        "reference_points": random.uniform(-0.1, 1.1, (1, 90, 1, 3, 4, 2)),
+        "sampling_offsets": random.normal(size=(1, 90, 23, 2, 8, 2)) * 0.2,
+        "attention_scores": random.normal(size=(1, 90, 23, 1, 16), scale=9),
+        "mask": np.where(shown, random.uniform(size=shown.shape), 0),
+    }
+    return {
+        name: array.astype(np.float32) if array.dtype == np.float64 else array
+        for name, array in drawn.items()
+    }
+
+
+def test_levels_share_offsets_and_a_camera_without_weight_is_not_read() -> None:
+    arrays = raw_call()
+    arrays["mask"][:, :, :, 1] = 0
+    expected = OPERATOR.dialect_reference(RAW, list(arrays.values()), {})
+    arrays["value"][:, 12:24] = np.nan
+    model = graph_of(RAW, arrays, opset=17)
+    _, needed = runnable.compiled_or_expanded(model, compiled=True)
+    assert [each.op_type for each in needed] == ["RawDeformableAttention"]
+
+    one, two = (Session(model, threads=n).run(arrays)["result"] for n in (1, 2))
+
+    assert np.allclose(one, expected, rtol=1e-4, atol=1e-5)
+    assert np.array_equal(one, two)
+
+
+STORED_RAW = """
+<ir_version: 9, opset_import: ["" : 17, "me2e" : 1]>
+call (uint8[1,36,23,8] value, int64[6,2] sizes, int64[6] starts,
+      float[1,90,1,3,4,2] near, float[1,90,23,2,8,2] away, float[1,90,23,1,16] scores,
+      float[1,90,1,3,1] mask) => (float[1,90,23,8] y)
+<float scale = {0.02}, uint8 zero = {119}> {
+    real = DequantizeLinear(value, scale, zero)
+    y = me2e.RawDeformableAttention(real, sizes, starts, near, away, scores, mask)
+}
+"""
+
+
+def test_int8_values_with_raw_offsets_and_scores() -> None:
+    _, *others = raw_call().values()
+    stored = np.random.default_rng(2).integers(0, 256, (1, 36, 23, 8)).astype(np.uint8)
+    model = ir.from_onnx_text(STORED_RAW)
+    _, needed = runnable.compiled_or_expanded(model, compiled=True)
+    assert [each.op_type for each in needed] == ["RawDeformableAttentionUint8"]
+
+    names = [str(port.name) for port in model.graph.inputs]
+    feeds = dict(zip(names, [stored, *others], strict=True))
+    found = Session(model, threads=1).run(feeds)["y"]
+
+    real = (stored.astype(np.float64) - 119) * 0.02
+    expected = OPERATOR.dialect_reference(RAW, [real, *others], {})
+    assert np.allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
 STORED = """
