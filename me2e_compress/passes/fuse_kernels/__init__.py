@@ -14,7 +14,7 @@ from me2e_compress.graph.nodes import STANDARD
 from me2e_compress.graph.rewrite import remove_dead, replace_value, value_names
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.fuse_kernels import choices, grid_sample
+from me2e_compress.passes.fuse_kernels import grid_sample
 
 __all__ = ["FuseKernels"]
 
@@ -25,11 +25,7 @@ None where the node is no such pattern; a PreconditionError names what an almost
 matching one lacks. Nothing may be written before the last check.
 """
 
-_FUSERS: Mapping[str, Fuser] = {
-    "Concat": choices.fuse,
-    "GridSample": grid_sample.fuse,
-    "Where": choices.fuse,
-}
+_FUSERS: Mapping[str, Fuser] = {"GridSample": grid_sample.fuse}
 """Fusers by the type of the last node of their pattern."""
 
 
