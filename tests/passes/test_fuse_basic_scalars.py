@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from me2e_compress.graph import rank_of
+from me2e_compress.graph import rank_of, static_shape
 from me2e_compress.passes.fuse_basic import FuseBasic
 from tests.passes.small import apply, compute, ops, read
 
@@ -21,7 +21,7 @@ def text_of(body: str, *, x: str = "float[2,600,1]", y: str = "float[M,N,O]") ->
 def constant_rank(text: str, **weights: Any) -> int | None:
     """Apply the pass; return the rank that the constant ``c`` of a node has then."""
     model, before = read(text, **weights), read(text, **weights)
-    shape = [int(dim) for dim in before.graph.inputs[0].shape or ()]
+    shape = static_shape(before.graph.inputs[0]) or ()
     x = RANDOM.normal(size=shape).astype(np.float32)
     apply(FuseBasic(), model)
     (want,), (got,) = compute(before, {"x": x}), compute(model, {"x": x})

@@ -39,8 +39,8 @@ def positions(batch: int, height: int, width: int, count: int) -> Any:
     """Draw positions inside and around a map, none near a tie of nearest pixels."""
     size = np.array([width, height])
     pixels = RANDOM.integers(-2, size + 2, (batch, count, 3, 2))
-    pixels = pixels + RANDOM.uniform(-0.45, 0.45, pixels.shape)
-    return ((2 * pixels + 1) / size - 1).astype(np.float32)
+    places = pixels + RANDOM.uniform(-0.45, 0.45, pixels.shape)
+    return ((2 * places + 1) / size - 1).astype(np.float32)
 
 
 def wanted(image: Any, at: Any, mode: str) -> Any:

@@ -31,6 +31,7 @@ None where the node is no such pattern; a PreconditionError names what an almost
 matching one lacks. Nothing may be written before the last check.
 """
 
+<<<<<<< HEAD
 _FUSERS: Mapping[str, Fuser] = {
     "Conv": fuse_convolution,
     "GridSample": fuse_grid_sample,
@@ -38,6 +39,9 @@ _FUSERS: Mapping[str, Fuser] = {
     "MultiScaleDeformableAttention": fuse_raw_attention,
     "Relu": fuse_rectified_convolution,
 }
+=======
+_FUSERS: Mapping[str, Fuser] = {"GridSample": grid_sample.fuse}
+>>>>>>> c/s28-c
 """Fusers by the type of the last node of their pattern."""
 
 

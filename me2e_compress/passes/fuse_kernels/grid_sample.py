@@ -41,7 +41,7 @@ class _Sizes:
         return self.grid[1] * self.grid[2]
 
 
-def fuse(node: ir.Node, call: FusedCall) -> ir.Value | None:
+def fuse_grid_sample(node: ir.Node, call: FusedCall) -> ir.Value | None:
     """Write a GridSample with constant sizes as deformable attention; [N, C, F, G]."""
     image, grid = node.inputs[:2]
     if image is None or grid is None:

@@ -61,6 +61,7 @@ MOTIFS: Mapping[str, tuple[Motif, float]] = {
     "loop": (bodies.loop, 1),
     "function": (bodies.called, 1),
     "deformable": (deformable.decomposed, 3),
+    "rotated-view": (deformable.rotated_view, 2),
     "plugin": (deformable.plugin, 2),
 }
 """What a graph is composed of, and how often each is drawn beside the others."""

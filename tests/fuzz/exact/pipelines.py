@@ -25,6 +25,8 @@ SLOW = ("fold-with-onnxsim",)
 ORDERS = (
     "fuse-operators, expand-operators",
     "fuse-operators, attach-bodies",
+    "fuse-operators, fuse-kernels, attach-bodies",
+    "fuse-kernels, expand-operators, eliminate-redundant",
     "fuse-basic, hoist-linear, fold-constants, eliminate-redundant",
     "hoist-linear, eliminate-redundant, hoist-linear, fuse-basic",
 )

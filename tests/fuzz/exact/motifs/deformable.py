@@ -99,6 +99,30 @@ def decomposed(b: Builder) -> None:
         sp.reduce(b, b.rng.choice(("ReduceSum", "ReduceMean")), y, [0], keep=False)
 
 
+def rotated_view(b: Builder) -> None:
+    """Sample the last frame's view, [H W, 1, C], where its pixels are now."""
+    if b.opset < 16 or b.is_double:
+        return
+    channels, (height, width) = (
+        b.rng.choice((3, 16, 16)),
+        b.rng.choice(((4, 5), (3, 1))),
+    )
+    rows = b.input((height * width, 1, channels))
+    turned = sp.transpose(b, rows, (1, 2, 0))
+    image = sp.reshape(b, turned, (1, channels, height, width))
+    attributes = {
+        "mode": "bilinear" if b.opset < 20 else "linear",
+        "padding_mode": b.rng.choice(("zeros",) * 5 + ("border",)),
+        "align_corners": int(b.chance(0.1)),
+    }
+    grid, shape = b.input((1, height, width, 2)), (1, channels, height, width)
+    sample = b.op("GridSample", [image, grid], shape, attributes)
+    flat = sp.reshape(b, sample, (1, channels, height * width))
+    sp.transpose(b, flat, (0, 2, 1))
+    if b.chance(0.3):
+        sp.unary(b, sample)
+
+
 def plugin(b: Builder) -> None:
     """Write it as one node of a plugin library."""
     if b.opset < 13 or b.is_double:
