@@ -26,7 +26,7 @@ from me2e_compress.operators.dialect import (
 )
 from me2e_compress.operators.kernels.kernel import DOMAIN
 
-TAPS = 3
+FILTER = 3
 """Rows and columns of a filter."""
 
 
@@ -66,7 +66,7 @@ class WinogradConvolution(Operator):
         batch, out, *image = self._sizes("N K H W", shapes, attributes)
         pads = numbers(attributes, "pads")
         sizes = (
-            None if size is None else size + pads[axis] + pads[axis + 2] - TAPS + 1
+            None if size is None else size + pads[axis] + pads[axis + 2] - FILTER + 1
             for axis, size in enumerate(image)
         )
         return (batch, out, *sizes)
@@ -75,7 +75,7 @@ class WinogradConvolution(Operator):
         """Count those of the convolution, not of the algorithm."""
         made = self.output_shape(shapes, attributes)
         (deep,) = self._sizes("C", shapes, attributes)
-        return None if made is None else product((*made, deep, TAPS, TAPS))
+        return None if made is None else product((*made, deep, FILTER, FILTER))
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
         """Write the kernel's call, or a Conv and a Relu."""
@@ -114,7 +114,9 @@ class WinogradConvolution(Operator):
         )
         top, left, bottom, right = numbers(attributes, "pads")
         padded = np.pad(image, ((0, 0), (0, 0), (top, bottom), (left, right)))
-        taken = np.lib.stride_tricks.sliding_window_view(padded, (TAPS, TAPS), (2, 3))
+        taken = np.lib.stride_tricks.sliding_window_view(
+            padded, (FILTER, FILTER), (2, 3)
+        )
         result: NdArray = np.einsum("nchwij,kcij->nkhw", taken, weight, optimize=True)
         result = result + bias[:, None, None]
         return np.maximum(result, 0) if number(attributes, "relu") else result

@@ -91,10 +91,12 @@ def test_small_images_are_left(given: str) -> None:
     check(graph(f"y = Conv<{PADS}>(x, w, b)", given=given), "Conv")
 
 
-def test_a_sum_with_a_shortcut_is_left_to_onnxruntime() -> None:
+def test_a_sum_with_a_shortcut_makes_it_pay_less() -> None:
     lines = f"c = Conv<{PADS}>(x, w, b)", "s = Add(c, x)", "y = Relu(s)"
 
-    check(graph(*lines), "Conv", "Add", "Relu")
+    check(graph(*lines), FUSED, "Add", "Relu")
+    check(graph(*lines, given="float[1,64,56,56] x"), "Conv", "Add", "Relu")
+    check(graph(f"y{lines[0][1:]}", given="float[1,64,56,56] x"), FUSED)
 
 
 def test_an_image_of_unknown_size_is_a_reason() -> None:

@@ -61,8 +61,7 @@ _ATTENTION = (
 _WINOGRAD = (
     "the inputs have not the ranks that they must: X 4, W 4, B 1, options 1",
     "the inputs do not fit each other: they must be X [N,C,H,W], W [3,3,C,K], B [K] and"
-    " options [5] (four pads, none below 0, and whether negative results become 0), and"
-    " the image with its pads at least 2 x 2",
+    " options [5], and the image with its pads at least 2 x 2",
 )
 
 

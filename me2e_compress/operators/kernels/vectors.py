@@ -139,15 +139,13 @@ def _between(half: int) -> list[int]:
 
 
 def vector_intrinsic(write: Callable[..., None]) -> Any:
-    """Return an intrinsic of seven words that writes instructions."""
+    """Return an intrinsic of a tuple of words that writes instructions."""
 
-    def typed(
-        context: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any
-    ) -> tuple[Any, Callable[..., Any]]:
-        def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            write(Vectors(builder), *given)
+    def typed(context: Any, given: Any) -> tuple[Any, Callable[..., Any]]:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            write(Vectors(builder), *cgutils.unpack_tuple(builder, arguments[0]))
             return context.get_dummy_value()
 
-        return types.void(*[types.intp] * 7), generate
+        return types.void(types.UniTuple(types.intp, len(given))), generate
 
     return intrinsic(typed)

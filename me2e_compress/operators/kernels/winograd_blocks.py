@@ -40,6 +40,9 @@ inputs of 64 channels fit into a second cache of 1 MB."""
 
 PANELS = GROUP // LANES
 
+AHEAD = 4
+"""Channels by which filters are fetched ahead."""
+
 ROW = OUT * TILES + LANES
 """Columns of one row of input tiles of a block."""
 
@@ -82,9 +85,10 @@ def transform_filters(a: Any, panel: int, to: int, plane: int) -> None:
     """Write the transformed filters of one panel."""
     depth, wide = a[C], a[K]
     for c in range(depth):
-        taps = a[FILTERS] + (c * wide + panel * LANES) * 4
+        elements = a[FILTERS] + (c * wide + panel * LANES) * 4
         at = to + c * LANES * 4
-        filters(taps, depth * wide, wide - panel * LANES, at, plane, 0, 0)
+        count = wide - panel * LANES
+        filters((elements, depth * wide, count, at, plane, AHEAD * wide))
 
 
 @compiled
@@ -102,10 +106,10 @@ def transform_inputs(a: Any, block: int, c: int, to: int) -> None:
         image = a[X] + (n * a[C] + c) * a[H] * a[W] * 4
         y, x = down * OUT - a[TOP], across * OUT - a[LEFT]
         for k in range(0, OUT * count + SIDE - OUT, LANES):
-            input_rows(image, y, a[H], x + k, a[W], rows + k * 4, ROW)
+            input_rows((image, y, a[H], x + k, a[W], rows + k * 4, ROW))
         for k in range(0, count, LANES):
             at = to + (tile - start + k) * 4
-            input_columns(rows + k * OUT * 4, ROW, at, plane, count - k, 0, 0)
+            input_columns((rows + k * OUT * 4, ROW, at, plane, count - k))
         tile += count
 
 
@@ -139,8 +143,6 @@ def write_outputs(a: Any, block: int, channel: int, m: int) -> None:
         columns = min(count * OUT, a[WIDE] - x)
         for k in range(0, count, LANES):
             products, at = m + (tile - start + k) * 4, to + k * OUT * 4
-            outputs(
-                products, PRODUCT_PLANE, address_of(ends),
-                at, a[WIDE], a[HIGH] - y, columns - k * OUT,
-            )  # fmt: skip
+            limits = (a[WIDE], a[HIGH] - y, columns - k * OUT, a[HIGH] * a[WIDE])
+            outputs((products, PRODUCT_PLANE, address_of(ends), at, *limits))
         tile += count

@@ -1,8 +1,8 @@
 """The kernel of 3x3 convolutions by Winograd's algorithm.
 
-What is smaller, the transformed filters or inputs, is written first, for all. Then each
-piece of work transforms some of the other, and multiplies it with all of the first,
-while that is in the caches: a block of tiles, or a group of output channels.
+The transformed filters, if they are few, or else the inputs, are written first, for
+all. Then each piece of work transforms some of the other, and multiplies it with all of
+the first, while that is in the caches: a block of tiles, or a group of output channels.
 """
 
 from collections.abc import Callable, Mapping
@@ -54,7 +54,7 @@ from me2e_compress.operators.kernels.winograd_blocks import (
     transform_inputs,
     write_outputs,
 )
-from me2e_compress.operators.kernels.winograd_transforms import OUT, PRODUCTS, TAPS
+from me2e_compress.operators.kernels.winograd_transforms import FILTER, OUT, PRODUCTS
 
 STRIPS = 16
 """Threads that can work at once: each has memory of its own."""
@@ -65,8 +65,8 @@ WORDS = 23
 
 RANKS = (4, 4, 1, 1)
 RANK_WRONG, SIZE_WRONG = range(2)
-PADS, NUMBERS = 4, 5
-"""Numbers of the options that are pads, and all of them."""
+NUMBERS = 5
+"""Numbers of the options: four pads, and whether negative results become 0."""
 
 _words = stack(types.int64, WORDS)
 _inputs = stack(types.int64, EACH * len(RANKS))
@@ -132,16 +132,13 @@ def _block(user: int, index: int) -> Word:
 def _sizes(a: Any, x: Any) -> Word:
     """Write the sizes of a call; return the index of a message, or -1."""
     a[N], a[C], a[H], a[W], a[K] = x[0], x[1], x[2], x[3], x[EACH + 3]
-    filters = x[EACH] == TAPS and x[EACH + 1] == TAPS and x[EACH + 2] == a[C]
+    filters = x[EACH] == FILTER and x[EACH + 1] == FILTER and x[EACH + 2] == a[C]
     if not filters or x[2 * EACH] != a[K] or x[3 * EACH] != NUMBERS:
         return SIZE_WRONG
     pads = words(a[OPTIONS])
     a[TOP], a[LEFT] = pads[0], pads[1]
-    a[HIGH] = a[H] + pads[0] + pads[2] - TAPS + 1
-    a[WIDE] = a[W] + pads[1] + pads[3] - TAPS + 1
-    for k in range(PADS):
-        if pads[k] < 0:
-            return SIZE_WRONG
+    a[HIGH] = a[H] + pads[0] + pads[2] - FILTER + 1
+    a[WIDE] = a[W] + pads[1] + pads[3] - FILTER + 1
     if a[HIGH] < 0 or a[WIDE] < 0:
         return SIZE_WRONG
     a[DOWN], a[ACROSS] = part(a[HIGH], OUT), part(a[WIDE], OUT)
@@ -152,11 +149,11 @@ def _sizes(a: Any, x: Any) -> Word:
 @compiled
 def _run(t: Any, context: int, a: Any) -> Word:
     """Run both stages on the session's threads."""
-    # Share what is smaller
+    # Filters are read again for each block, inputs for each group
     panels, held = part(a[K], LANES), _held()
     filters = PRODUCTS * filter_plane(a[C], panels) * 4
     inputs = PRODUCTS * input_plane(a[C]) * 4
-    a[BY_BLOCK] = filters <= a[BLOCKS] * inputs
+    a[BY_BLOCK] = 2 * filters <= a[BLOCKS] * inputs
     # Memory for that, and for each part of the work
     shared, own, pieces = filters, inputs, a[BLOCKS]
     if not a[BY_BLOCK]:
