@@ -26,14 +26,14 @@ from benchmarks.processes import in_turn
 from me2e_compress.runtime.profile import processor
 
 FORMS = {
-    "QGemm, float32": ("QGemm(x, xs, z, w, ws, wz, b)", "float"),
-    "QGemm, uint8": ("QGemm(x, xs, z, w, ws, wz, b, xs, z)", "uint8"),
+    "QGemm, float32": ("com.microsoft.QGemm(x, xs, z, w, ws, wz, b)", "float"),
+    "QGemm, uint8": ("com.microsoft.QGemm(x, xs, z, w, ws, wz, b, xs, z)", "uint8"),
     "MatMulIntegerToFloat": (
-        "MatMulIntegerToFloat(x, w, xs, ws, z, wz, bias)",
+        "com.microsoft.MatMulIntegerToFloat(x, w, xs, ws, z, wz, bias)",
         "float",
     ),
-    "MatMulInteger": ("ai.onnx.MatMulInteger(x, w, z)", "int32"),
-    "QLinearMatMul": ("ai.onnx.QLinearMatMul(x, xs, z, w, ws, wz, xs, z)", "uint8"),
+    "MatMulInteger": ("MatMulInteger(x, w, z)", "int32"),
+    "QLinearMatMul": ("QLinearMatMul(x, xs, z, w, ws, wz, xs, z)", "uint8"),
 }
 """Kernels of products, and what they give."""
 
@@ -75,7 +75,7 @@ class Convolution:
             f" strides=[{self.stride},{self.stride}],"
             f" pads=[{before},{before},{behind},{behind}]"
         )
-        call = f"QLinearConv<{options}>(x, xs, z, w, ws, wz, xs, z, b)"
+        call = f"com.microsoft.QLinearConv<{options}>(x, xs, z, w, ws, wz, xs, z, b)"
         return _text(size, call, "uint8")
 
 
@@ -100,15 +100,13 @@ def resnet() -> Iterator[Convolution]:
 
 def _text(size: str, call: str, kind: str) -> str:
     return f"""<ir_version: 9, opset_import: ["" : 17, "com.microsoft" : 1]>
-    g (uint8[{size}] x) => ({kind}[N] y) {{ y = com.microsoft.{call} }}""".replace(
-        "com.microsoft.ai.onnx.", ""
-    )
+    layer (uint8[{size}] x) => ({kind}[N] y) {{ y = {call} }}"""
 
 
 def session(text: str, filter_shape: Sequence[int], axis: int) -> ort.InferenceSession:
     """Open one layer with weights of its shape, its channels along an axis."""
     model = onnx.parser.parse_model(text)
-    del model.graph.output[0].type.tensor_type.shape.dim[:]
+    model.graph.output[0].type.tensor_type.ClearField("shape")
     random = np.random.default_rng(0)
     channels = filter_shape[axis]
     constants: dict[str, npt.NDArray[Any]] = {
@@ -132,6 +130,12 @@ def session(text: str, filter_shape: Sequence[int], axis: int) -> ort.InferenceS
     )
 
 
+def product(form: str, rows: int, size: tuple[int, int]) -> ort.InferenceSession:
+    """Open a product of ``rows`` by [K, N] in one of its forms."""
+    call, kind = FORMS[form]
+    return session(_text(f"{rows},{size[0]}", call, kind), size, 1)
+
+
 def milliseconds(sessions: dict[str, ort.InferenceSession], rounds: int) -> list[float]:
     """Time layers in turn on random pixels: the least CPU time of each."""
     random = np.random.default_rng(1)
@@ -149,10 +153,7 @@ def measured(rounds: int) -> list[tuple[str, float, float]]:
     for rows, depth, columns in PRODUCTS:
         name = f"[{rows}, {depth}] x [{depth}, {columns}]"
         forms = {
-            f"{name}, {form}": session(
-                _text(f"{rows},{depth}", call, kind), (depth, columns), 1
-            )
-            for form, (call, kind) in FORMS.items()
+            f"{name}, {form}": product(form, rows, (depth, columns)) for form in FORMS
         }
         pixels = Convolution("", 1, rows, 1, depth, columns)
         forms[f"{name}, QLinearConv"] = session(

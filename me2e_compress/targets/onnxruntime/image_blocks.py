@@ -7,7 +7,7 @@ Both add up the same products; w' has zeros where a block reaches beyond w. onnx
 reads the pixels of a QLinearConv in place only if four channels or a multiple of them
 lie side by side. With three it copies every window first, and a ResNet's first layer
 runs at a quarter of the processor's int8 rate; so at two thirds
-(``benchmarks/bench_levers.py``). ONNX defines the order of the channels under
+(``benchmarks/bench_int8_shapes.py``). ONNX defines the order of the channels under
 `SpaceToDepth <https://onnx.ai/onnx/operators/onnx__SpaceToDepth.html>`_.
 """
 
@@ -31,15 +31,15 @@ class Blocks:
 
     Attributes:
         size: pixels along a side of a block.
-        zeros: taps of the new filter before the first of the old one.
-        taps: blocks that the filter covers.
+        zeros: rows and columns of the new filter before the old one.
+        covered: blocks that the new filter covers.
         pads: blocks of padding before and behind the image, in the order of ONNX:
             before height and width, then behind.
     """
 
     size: int
     zeros: tuple[int, int]
-    taps: tuple[int, int]
+    covered: tuple[int, int]
     pads: tuple[int, int, int, int]
 
 
@@ -71,31 +71,31 @@ def blocks_of(node: ir.Node) -> Blocks | None:
         return None
     axes = zip(lengths, weight[2:], pads[:2], pads[2:], strict=True)
     sides = [_side(size, *axis) for axis in axes]
-    zeros, taps, before, behind = zip(*sides, strict=True)
-    return Blocks(size, zeros, taps, (*before, *behind))
+    zeros, covered, before, behind = zip(*sides, strict=True)
+    return Blocks(size, zeros, covered, (*before, *behind))
 
 
 def _side(
     size: int, length: int, kernel: int, before: int, behind: int
 ) -> tuple[int, int, int, int]:
-    """Return zeros, taps and padding in blocks along one axis."""
+    """Return zeros, and in blocks what is covered and padded, along one axis."""
     first = -(-before // size)
     zeros = first * size - before
-    taps = -(-(zeros + kernel) // size)
+    covered = -(-(zeros + kernel) // size)
     steps = (length + before + behind - kernel) // size + 1
-    return zeros, taps, first, steps - 1 + taps - first - length // size
+    return zeros, covered, first, steps - 1 + covered - first - length // size
 
 
 def filter_of_blocks(weight: QuantizedWeight, cut: Blocks) -> QuantizedWeight:
     """Return a filter [O, C, k, k] as one over blocks, [O, size * size * C, k', k']."""
     outputs, channels, high, wide = weight.integers.shape
-    size, taps = cut.size, cut.taps
-    whole = np.zeros((outputs, channels, taps[0] * size, taps[1] * size), np.int8)
+    size, covered = cut.size, cut.covered
+    whole = np.zeros((outputs, channels, covered[0] * size, covered[1] * size), np.int8)
     top, left = cut.zeros
     whole[:, :, top : top + high, left : left + wide] = weight.integers
     # A block's pixels come first among the channels, the image's channels last.
-    split = whole.reshape(outputs, channels, taps[0], size, taps[1], size)
-    integers = split.transpose(0, 3, 5, 1, 2, 4).reshape(outputs, -1, *taps)
+    split = whole.reshape(outputs, channels, covered[0], size, covered[1], size)
+    integers = split.transpose(0, 3, 5, 1, 2, 4).reshape(outputs, -1, *covered)
     name = f"{weight.name}_blocks"
     return dataclasses.replace(
         weight, name=name, integers=np.ascontiguousarray(integers)
@@ -120,7 +120,7 @@ def read_blocks(writer: Writer, node: ir.Node, cut: Blocks) -> ir.Value:
     # The stride is in the blocks now.
     node.replace_input_with(0, blocks)
     node.attributes.pop("strides", None)
-    node.attributes.add(ir.AttrInt64s("kernel_shape", cut.taps))
+    node.attributes.add(ir.AttrInt64s("kernel_shape", cut.covered))
     node.attributes.add(ir.AttrInt64s("pads", cut.pads))
     provenance.inherit(node, [node], by=BY)
     return blocks
