@@ -3,11 +3,11 @@
     python -m benchmarks.bench_hoisting
 
 Parts of VAD-tiny as they are exported and behind the pass: the keys of the motion
-decoder, motion's attention to the map as the original code has it (keys and values
-written for every agent and mode), the sampling places of the spatial cross attention
-(10,000 queries for six cameras), the rows of a planner of which one is stored. CPU time of onnxruntime on two
-threads, the least of rounds that alternate. First, how long the pass itself takes on
-graphs of more and more products of repeated rows.
+decoder, its attention to the map as the original code has it (keys and values written
+for every agent and mode), the sampling places of the spatial cross attention (10,000
+queries for six cameras), the rows of a planner of which one is stored. CPU time of
+onnxruntime on two threads, the least of rounds that alternate. First, how long the pass
+itself takes on graphs of more and more products of repeated rows.
 """
 
 import time
