@@ -68,6 +68,19 @@ def test_values_are_what_the_batch_shares_and_positions() -> None:
     assert products(model) == B * H * T * J * (D + 2) + B * H * T * 2 * D
 
 
+def test_keys_of_positions_alone_are_not_made_wide() -> None:
+    model = hoist(
+        graph_of(
+            f"(float[{B},{H},{T},{D}] q, float[{B},{J},2] position)"
+            f" => (float[{B},{H},{T},{J}] y)",
+            "wide = MatMul(position, w)  split = Reshape(wide, heads)"
+            " turned = Transpose<perm = [0, 2, 3, 1]>(split)  y = MatMul(q, turned)",
+        ),
+        w=normal(2, WIDE), heads=integers(B, J, H, D),
+    )  # fmt: skip
+    assert products(model) == B * H * T * 2 * (D + J)
+
+
 STAY = {
     "keys that something else reads": (
         "keys = Add(map, wide)  more = Relu(keys)  split = Reshape(keys, heads)"

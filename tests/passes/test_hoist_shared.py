@@ -3,15 +3,12 @@
 from typing import Any
 
 import numpy as np
-import onnx_ir as ir
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress import graph
 from me2e_compress.graph import static_shape
 from me2e_compress.passes.hoist_linear import HoistLinear
-from me2e_compress.passes.hoist_linear.shared_rows import shared_along
 from tests.passes.hoisted import RANDOM, graph_of, hoist, integers, normal, products
 from tests.passes.small import apply, compute, ops, read
 
@@ -98,56 +95,6 @@ def test_stored_rows_that_differ_are_not_the_same_for_the_batch() -> None:
     model = hoist(graph_of(f"{SIGNATURE})", BODY), **stored)
     wide = (J, B, WIDE)
     assert any(static_shape(node.outputs[0]) == wide for node in model.graph)
-
-
-SAME = {
-    "x = Expand(a, two)": 0,  # of [1, 2, 3]: [2, 2, 3]
-    "b = Expand(a, two)  x = Reshape(b, halves)": 0,  # to [2, 1, 6]
-    "b = Expand(a, two)  x = Transpose<perm = [1, 2, 0]>(b)": 2,
-    "b = Expand(a, two)  x = Concat<axis = 1>(b, b)": 0,
-    "x = Identity(stored)": 1,
-}
-DIFFERENT = {
-    "x = Concat<axis = 0>(a, twice)": 0,
-    "b = Expand(a, two)  x = Reshape(b, halves)": 2,
-    "b = Expand(a, two)  x = Reshape(b, pairs)": 1,
-    "b = Expand(a, two)  x = Relu(b)": 0,
-    "x = Identity(stored)": 0,
-    "b = Tile(a, both)  x = Identity(b)": 1,
-}
-
-
-@pytest.mark.parametrize("body", SAME)
-def test_an_axis_of_equal_entries_is_found(body: str) -> None:
-    x, axis = _value(body), SAME[body]
-    found = shared_along(x, axis)
-    assert found is not None
-    assert found.shape[axis] == 1
-
-
-@pytest.mark.parametrize("body", DIFFERENT)
-def test_an_axis_of_other_entries_is_not_shared(body: str) -> None:
-    assert shared_along(_value(body), DIFFERENT[body]) is None
-
-
-def test_repetitions_that_something_else_reads_do_not_go() -> None:
-    x = _value("b = Expand(a, two)  c = Relu(b)  x = Identity(b)")
-    found = shared_along(x, 0)
-    assert found is not None
-    assert [node.op_type for node in found.nodes] == ["Identity"]
-
-
-def _value(body: str) -> ir.Value:
-    """Build x of a [1, 2, 3]; another node reads it, as a product would."""
-    held = {
-        "two": integers(2, 2, 3), "halves": integers(2, 1, 6),
-        "both": integers(1, 2, 1), "pairs": integers(6, 2, 1),
-        "twice": normal(1, 2, 3), "stored": np.repeat(normal(3, 1, 2), 4, 1),
-    }  # fmt: skip
-    text = graph_of("(float[1,2,3] a) => (float[A,B,C] y)", body + "  y = Neg(x)")
-    model = read(text, **held)
-    graph.infer_shapes(model)
-    return next(v for node in model.graph for v in node.outputs if v.name == "x")
 
 
 @settings(max_examples=40, deadline=None)

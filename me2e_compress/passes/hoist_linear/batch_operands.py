@@ -4,9 +4,8 @@ Given:   keys = A + p P, A the same for every batch;  MatMul(q, heads of keys)
 
 Result:  MatMul(q, heads of A) + MatMul(MatMul(q, heads of P), p)
 
-Terms shared by the batch need not be repeated (they may be: an exporter writes A for
-every batch entry, behind stored rows), and a term of few columns (positions: two) is
-multiplied by the queries before it becomes wide.
+Terms shared by the batch need not be repeated, and a term of few columns (positions:
+two) is multiplied by the queries before it becomes wide.
 """
 
 import dataclasses
@@ -21,7 +20,7 @@ from me2e_compress.passes.hoist_linear.least_work import terms_of
 from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
 from me2e_compress.passes.hoist_linear.node_writer import NodeWriter
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
-from me2e_compress.passes.hoist_linear.shared_rows import Shared, shared_along
+from me2e_compress.passes.hoist_linear.row_moves import without_repeats
 from me2e_compress.passes.work import work
 
 READ = "something else reads them, or the layer behind a term"
@@ -34,7 +33,7 @@ class BatchOperand:
     """The right operand of a batched product: shared terms and narrow layers."""
 
     layout: HeadLayout
-    shared: tuple[Shared, ...]
+    shared: tuple[ir.Value, ...]
     narrow: tuple[LinearLayer, ...]
     nodes: tuple[ir.Node, ...]
 
@@ -79,7 +78,7 @@ def _operand(product: ir.Node) -> BatchOperand | str | None:
         rows, layer = _shared(value, layout), layer_behind(value)
         if rows is not None:
             shared.append(rows)
-            nodes.extend(rows.nodes)
+            nodes.extend(_repetition(value, rows))
         elif layer is not None and layout.is_whole(static_shape(layer.source)):
             narrow.append(layer)
             nodes.extend(layer.nodes)
@@ -91,7 +90,7 @@ def _operand(product: ir.Node) -> BatchOperand | str | None:
         sole_reader(each.outputs[0]) is None for one in narrow for each in one.nodes
     ):
         return READ
-    if not shared and (not sums or any(layer.bias() is not None for layer in narrow)):
+    if not shared and any(layer.bias() is not None for layer in narrow):
         return None
     return BatchOperand(layout, tuple(shared), tuple(narrow), tuple(nodes))
 
@@ -108,11 +107,17 @@ def _reason(layout: HeadLayout, fits: bool) -> str | None:
     return READ if any(each is not None for each in found) else None
 
 
-def _shared(value: ir.Value, layout: HeadLayout) -> Shared | None:
-    shape = static_shape(value)
-    if not layout.is_shared(shape) and not layout.has_rows(shape):
-        return None
-    return shared_along(value, layout.batch_axis)
+def _shared(value: ir.Value, layout: HeadLayout) -> ir.Value | None:
+    """Return the rows that a term has for every batch entry, or repeats for each."""
+    sources = (value, without_repeats(value))
+    return next((v for v in sources if layout.is_shared(static_shape(v))), None)
+
+
+def _repetition(value: ir.Value, rows: ir.Value) -> tuple[ir.Node, ...]:
+    """Return the node that repeats rows, if only the term needs it."""
+    node = value.producer()
+    owned = value is not rows and sole_reader(value) is not None
+    return (node,) if owned and node is not None else ()
 
 
 def _terms(value: ir.Value) -> tuple[list[ir.Value], list[ir.Node]]:
@@ -164,7 +169,7 @@ class _Writer(NodeWriter):
         # One product with the sum of what the batch shares, the biases among it
         shared: ir.Value | None = None
         for rows in self.found.shared:
-            shared = self.plus(shared, rows.write(self))
+            shared = self.plus(shared, rows)
         for layer in self.found.narrow:
             bias = layer.bias()
             if bias is not None:

@@ -42,10 +42,6 @@ class HeadLayout:
         """Return whether rows of this shape are the same for every batch."""
         return shape is not None and shape == self._rows(1, self.heads * self.channels)
 
-    def has_rows(self, shape: tuple[int, ...] | None) -> bool:
-        """Return whether every batch has rows of this shape, shared or not."""
-        return shape == self._rows(self.batch, self.heads * self.channels)
-
     def is_whole(self, shape: tuple[int, ...] | None) -> bool:
         """Return whether every batch has such rows, of fewer columns."""
         if not shape or shape[-1] >= self.channels:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
-from me2e_compress.graph.rewrite import Array, holds_numbers, numbers_of
+from me2e_compress.graph.rewrite import Array
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 
 
@@ -42,12 +42,9 @@ class NodeWriter:
         )
 
     def shape(self, value: ir.Value, shape: tuple[int, ...]) -> ir.Value:
-        """Reshape; a constant becomes another one, and an equal shape stays."""
+        """Reshape; nothing is written where the shape stays."""
         if static_shape(value) == shape:
             return value
-        numbers = numbers_of(value) if holds_numbers(value) else None
-        if numbers is not None:
-            return self.constant(numbers.reshape(shape), value.name or "constant")
         target = self.rewriter.target(shape, f"{self.sources[0].name}_shape")
         return self.write("Reshape", [value, target], shape)
 
