@@ -197,6 +197,17 @@ def test_near_misses_stay_and_say_why(old: str, new: str, why: str) -> None:
     assert not any(find(node) for node in model.graph)
 
 
+def test_a_query_that_is_a_vector_stays() -> None:
+    model = read(
+        HEAD + f"m (float[{C}] q, float[{C},{K}] k, float[{K},{C}] v) => (float[{C}] y)"
+        "{ b = MatMul(q, k) w = Softmax<axis=-1>(b) y = MatMul(w, v) }"
+    )
+
+    (note,) = apply(FuseKernels(), model).notes
+
+    assert note.endswith("one of its operands is a vector")
+
+
 def test_attention_maps_that_are_outputs_stay() -> None:
     model = written("heads in the batch")
     (softmax,) = (node for node in model.graph if node.op_type == "Softmax")

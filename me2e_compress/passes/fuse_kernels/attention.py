@@ -108,6 +108,8 @@ def _checked(found: _Attention, softmax: ir.Node) -> _Shape:
     query, key, value = shapes
     if query is None or key is None or value is None:
         raise PreconditionError("its shapes are not known")
+    if min(map(len, (query, key, value))) < 2:
+        raise PreconditionError("one of its operands is a vector")
     if any(maker(each, "DequantizeLinear") for each in found.operands):
         raise PreconditionError("its products are int8")
     if any(each.dtype != ir.DataType.FLOAT for each in found.operands):
