@@ -75,7 +75,7 @@ def opened_before(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
         return
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(first_opening, "try_apart", lambda *_, **__: 0.0)
+        patch.setattr(first_opening, "try_apart", lambda *_, **__: None)
         yield
 
 

@@ -5,6 +5,7 @@ On outputs that a graph draws anew at every run nothing can be compared.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Protocol, TypeAlias
 
 import onnx_ir as ir
 
@@ -14,10 +15,27 @@ from me2e_compress.manager import runtime_levels
 from me2e_compress.manager.output_errors import errors, tolerances
 from me2e_compress.manager.report import Verification
 from me2e_compress.manager.verification_inputs import Outputs, VerificationInputs
+from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session, replay
 
 NUDGES = 3
 """How often inputs are nudged to see what rounding alone does to an output."""
+
+Answers: TypeAlias = Sequence[Outputs]
+"""What a graph gave, frame by frame."""
+
+Known: TypeAlias = tuple[Answers | None, Answers | None]
+"""What the graph before and the one after gave; None where they are to be run."""
+
+
+class TryFirst(Protocol):
+    """Opens a graph before this process does."""
+
+    def __call__(
+        self, model: ir.Model, name: str, *, frames: Sequence[Frame]
+    ) -> Answers | None:
+        """Return what it answered on frames, if it was run on them; may refuse it."""
+        ...
 
 
 def verify(
@@ -25,8 +43,11 @@ def verify(
     before: ir.Model,
     after: ir.Model,
     inputs: VerificationInputs,
+    known: Known = (None, None),
 ) -> Verification:
     """Compare two graphs on the same inputs; one that no longer runs differs by inf.
+
+    ``known`` is what they answered before, who is then not run again.
 
     An output that is drawn anew at every run tells nothing about the passes, and is
     named; so is one that differs but that rounding alone moves as far: inputs that
@@ -34,10 +55,12 @@ def verify(
     What differs still is compared again without onnxruntime's own optimizations
     (:mod:`me2e_compress.manager.runtime_levels`).
     """
-    left = list(inputs.run(before))  # its session is gone before the next one opens
+    answers, changed = known
+    # a session is gone before the next one opens
+    left = list(inputs.run(before)) if answers is None else answers
     allowed = tolerances(left[0])
     try:
-        gaps = errors(left, inputs.run(after))
+        gaps = errors(left, inputs.run(after) if changed is None else changed)
     except GraphError:
         gaps = dict.fromkeys(left[0], float("inf"))
     found = Verification(

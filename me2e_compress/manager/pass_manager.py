@@ -11,6 +11,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import (
     GraphError,
     Me2eError,
@@ -21,9 +22,10 @@ from me2e_compress.errors import (
 from me2e_compress.graph.opset import lowered
 from me2e_compress.manager import equivalence, pass_contract, reproducer
 from me2e_compress.manager.attempt import attempt
+from me2e_compress.manager.equivalence import Answers, TryFirst
 from me2e_compress.manager.recipe import to_text
 from me2e_compress.manager.report import LossyPass, Report, Step, Verification
-from me2e_compress.manager.verification_inputs import VerificationInputs
+from me2e_compress.manager.verification_inputs import VerificationInputs, first_frames
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize, needs_import
 
@@ -45,14 +47,18 @@ class PassManager:
         reproducers: the folder that a failing pass leaves its reproducer in.
         samples: recorded frames that exact passes are checked on where the context has
             none; None makes seeded inputs up then.
-        try_first: called with a graph and its name before it is run; may refuse it.
+        try_first: called with a graph, its name and frames before it is run on them;
+            may refuse it, and may return what it answered.
+        answers: what the graph that is run answers on the first ``verify_frames``
+            recorded frames, where that is known.
     """
 
     passes: tuple[Pass, ...]
     verify_frames: int = 2
     reproducers: Path | None = None
     samples: CalibrationSet | None = None
-    try_first: Callable[[ir.Model, str], None] | None = None
+    try_first: TryFirst | None = None
+    answers: Answers | None = None
 
     def run(
         self, model: ir.Model, context: Context, progress: Progress | None = None
@@ -134,6 +140,8 @@ class _Books:
         self._unchecked: list[str] = []
         self._size = graph.size(checkpoint)
         self._digest = graph.digest(checkpoint)
+        self._source = self._digest
+        self._came_in = checkpoint  # or an unchanged copy of it
 
     def transact(self, current: Pass, model: ir.Model) -> ir.Model:
         """Run one pass on a clone; return the clone only if all checks hold.
@@ -148,6 +156,8 @@ class _Books:
             raise self._with_reproducer(current, model, found) from found.__cause__
         if isinstance(found, Me2eError):
             raise found
+        if self._digest == self._source:
+            self._came_in = model
         # Commit: what the next pass is given has its shapes, and is hashed once.
         result, self._digest = found.result, found.digest
         self._enter(current, result, process_time() - start)
@@ -167,9 +177,13 @@ class _Books:
             self.verifications.append(equivalence.skipped(names, NOT_ASKED))
         if not stretch:
             return
+        # what onnxruntime dies of is refused here, not merely unproven
+        answers = None
         if self.manager.try_first is not None:
-            self.manager.try_first(model, f"the graph after {stretch[-1][0].name}")
-        found, runnable, inputs = self._compare(stretch, model)
+            fed = first_frames(self._frames(), self.manager.verify_frames)
+            what = f"the graph after {stretch[-1][0].name}"
+            answers = self.manager.try_first(model, what, frames=fed)
+        found, runnable, inputs = self._compare(stretch, model, answers)
         self.verifications.append(found)
         if equivalence.passed(found) or inputs is None:
             return
@@ -183,19 +197,20 @@ class _Books:
         raise self._with_reproducer(current, guilty, error)
 
     def _compare(
-        self, stretch: Stretch, model: ir.Model
+        self, stretch: Stretch, model: ir.Model, answers: Answers | None
     ) -> tuple[Verification, Stretch, VerificationInputs | None]:
         """Compare with the earliest graph that runs (import may make it runnable)."""
-        context, count = self.context, self.manager.verify_frames
-        frames = context.frames or self.manager.samples
-        reason = ""
+        context, frames = self.context, self._frames()
+        count, reason = self.manager.verify_frames, ""
         for first, (_, before) in enumerate(stretch):
             names = tuple(current.name for current, _ in stretch[first:])
             try:
                 inputs = VerificationInputs.of(
                     before, frames, context.seed, count, model, context.provider
                 )
-                found = equivalence.verify(names, before, model, inputs)
+                came_in = before is self._came_in
+                known = (self.manager.answers if came_in else None, answers)
+                found = equivalence.verify(names, before, model, inputs, known)
             except (GraphError, PreconditionError) as error:
                 reason = reason or str(error)
                 continue
@@ -203,6 +218,9 @@ class _Books:
             return found, stretch[first:], inputs
         names = tuple(current.name for current, _ in stretch)
         return equivalence.skipped(names, reason), stretch, None
+
+    def _frames(self) -> Recording | None:
+        return self.context.frames or self.manager.samples
 
     def _leave_out(self, stretch: Stretch, reason: str) -> None:
         """Say what is not proven since the graph did not run before it.

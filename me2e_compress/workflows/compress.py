@@ -254,12 +254,14 @@ class Compression:
         start, options, listener = process_time(), self.options, self.listener
         source, model = loaded.path, loaded.model
         seen = frames.calibration or frames.samples
-        first = partial(try_first, listener=listener, provider=options.provider)
-        first(model, source.name, file=loaded.file, frames=seen)
+        count, provider = options.verify_frames or 1, options.provider
+        first = partial(try_first, listener=listener, count=count, provider=provider)
+        answers = first(model, source.name, file=loaded.file, frames=seen)
         # apply the passes, and refuse a result that is unproven or not int8
         context = Context(modules, frames.calibration, options.seed, options.provider)
+        checked, samples = options.verify_frames, frames.samples
         manager = PassManager(
-            passes, options.verify_frames, self.reproducers, frames.samples, first
+            passes, checked, self.reproducers, samples, first, answers
         )
         report = manager.run(model, context, partial(listener.on_progress, "passes"))
         _refuse_unproven(report, options)

@@ -3,20 +3,22 @@
 Native code that divides the least integer by -1, or overflows the stack, kills its
 process without a message. The verdict on a graph is stored by its digest: the same
 graph is not tried again on this machine. The process runs ``opening_main.py``, which
-imports nothing of this package: so it starts in 0.3 s, not in 1.6.
+imports nothing of this package: so it starts in 0.3 s, not in 1.6. What the graph
+answered there is handed back, so that nobody has to open and run it again for that.
 """
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import signal
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from time import perf_counter
 
-import numpy as np
 import onnx_ir as ir
 import onnxruntime as ort
 import platformdirs
@@ -24,19 +26,35 @@ import platformdirs
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import LoadedModel
+from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.operators.kernels import why_not
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.children import run_script
-from me2e_compress.runtime.frames import Array, Frames
+from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import compiled_or_expanded, unsupported
+from me2e_compress.workflows import opening_main
 from me2e_compress.workflows.listener import Listener
 
 STAGE = "first opening"
-_SCRIPT = Path(__file__).with_name("opening_main.py")
+_SCRIPT = Path(opening_main.__file__)
 _SURVIVED = {"onnxruntime": ort.__version__, "survived": True}
 _REFUSED = (0, 1)
 """Exit codes of a script that ended by itself: an exception gives 1."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FirstRun:
+    """What opening a graph in a separate process gave.
+
+    Attributes:
+        seconds: how long it took.
+        answers: its outputs, frame by frame; None where they are not those that a
+            session here would give: it did not run, or lacked an input.
+    """
+
+    seconds: float
+    answers: tuple[Mapping[str, Array], ...] | None = None
 
 
 def try_first(
@@ -45,27 +63,32 @@ def try_first(
     listener: Listener,
     *,
     file: Path | None = None,
-    frames: Frames | None = None,
+    frames: Frames | Sequence[Frame] | None = None,
+    count: int = 1,
     provider: Provider = CPU,
-) -> None:
-    """Open a graph in another process, if it is new here, and run its first frame.
+) -> tuple[Mapping[str, Array], ...] | None:
+    """Open a graph in another process, if it is new here, and run its first frames.
 
-    `file` holds the same graph as `model`; without `frames` the graph is only opened.
-    The listener is told how long this took, since no other time includes it. Providers
-    other than the plain CPU are not tried: what they do to a graph does not follow from
-    it.
+    `file` holds the same graph as `model`; without `frames` the graph is only opened,
+    else it runs the first `count`. The listener is told how long this took, since no
+    other time includes it. Providers other than the plain CPU are not tried: what they
+    do to a graph does not follow from it.
+
+    Returns:
+        What it answered on those frames; None where it was not run for that.
 
     Raises:
         GraphError: onnxruntime crashes on the graph.
     """
     if provider != CPU:
-        return
-    first = None if frames is None else next(iter(frames), None)
-    feeds = None if first is None else first.arrays
+        return None
+    fed = () if frames is None else tuple(islice(frames, count))
     begins = partial(listener.on_progress, STAGE, 0, 1, name)
-    seconds = try_apart(model, name, file=file, feeds=feeds, on_begin=begins)
-    if seconds:
-        listener.on_progress(STAGE, 1, 1, f"{name}: {seconds:.1f} s")
+    found = try_apart(model, name, file=file, frames=fed, on_begin=begins)
+    if found is None:
+        return None
+    listener.on_progress(STAGE, 1, 1, f"{name}: {found.seconds:.1f} s")
+    return found.answers
 
 
 def try_model(
@@ -103,18 +126,17 @@ def try_apart(
     name: str,
     *,
     file: Path | None = None,
-    feeds: Mapping[str, Array] | None = None,
+    frames: Sequence[Frame] = (),
     memory: Path | None = None,
     on_begin: Callable[[], None] = lambda: None,
-) -> float:
-    """Open a graph, and run it once, in a separate process, unless it is known.
+) -> FirstRun | None:
+    """Open a graph, and run frames, in a separate process, unless it is known.
 
-    Opening takes 0.3 s more than a session takes; running adds one inference. A graph
+    Opening takes 0.3 s more than a session takes; running adds the inferences. A graph
     that onnxruntime refuses passes here: whoever opens it next reports why. ``file``
-    may hold this very graph already. ``feeds`` are inputs for one run, without which
-    the graph is only opened; recurrent ones may be missing. ``memory`` is the folder of
-    verdicts, by default in the user's cache. Returns the seconds taken, 0 for a known
-    graph.
+    may hold this very graph already. ``frames`` are run in order, as a replay does;
+    without them the graph is only opened. ``memory`` is the folder of verdicts, by
+    default in the user's cache. Returns None for a known graph.
 
     Raises:
         GraphError: the process died; the message has the graph, the step and the
@@ -123,29 +145,31 @@ def try_apart(
     begun = perf_counter()
     # What cannot run is refused later, with a reason.
     if unsupported(model):
-        return 0.0
+        return None
     try:
         ready, needed = compiled_or_expanded(model, compiled=why_not() is None)
     except GraphError:
-        return 0.0
+        return None
     # A verdict holds for this graph, onnxruntime and these kernels.
     kernels = [each.op_type for each in needed]
     folder = memory or platformdirs.user_cache_path("me2e-compress") / "opened"
     opened, ran = (folder / f"{each}.json" for each in _fingerprints(model, kernels))
-    verdict = opened if feeds is None else ran
+    verdict = ran if frames else opened
     if _is_known(verdict) or _is_known(ran):
-        return 0.0
+        return None
     on_begin()
     # Run the script on a file of the graph and of its inputs.
     with tempfile.TemporaryDirectory(prefix="me2e-opening-") as scratch:
-        inputs = Path(scratch) / "inputs.npz"
-        _save(feeds or {}, inputs)
+        state = _state(model)
+        _save(frames, state or {}, Path(scratch))
         if file is None or ready is not model:
             file = Path(scratch) / "model.onnx"
             graph.save(ready, file)
-        steps = "open" if feeds is None else "run"
-        words = [str(file), str(inputs), steps, ",".join(kernels), *CPU.left_out]
+        words = [str(file), scratch, ",".join(kernels), *CPU.left_out]
         done = run_script(_SCRIPT, words)
+        answers = None
+        if state is not None and _are_complete(model, frames, state):
+            answers = _answers(len(frames), Path(scratch))
     # Exit codes that the script does not give itself mean a crash.
     if done.returncode not in _REFUSED:
         step = (done.stdout.split() or ["start"])[-1]
@@ -154,7 +178,37 @@ def try_apart(
         with contextlib.suppress(OSError):  # a home that cannot be written to
             folder.mkdir(parents=True, exist_ok=True)
             write_json(verdict, _SURVIVED)
-    return perf_counter() - begun
+    return FirstRun(perf_counter() - begun, answers)
+
+
+def _state(model: ir.Model) -> dict[str, str] | None:
+    """Return ``{input: output}`` of what is fed forward; None where a session decides.
+
+    A session may know the shape of an output of which the file says nothing.
+    """
+    if any(each.shape is None for each in (*model.graph.inputs, *model.graph.outputs)):
+        return None
+    try:
+        return recurrent_inputs(model)
+    except GraphError:
+        return None
+
+
+def _are_complete(
+    model: ir.Model, frames: Sequence[Frame], state: Mapping[str, str]
+) -> bool:
+    """Return whether nothing was made up to run the frames: all is there, or state."""
+    fed = {str(each.name) for each in model.graph.inputs} - state.keys()
+    starts = frames[:1] and frames[0].starts_scene
+    return bool(starts) and all(fed <= frame.arrays.keys() for frame in frames)
+
+
+def _answers(count: int, folder: Path) -> tuple[Mapping[str, Array], ...] | None:
+    """Read the outputs of every frame; None where one is missing."""
+    files = [folder / f"{index}.answer.npz" for index in range(count)]
+    if not all(each.exists() for each in files):
+        return None
+    return tuple(opening_main.read(each) for each in files)
 
 
 def _fingerprints(model: ir.Model, kernels: Sequence[str]) -> Iterator[str]:
@@ -165,9 +219,12 @@ def _fingerprints(model: ir.Model, kernels: Sequence[str]) -> Iterator[str]:
         yield hashlib.sha256("\n".join((*known, step)).encode()).hexdigest()
 
 
-def _save(feeds: Mapping[str, Array], path: Path) -> None:
-    """Write arrays by number, and their names first, so that any name is allowed."""
-    np.savez(path, np.array(list(feeds), np.str_), *feeds.values(), allow_pickle=False)
+def _save(frames: Sequence[Frame], state: Mapping[str, str], folder: Path) -> None:
+    """Write what the script is to run."""
+    starts = [frame.starts_scene for frame in frames]
+    write_json(folder / "steps.json", {"starts": starts, "recurrent": dict(state)})
+    for index, frame in enumerate(frames):
+        opening_main.write(folder / f"{index}.npz", frame.arrays)
 
 
 def _is_known(verdict: Path) -> bool:

@@ -94,6 +94,7 @@ def _run(
         onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     )
     options.intra_op_num_threads = 1
+    options.enable_cpu_mem_arena = False  # it would live as long as a constant does
     options.log_severity_level = SILENT
     session = onnxruntime.InferenceSession(
         model.SerializeToString(), options, providers=["CPUExecutionProvider"]

@@ -20,6 +20,7 @@ from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.operators.kernels import custom_ops, store, trampoline
 from me2e_compress.operators.kernels.kernel import CompiledKernel
 from me2e_compress.operators.kernels.machine_code import load_or_compile
+from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.opening import open_graph
 from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.runtime.runnable import compiled_or_expanded
@@ -263,11 +264,12 @@ def test_a_call_that_is_none_is_named() -> None:
 @pytest.mark.opens_apart
 def test_a_graph_with_kernels_is_opened_apart_with_them(tmp_path: Path) -> None:
     model, arrays = call()
+    frames = [Frame(0, True, dict(arrays))]
 
-    assert try_apart(model, "call", feeds=arrays, memory=tmp_path) > 0
+    assert try_apart(model, "call", frames=frames, memory=tmp_path) is not None
 
     assert len(list(tmp_path.iterdir())) == 1  # it survived
-    assert try_apart(model, "call", feeds=arrays, memory=tmp_path) == 0
+    assert try_apart(model, "call", frames=frames, memory=tmp_path) is None
 
 
 def test_numba_is_imported_for_fused_nodes_only(
