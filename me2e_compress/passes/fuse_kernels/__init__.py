@@ -31,7 +31,6 @@ None where the node is no such pattern; a PreconditionError names what an almost
 matching one lacks. Nothing may be written before the last check.
 """
 
-<<<<<<< HEAD
 _FUSERS: Mapping[str, Fuser] = {
     "Conv": fuse_convolution,
     "GridSample": fuse_grid_sample,
@@ -39,9 +38,6 @@ _FUSERS: Mapping[str, Fuser] = {
     "MultiScaleDeformableAttention": fuse_raw_attention,
     "Relu": fuse_rectified_convolution,
 }
-=======
-_FUSERS: Mapping[str, Fuser] = {"GridSample": grid_sample.fuse}
->>>>>>> c/s28-c
 """Fusers by the type of the last node of their pattern."""
 
 
@@ -49,11 +45,13 @@ _FUSERS: Mapping[str, Fuser] = {"GridSample": grid_sample.fuse}
 class FuseKernels(Pass):
     """Fuse float operators that compiled kernels run faster than onnxruntime's own.
 
-    Given:   y = me2e::MultiScaleDeformableAttention(
-                 value, sizes, starts, points + offsets, Softmax(scores) * mask)
+    Given:   y = MatMul(Softmax(MatMul(q, k^T) / sqrt(C)), v)
 
-    Result:  y = me2e::RawDeformableAttention(
-                 value, sizes, starts, points, offsets, scores, mask)
+    Result:  y = me2e::MultiHeadAttention(q, k, v)
+
+    Likewise 3x3 convolutions (by Winograd's algorithm), GridSample of feature maps, and
+    the sums, softmax and mask in front of deformable attention, which its kernel reads
+    unrepeated (``me2e::RawDeformableAttention``).
 
     It stands last in a recipe, behind quantization: what is int8 stays as it is. The
     bodies of the fused nodes are the standard operators that they replace, so a file
