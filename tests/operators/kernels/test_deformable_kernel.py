@@ -125,7 +125,7 @@ def raw_call() -> dict[str, Any]:
         "level_start_index": np.arange(6) * 6,
         "reference_points": random.uniform(-0.1, 1.1, (1, 90, 1, 3, 4, 2)),
         "sampling_offsets": random.normal(size=(1, 90, 23, 2, 8, 2)) * 0.2,
-        "attention_scores": random.normal(size=(1, 90, 23, 1, 16), scale=9),
+        "attention_scores": random.normal(300, 9, (1, 90, 23, 1, 16)),
         "mask": np.where(shown, random.uniform(size=shown.shape), 0),
     }
     return {
