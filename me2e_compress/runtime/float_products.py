@@ -2,7 +2,7 @@
 
 onnxruntime makes a QGemm of a quantized Gemm. It writes the bias to every row of the
 answer first, and adds the products to it; MatMulIntegerToFloat does both while a tile
-lies in the cache, and takes 0.6 to 0.9 of the time
+lies in the cache, and takes 0.6 to 1.0 of the time
 (``benchmarks/bench_int8_shapes.py``). onnxruntime 1.31 makes one with a bias of no
 pattern of constant scales, so it is written as a graph is opened.
 """

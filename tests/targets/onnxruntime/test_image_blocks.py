@@ -77,7 +77,7 @@ def test_a_filter_over_blocks_adds_up_the_same_products(
     generator = np.random.default_rng(seed)
     integers = generator.integers(-127, 128, stem.filter).astype(np.int8)
     fed = {"x": generator.integers(-9, 9, stem.image).astype(np.float32)}
-    model = net(stem.text(), {"w": integers})
+    model = net(stem.text(), {"w": integers.astype(np.float32)})
     node = model.graph[0]
     cut = blocks_of(node)
     assume(cut is not None)
