@@ -4,8 +4,8 @@ On outputs that a graph draws anew at every run nothing can be compared.
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Protocol, TypeAlias
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import onnx_ir as ir
 
@@ -27,15 +27,8 @@ Answers: TypeAlias = Sequence[Outputs]
 Known: TypeAlias = tuple[Answers | None, Answers | None]
 """What the graph before and the one after gave; None where they are to be run."""
 
-
-class TryFirst(Protocol):
-    """Opens a graph before this process does."""
-
-    def __call__(
-        self, model: ir.Model, name: str, *, frames: Sequence[Frame]
-    ) -> Answers | None:
-        """Return what it answered on frames, if it was run on them; may refuse it."""
-        ...
+TryFirst: TypeAlias = Callable[[ir.Model, str, Sequence[Frame]], Answers | None]
+"""Opens a graph before this process does: returns what it answered, or refuses it."""
 
 
 def verify(
@@ -80,7 +73,7 @@ def verify(
 
 
 def unsteadiness(
-    model: ir.Model, answers: Sequence[Outputs], inputs: VerificationInputs
+    model: ir.Model, answers: Answers, inputs: VerificationInputs
 ) -> dict[str, float]:
     """Measure how far each output moves when inputs change in their last places.
 

@@ -182,7 +182,7 @@ class _Books:
         if self.manager.try_first is not None:
             fed = first_frames(self._frames(), self.manager.verify_frames)
             what = f"the graph after {stretch[-1][0].name}"
-            answers = self.manager.try_first(model, what, frames=fed)
+            answers = self.manager.try_first(model, what, fed)
         found, runnable, inputs = self._compare(stretch, model, answers)
         self.verifications.append(found)
         if equivalence.passed(found) or inputs is None:

@@ -42,7 +42,7 @@ of them to be equal, or pictures that can be halved again and again."""
 MOST_ELEMENTS = 1 << 25
 """Inputs of more numbers than this (128 MB) are not made up."""
 
-Outputs: TypeAlias = dict[str, npt.NDArray[np.generic]]
+Outputs: TypeAlias = Mapping[str, npt.NDArray[np.generic]]
 Sizes: TypeAlias = Mapping[str, int]
 
 

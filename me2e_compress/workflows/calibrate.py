@@ -182,7 +182,7 @@ def _ready(
     try_first(
         loaded.model,
         source.name,
-        listener,
+        listener=listener,
         file=loaded.file,
         frames=part,
         provider=options.provider,

@@ -256,7 +256,7 @@ class Compression:
         seen = frames.calibration or frames.samples
         count, provider = options.verify_frames or 1, options.provider
         first = partial(try_first, listener=listener, count=count, provider=provider)
-        answers = first(model, source.name, file=loaded.file, frames=seen)
+        answers = first(model, source.name, seen, file=loaded.file)
         # apply the passes, and refuse a result that is unproven or not int8
         context = Context(modules, frames.calibration, options.seed, options.provider)
         checked, samples = options.verify_frames, frames.samples

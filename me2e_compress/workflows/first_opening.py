@@ -60,10 +60,10 @@ class FirstRun:
 def try_first(
     model: ir.Model,
     name: str,
-    listener: Listener,
-    *,
-    file: Path | None = None,
     frames: Frames | Sequence[Frame] | None = None,
+    *,
+    listener: Listener,
+    file: Path | None = None,
     count: int = 1,
     provider: Provider = CPU,
 ) -> tuple[Mapping[str, Array], ...] | None:
@@ -104,7 +104,7 @@ def try_model(
     name, stack = loaded.path.name, loaded.stack
     opened = partial(try_first, listener=listener, provider=provider)
     if stack is None:
-        opened(loaded.model, name, file=loaded.path, frames=frames)
+        opened(loaded.model, name, frames, file=loaded.path)
         return
     for each in filter(None, (stack.model, stack.first)):
         opened(each, name)

@@ -110,7 +110,7 @@ class TrialFiles:
         try_first(
             loaded,
             name,
-            listener,
+            listener=listener,
             file=read.file,
             frames=recording,
             provider=options.provider,

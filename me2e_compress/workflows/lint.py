@@ -174,7 +174,7 @@ def _found(
     if any(each.severity == "error" for each in found):
         return found
     if judge.opens:
-        try_first(model, name, listener, provider=provider)
+        try_first(model, name, listener=listener, provider=provider)
     # a node that a rule has named already is not named again
     known = {each.node for each in found if each.rule == "float-answer"}
     opened = [

@@ -49,7 +49,7 @@ def test_a_graph_whose_answers_are_known_is_not_opened_again(
     tried: list[tuple[str, float]] = []
 
     def first(
-        model: ir.Model, name: str, *, frames: Sequence[Frame]
+        model: ir.Model, name: str, frames: Sequence[Frame]
     ) -> equivalence.Answers:
         tried.append((name, frames[0].arrays["x"].sum().item()))
         return [{"y": np.array([[2.0]], np.float32)}]
@@ -58,7 +58,7 @@ def test_a_graph_whose_answers_are_known_is_not_opened_again(
         raise AssertionError("a session was opened")
 
     monkeypatch.setattr("me2e_compress.manager.verification_inputs.Session", opens)
-    answers = [{"y": np.array([[2.0 + 1e-4]], np.float32)}]
+    answers: equivalence.Answers = [{"y": np.array([[2.0 + 1e-4]], np.float32)}]
     manager = PassManager(
         (passes.DROPS_RELU,),
         samples=CalibrationSet(tmp_path),
@@ -75,7 +75,7 @@ def test_answers_of_the_graph_that_came_in_are_not_those_of_a_later_one(
     context: Context, tmp_path: Path
 ) -> None:
     _record(tmp_path)
-    wrong = [{"y": np.zeros((1, 8), np.float32)}]
+    wrong: equivalence.Answers = [{"y": np.zeros((1, 8), np.float32)}]
     manager = PassManager(
         (passes.HALVES, passes.DROPS_RELU),
         samples=CalibrationSet(tmp_path),
