@@ -48,9 +48,10 @@ PLANS = {
 }
 """The models that are measured, and which output of each is the plan."""
 FOLDED = "import-normalize,fold-constants"
-BEFORE = f"{FOLDED},eliminate-redundant,hoist-linear"
+BEFORE = f"{FOLDED},eliminate-redundant,hoist-linear,flatten-matmul"
 FUSED = f"{BEFORE},fuse-operators,eliminate-redundant,fuse-basic"
 INT8 = "quantize-int8{target=onnxruntime}"
+KERNELS = "fuse-kernels"
 QUANTIZED = Entry("onnxruntime", "onnxruntime-int8", tool="peer", of="model")
 ENTRIES = {
     "PyTorch, eager": Entry("torch", "stack"),
@@ -62,9 +63,9 @@ ENTRIES = {
     "OpenVINO, bfloat16": Entry("openvino-bf16", "source"),
     "OpenVINO, int8": dataclasses.replace(QUANTIZED, engine="openvino-f32"),
     "ours, exact": Entry("ours", "exact", f"{BEFORE},fuse-basic"),
-    "ours, fused": Entry("ours", "fused", FUSED),
+    "ours, fused": Entry("ours", "fused", f"{FUSED},{KERNELS}"),
     "ours, int8": Entry("ours", "int8", f"{BEFORE},fuse-basic,{INT8}"),
-    "ours, int8 fused": Entry("ours", "int8-fused", f"{FUSED},{INT8}"),
+    "ours, int8 fused": Entry("ours", "int8-fused", f"{FUSED},{INT8},{KERNELS}"),
 }
 OPTIONAL = {"torch.compile": "PyTorch, torch.compile"}
 """Rows that only ``--with`` measures: torch.compile compiles for six minutes."""
