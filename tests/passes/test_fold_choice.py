@@ -7,8 +7,10 @@ import onnx_ir as ir
 from hypothesis import given
 from hypothesis import strategies as st
 
+from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.passes import PassResult
-from me2e_compress.passes.fold_constants import FoldConstants
+from me2e_compress.passes.fold_constants import SMALL_FILE, FoldConstants
+from me2e_compress.passes.fold_constants.choice import ENTRY_BYTES
 from me2e_compress.passes.fold_constants.min_cut import FlowNetwork
 from tests.passes.small import apply, ops, read
 
@@ -82,9 +84,9 @@ def attention(tokens: int) -> ir.Model:
     )
 
 
-def folded(tokens: int) -> tuple[ir.Model, PassResult]:
+def folded(tokens: int, growth: float = 1e9) -> tuple[ir.Model, PassResult]:
     model = attention(tokens)
-    return model, apply(FoldConstants(), model)
+    return model, apply(FoldConstants(growth=growth), model)
 
 
 def test_an_attention_that_takes_longer_than_its_bytes_are_worth_is_folded() -> None:
@@ -92,6 +94,25 @@ def test_an_attention_that_takes_longer_than_its_bytes_are_worth_is_folded() -> 
     model, _ = folded(2000)
 
     assert ops(model) == ["Add", "Mul", "MatMul"]
+
+
+def test_what_is_worth_its_bytes_stays_computed_beyond_the_budget() -> None:
+    model, _ = folded(2000, growth=0.01)
+
+    assert "Softmax" in ops(model)
+    assert ops(model).count("Slice") == 0  # what shrinks the weights is done
+
+
+@given(st.floats(0, 40), st.integers(2, 3000))
+def test_weights_never_grow_beyond_their_budget(growth: float, tokens: int) -> None:
+    model = attention(tokens)
+    before = weight_bytes(model)
+
+    apply(FoldConstants(growth=growth), model)
+
+    allowed = max(growth * before, SMALL_FILE) if growth else 0
+    entries = ENTRY_BYTES * len(model.graph.initializers)
+    assert weight_bytes(model) - before <= allowed + entries
 
 
 def test_a_table_that_is_only_repeated_stays_computed() -> None:

@@ -21,14 +21,19 @@ from me2e_compress.graph.rewrite import (
     replace_value,
     value_names,
 )
+from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fold_constants import evaluation
-from me2e_compress.passes.fold_constants.choice import FoldChoice, choose
+from me2e_compress.passes.fold_constants.choice import FoldChoice, choose_within
 from me2e_compress.passes.fold_constants.inference import branch_fits
 from me2e_compress.passes.fold_constants.knowledge import Sweep
 from me2e_compress.passes.work import BYTES_PER_NODE
 
 __all__ = ["FoldConstants"]
+
+
+SMALL_FILE = 1 << 16
+"""Growth in bytes that is no matter, whatever the share."""
 
 
 @dataclasses.dataclass
@@ -40,6 +45,7 @@ class _Tally:
     stored: int = 0
     kept: int = 0
     growth_bytes: int = 0
+    budget: float = 0.0
     refused: Counter[str] = dataclasses.field(default_factory=Counter)
 
     @property
@@ -61,6 +67,9 @@ class FoldConstants(Pass):
             shrinks the weights is always done, one that grows them only up to this
             price, so that a position table repeated for every token stays computed and
             an attention between constants does not.
+        growth: by which share of their bytes all weights together may grow, or by
+            64 KB where that is more; 0 is by nothing, for more nodes. The price of a
+            node is lowered until it is met.
         through_compute: fold through products, convolutions and softmax too, at the
             same price; False keeps every named layer, e.g. to ablate it later.
     """
@@ -68,12 +77,15 @@ class FoldConstants(Pass):
     name: ClassVar[str] = "fold-constants"
     exact: ClassVar[bool] = True
     bytes_per_node: int = BYTES_PER_NODE
+    growth: float = 0.01
     through_compute: bool = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Infer shapes, then fold every graph of the model, outermost first."""
         # Normalize first: Constant nodes and bounds of Range
-        tally = _Tally(lifted=lift_constants(model))
+        lifted = lift_constants(model)
+        share = self.growth * weight_bytes(model)
+        tally = _Tally(lifted, budget=max(share, SMALL_FILE) if self.growth else 0)
         declared = [value.shape for value in model.graph.outputs]
         opset = graphs.opset_of(model)
         for body in graphs_of(model.graph):
@@ -103,7 +115,8 @@ class FoldConstants(Pass):
                 through_compute=self.through_compute,
                 trust_shapes=trust,
             ).run(body)
-            choice = choose(known, self.bytes_per_node)
+            left = max(tally.budget - tally.growth_bytes, 0)
+            choice = choose_within(known, self.bytes_per_node, left)
             # Evaluate the choice; start over if it taught new shapes or failed
             asked = [value for value in choice.values if value not in known.arrays]
             found, failed = evaluation.evaluate(asked, known, opset)

@@ -22,6 +22,9 @@ from me2e_compress.passes.work import work
 ENTRY_BYTES = 64
 """Bytes of an initializer in the file besides its data: name, shape, type."""
 
+STEP_BYTES = 32
+"""How finely a price is found that keeps to a budget."""
+
 
 @dataclasses.dataclass
 class FoldChoice:
@@ -34,6 +37,32 @@ class FoldChoice:
     gone: list[Expression]
     kept: int
     growth_bytes: int
+
+
+def choose_within(known: Knowledge, bytes_per_node: int, most: float) -> FoldChoice:
+    """Choose at the price given, or at the highest below it that keeps to a budget.
+
+    A lower price leaves those nodes computed whose removal costs the most bytes each.
+
+    Args:
+        known: the constant values.
+        bytes_per_node: the price of a node.
+        most: bytes by which the weights may grow.
+    """
+    choice = choose(known, bytes_per_node)
+    low, high = 0, bytes_per_node
+    if choice.growth_bytes <= most:
+        return choice
+    # bisect; at no price at all nothing grows the weights
+    best = choose(known, low)
+    while high - low > STEP_BYTES:
+        middle = (low + high) // 2
+        choice = choose(known, middle)
+        if choice.growth_bytes <= most:
+            low, best = middle, choice
+        else:
+            high = middle
+    return best
 
 
 def choose(known: Knowledge, bytes_per_node: int) -> FoldChoice:
