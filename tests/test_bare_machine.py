@@ -57,13 +57,12 @@ WORLD = (
     "workflows.latency_figure",
 )
 KERNELS = (
-    "operators.kernels.call_inputs",
+    "operators.kernels.call_context",
     "operators.kernels.custom_ops",
     "operators.kernels.deformable_kernel",
     "operators.kernels.intrinsics",
     "operators.kernels.machine_code",
     "operators.kernels.matrix_tile",
-    "operators.kernels.memory",
     "operators.kernels.vectors",
     "operators.kernels.weighted_rows",
     "operators.kernels.winograd_blocks",

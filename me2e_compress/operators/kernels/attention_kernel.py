@@ -15,7 +15,7 @@ import numpy as np
 from numba import types
 
 from me2e_compress.operators.kernels import abi
-from me2e_compress.operators.kernels.call_inputs import (
+from me2e_compress.operators.kernels.call_context import (
     ADDRESS,
     EACH,
     made,

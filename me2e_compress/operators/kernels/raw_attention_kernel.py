@@ -12,7 +12,7 @@ import numpy as np
 from numba import types
 
 from me2e_compress.operators.kernels.attention_call import functions_of
-from me2e_compress.operators.kernels.call_inputs import ADDRESS, EACH
+from me2e_compress.operators.kernels.call_context import ADDRESS, EACH
 from me2e_compress.operators.kernels.exponential import softmax
 from me2e_compress.operators.kernels.intrinsics import (
     Word,

@@ -11,9 +11,11 @@ from typing import Any
 from numba import types
 
 from me2e_compress.operators.kernels import abi
-from me2e_compress.operators.kernels.call_inputs import (
+from me2e_compress.operators.kernels.call_context import (
     ADDRESS,
     EACH,
+    borrow,
+    give_back,
     made,
     read,
     refused,
@@ -26,7 +28,6 @@ from me2e_compress.operators.kernels.intrinsics import (
     stack,
     words,
 )
-from me2e_compress.operators.kernels.memory import borrow, give_back
 from me2e_compress.operators.kernels.vectors import LANES
 from me2e_compress.operators.kernels.winograd_blocks import (
     ACROSS,
