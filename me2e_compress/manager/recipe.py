@@ -25,7 +25,7 @@ from me2e_compress.registry import documents
 from me2e_compress.registry.registry import default_of, fields_of
 from me2e_compress.registry.text import chosen_fields
 
-__all__ = ["load", "parse", "shipped", "to_text", "to_toml"]
+__all__ = ["adding_no_weights", "load", "parse", "shipped", "to_text", "to_toml"]
 
 
 def shipped() -> list[str]:
@@ -80,6 +80,19 @@ def parse(text: str) -> tuple[Pass, ...]:
         RecipeError: the text is not a pipeline, or names an unknown pass or option.
     """
     return PASSES.parse_all(text)
+
+
+def adding_no_weights(passes: Iterable[Pass]) -> tuple[Pass, ...]:
+    """Set the options that let passes add weights for fewer nodes or less work to 0."""
+
+    def without(each: Pass) -> Pass:
+        prices = [name for name in _PRICES if name in each.option_names()]
+        return each.with_options(dict.fromkeys(prices, 0))
+
+    return tuple(map(without, passes))
+
+
+_PRICES = ("bytes_per_node", "growth")
 
 
 def to_text(passes: Iterable[Pass]) -> str:

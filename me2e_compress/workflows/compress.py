@@ -64,14 +64,13 @@ class CompressOptions:
         method: how ranges are read from frames, or were for ``ranges``.
         module_map: preset or TOML file; None finds the preset.
         seed: seed of everything random.
-        verify_frames: frames that exact passes are checked on; 0 checks none, and the
-            verdict says so.
-        unproven: write a graph that does not run here, so that exact passes are
-            unchecked.
+        verify_frames: frames that exact passes are checked on; 0 checks none.
+        unproven: write a graph that does not run here, its exact passes unchecked.
         measure_frames: most frames that are kept out of calibration, to measure lossy
             passes on; 0 measures nothing and calibrates on all.
         floor: SQNR in dB below which an output is warned of.
         allow_empty: write the graph although nothing in it became int8.
+        smaller: add no weights to remove nodes: fewer bytes instead of fewer nodes.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         adapter: TOML file whose plan and state become metadata of the graph.
         provider: what runs graphs, to calibrate, check and measure.
@@ -92,6 +91,7 @@ class CompressOptions:
     measure_frames: int = 4
     floor: float = SQNR_FLOOR_DB
     allow_empty: bool = False
+    smaller: bool = False
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
     adapter: str | Path | None = None
     provider: Provider = CPU
@@ -130,6 +130,7 @@ class CompressOptions:
             )
         if self.scheme is not None:
             passes = (*passes, QuantizeInt8(scheme=self.scheme))
+        passes = recipes.adding_no_weights(passes) if self.smaller else passes
         return self._with_int8(with_sizes(passes, self.dims))
 
     def _with_int8(self, passes: tuple[Pass, ...]) -> tuple[Pass, ...]:

@@ -28,6 +28,10 @@ AllowEmpty = Annotated[
     bool, typer.Option("--allow-empty", help="write it although nothing became int8")
 ]
 
+Smaller = Annotated[
+    bool, typer.Option("--smaller", help="add no weights for fewer nodes or less work")
+]
+
 
 def compress(
     model: given.AnyModel,
@@ -49,6 +53,7 @@ def compress(
     measure_frames: Measure = 4,
     floor: Floor = SQNR_FLOOR_DB,
     allow_empty: AllowEmpty = False,
+    smaller: Smaller = False,
     set_dim: given.SetDim = None,
     adapter: given.Adapter = None,
     provider: given.Provider = "cpu",
@@ -67,7 +72,7 @@ def compress(
         method=method, module_map=module_map, seed=seed, verify_frames=verify_frames,
         measure_frames=measure_frames, floor=floor, allow_empty=allow_empty,
         weight_only_gemv=weight_only_gemv, force=force, dims=sizes(set_dim or ()),
-        adapter=adapter, unproven=unproven,
+        adapter=adapter, unproven=unproven, smaller=smaller,
         provider=provider_named(provider, plugins or ()),
     )  # fmt: skip
     with listening() as listener:
