@@ -57,12 +57,18 @@ WORLD = (
     "workflows.latency_figure",
 )
 KERNELS = (
+    "operators.kernels.attention_call",
+    "operators.kernels.attention_kernel",
     "operators.kernels.call_context",
     "operators.kernels.custom_ops",
     "operators.kernels.deformable_kernel",
+    "operators.kernels.exponential",
     "operators.kernels.intrinsics",
     "operators.kernels.machine_code",
     "operators.kernels.matrix_tile",
+    "operators.kernels.online_softmax",
+    "operators.kernels.raw_attention_kernel",
+    "operators.kernels.sampling",
     "operators.kernels.vectors",
     "operators.kernels.weighted_rows",
     "operators.kernels.winograd_blocks",

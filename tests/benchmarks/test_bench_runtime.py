@@ -68,7 +68,8 @@ def test_the_table_compares_with_the_first_row() -> None:
     ours = Row([1.0, 2.0], [0.5], 900.0, {"ego_fut_preds": 30.0, "bev": 20.0})
     eager = Row([10.0, 9.0], [5.0], 1700.0, {"ego_fut_preds": 99.0, "bev": 99.0})
 
-    lines = table({"PyTorch, eager": eager, "ours": ours}, {"ours": 0.4}).splitlines()
+    rows = {"PyTorch, eager": eager, "ours": ours}
+    lines = table(rows, {"ours": 0.4}, "ego_fut_preds").splitlines()
 
     assert lines[-1].split(" | ")[1:4] == ["1.00", "1.50", "9.00"]
     assert lines[-1].endswith("20.0 | 30.0 | 40% |")
