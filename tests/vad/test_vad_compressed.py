@@ -181,7 +181,7 @@ def test_the_cpu_runs_every_convolution_and_most_products_in_int8(
     kernels = Counter(node.op_type for node in graph.load(rewritten).graph)
     found = reference.compare(session)
 
-    # ResNet-50 has 53, the neck two; products that only uint8 readers take are some, too
+    # ResNet-50 has 53, the neck two; others are products that only uint8 readers take
     products = kernels["QLinearConv"] - 55
     assert products > 0
     assert kernels["Conv"] + kernels["FusedConv"] == 0
