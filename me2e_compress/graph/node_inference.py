@@ -54,7 +54,7 @@ def infer_node(
             return {}
         types[value.name] = ir.serde.serialize_value(source).type
         array = known(value)
-        if array is not None:
+        if array is not None and array.dtype.kind != "S":  # no shape depends on text
             data[value.name] = onnx.numpy_helper.from_array(array, value.name)
     return onnx.shape_inference.infer_node_outputs(
         onnx.defs.get_schema(node.op_type, opset),

@@ -4,6 +4,8 @@ import pytest
 from me2e_compress.graph import provenance
 from me2e_compress.manager import PassManager
 from me2e_compress.passes.base import Context
+from me2e_compress.passes.eliminate_redundant import EliminateRedundant
+from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize
 
 
@@ -29,6 +31,19 @@ def test_a_graph_is_imported_as_exporters_leave_it(
         provenance.stamp(node, provenance.Provenance("backbone", (str(node.name),)))
     report = PassManager((ImportNormalize(),)).run(model, context)
     assert report.steps[0].changes > 0
+
+
+def test_a_graph_may_hold_text(context: Context) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 20]>\n'
+        "m (string[2] x) => (string[2] y) {"
+        ' unit = Constant<value_strings = ["m", "s"]>()'
+        ' again = Constant<value_strings = ["m", "s"]>()'
+        ' a = StringConcat(x, unit) ["/backbone/y"] y = StringConcat(a, again) }'
+    )
+    passes = (ImportNormalize(), FoldConstants(), EliminateRedundant())
+    report = PassManager(passes).run(model, context)
+    assert len(report.model.graph.initializers) == 1
 
 
 def test_an_output_that_is_a_sequence_is_not_compared(context: Context) -> None:
