@@ -1,6 +1,8 @@
 """The tester can fail: passes that are wrong on purpose are caught, and shrunk."""
 
 import dataclasses
+import subprocess
+import sys
 from typing import ClassVar
 
 import onnx
@@ -110,3 +112,9 @@ def test_a_weight_that_is_off_by_a_step_is_told() -> None:
     bad = array([[1.0, 1.1], [1.3, 63.5]], float32)
     with pytest.raises(StrippingError, match="1 steps off"):
         stripped(model, [bad])
+
+
+@pytest.mark.slow
+def test_a_night_starts_its_workers() -> None:
+    command = [sys.executable, "-m", "tests.fuzz.exact", "--graphs", "2", "--jobs", "1"]
+    subprocess.run(command, check=True)
