@@ -83,8 +83,8 @@ def _plan(node: ir.Node, opset: int) -> _Plan | None:
     if node.op_type in BINARY:
         return _combined(node, shape)
     # An operator along the last axis needs it whole
-    found, given = repeated_axes(value), static_shape(value) or ()
-    if found is None:
+    found, given = repeated_axes(value), static_shape(value)
+    if found is None or not given:
         return None
     operand = _Operand(value, found.small, found)
     if node.op_type in UNARY:
