@@ -162,8 +162,8 @@ def modules(name: str, scheme: str, rules: str, model: ir.Model) -> Iterator[str
 def checked(
     path: Path, name: str, scheme: str, rules: str, parse: bool
 ) -> Iterator[str]:
-    """Say what TensorRT's lint and, if asked, TensorRT-RTX say of a file."""
-    found = lint(path, LintOptions("tensorrt", trt_check=parse))
+    """Say what the lint for the paper's TensorRT and, if asked, TensorRT-RTX say."""
+    found = lint(path, LintOptions(trt_check=parse, target_version="10.7"))
     yield f"{name} {scheme} ({rules}): {'; '.join(found.lines())}"
 
 

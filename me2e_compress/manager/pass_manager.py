@@ -214,22 +214,26 @@ class _Books:
             except (GraphError, PreconditionError) as error:
                 reason = reason or str(error)
                 continue
-            self._leave_out(stretch[:first], reason)
-            return found, stretch[first:], inputs
+            said = (*found.remarks, *self._leave_out(stretch[:first], reason))
+            return dataclasses.replace(found, remarks=said), stretch[first:], inputs
         names = tuple(current.name for current, _ in stretch)
         return equivalence.skipped(names, reason), stretch, None
 
     def _frames(self) -> Recording | None:
         return self.context.frames or self.manager.samples
 
-    def _leave_out(self, stretch: Stretch, reason: str) -> None:
+    def _leave_out(self, stretch: Stretch, reason: str) -> tuple[str, ...]:
         """Say what is not proven since the graph did not run before it.
 
-        An import alone is what makes a graph run that somebody else exported.
+        An import alone is what makes a graph run that somebody else exported: what it
+        has to say of that, such as types that it changed, is returned.
         """
         names = tuple(current.name for current, _ in stretch)
         if set(names) - {ImportNormalize.name}:
             self.verifications.append(equivalence.skipped(names, reason))
+            return ()
+        notes = [n for each in self.steps if each.name in names for n in each.notes]
+        return tuple(f"not proven: {names[0]}, {n}: {reason}" for n in notes)
 
     def _enter(self, current: Pass, result: PassResult, seconds: float) -> None:
         after = graph.size(result.model)

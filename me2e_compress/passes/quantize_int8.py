@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -25,7 +24,7 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.targets import TARGETS, LintFinding, Target
+from me2e_compress.targets import TARGETS, Target
 from me2e_compress.targets.quantized import describe_quantized
 from me2e_compress.targets.weights import QuantizedWeight, weights_of
 from me2e_compress.targets.writer import BY, Writer
@@ -125,7 +124,6 @@ class QuantizeInt8(Pass):
             *_notes(plan, self.target),
             *_findings(plan, ranges),
             *advice,
-            _linted(target.lint(placed), self.target),
         )
         return PassResult(placed, len(plan.placed) + len(plan.weight_only), notes)
 
@@ -229,16 +227,6 @@ def _findings(plan: QuantPlan, ranges: Ranges) -> tuple[str, ...]:
         *_first(list(ranges.dead), "always zero"),
         *_first(_outliers(ranges), "a few elements make the range"),
         *_first(shared, "scales shared by what a Concat joins"),
-    )
-
-
-def _linted(found: Sequence[LintFinding], target: str) -> str:
-    if not found:
-        return f"lint for {target}: nothing found"
-    first = found[0]
-    return (
-        f"lint for {target}: {len(found)} findings, first {first.severity}"
-        f" {first.rule} {first.node!r}: {first.message}"
     )
 
 

@@ -23,6 +23,7 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.files import INLINE_LIMIT_BYTES
 from me2e_compress.graph.nodes import is_read
+from me2e_compress.runtime.kernel_types import without_kernel
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import runnable, unsupported
 
@@ -118,6 +119,28 @@ def open_graph(
     if reason := unsupported(model, provider):
         raise GraphError(reason)
     model = runnable(model, options, provider)
+    try:
+        return _lending(model, options, provider, without)
+    except GraphError as refusal:
+        raise GraphError(_reason(model, provider) or str(refusal)) from refusal
+
+
+def _reason(model: ir.Model, provider: Provider) -> str:
+    """Say which operator of a refused graph has no kernel; empty if all have one."""
+    if provider.native != CPU.native:
+        return ""
+    typed = model.clone()
+    graph.infer_shapes(typed)
+    node, said = next(without_kernel(typed), (None, ""))
+    return said if node is None else f"{said} (node {node.name!r})"
+
+
+def _lending(
+    model: ir.Model,
+    options: ort.SessionOptions,
+    provider: Provider,
+    without: Sequence[str] | None,
+) -> tuple[ort.InferenceSession, Weights]:
     # Lend the large weights that are read.
     lent = {
         name: tensor

@@ -6,6 +6,7 @@ To add a target, write its class, then add it to this table.
 from me2e_compress.errors import RecipeError
 from me2e_compress.registry import Registry
 from me2e_compress.targets.base import (
+    SEVERITIES,
     LintFinding,
     LintRule,
     Severity,
@@ -14,9 +15,11 @@ from me2e_compress.targets.base import (
     of_opset,
     valid,
     warning,
+    worst_first,
 )
 
 __all__ = [
+    "SEVERITIES",
     "TARGETS",
     "LintFinding",
     "LintRule",
@@ -26,6 +29,7 @@ __all__ = [
     "of_opset",
     "valid",
     "warning",
+    "worst_first",
 ]
 
 _HERE = "me2e_compress.targets"

@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Callable, Collection, Iterable, Iterator
-from typing import ClassVar, Literal, TypeAlias
+from typing import ClassVar, Literal, TypeAlias, get_args
 
 import onnx
 import onnx_ir as ir
@@ -17,7 +17,11 @@ from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import KeptFloat, QuantPlan
 from me2e_compress.runtime.providers import CPU, Provider
 
-Severity = Literal["error", "warning"]
+Severity = Literal[
+    "error", "wrong", "reported refused", "reported wrong", "reported slow", "warning"
+]
+SEVERITIES: tuple[Severity, ...] = get_args(Severity)
+"""The worst first."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +29,10 @@ class LintFinding:
     """One problem of a graph for its target.
 
     Attributes:
-        severity: ``error`` or ``warning``. With an error the target refuses the graph
-            or computes something else; else it runs, but not as int8, or slowly.
+        severity: with an ``error`` the target refuses the graph, with ``wrong`` it
+            runs it and computes something else; with a ``warning`` it runs, but not as
+            int8, or slowly. What users report of some versions is ``reported refused``,
+            ``wrong`` or ``slow``.
         rule: id of the rule.
         node: name of the node; empty for a finding about the whole graph.
         message: what was found; and what is expected.
@@ -44,18 +50,23 @@ LintRule: TypeAlias = Callable[[ir.Model], Iterator[LintFinding]]
 
 def error(rule: str, node: ir.Node | None, message: str) -> LintFinding:
     """Return a finding that makes the target refuse the graph."""
-    return LintFinding("error", rule, _name(node), message)
+    return LintFinding("error", rule, name_of(node), message)
 
 
 def warning(rule: str, node: ir.Node | None, message: str) -> LintFinding:
     """Return a finding with which the target still runs the graph, but badly."""
-    return LintFinding("warning", rule, _name(node), message)
+    return LintFinding("warning", rule, name_of(node), message)
 
 
 def valid(model: ir.Model) -> Iterator[LintFinding]:
     """Run ONNX's checker, ignoring plugins."""
     if reason := refusal(model, plugins=True):
         yield error("onnx", None, f"not valid ONNX: {reason}")
+
+
+def worst_first(found: Iterable[LintFinding]) -> tuple[LintFinding, ...]:
+    """Sort findings by their severity."""
+    return tuple(sorted(found, key=lambda each: SEVERITIES.index(each.severity)))
 
 
 def of_opset(model: ir.Model) -> Iterator[LintFinding]:
@@ -90,7 +101,8 @@ def _first_version(op_type: str) -> int:
     )
 
 
-def _name(node: ir.Node | None) -> str:
+def name_of(node: ir.Node | None) -> str:
+    """Return what a finding calls a node: its name, or that of its first output."""
     return "" if node is None else node.name or str(node.outputs[0].name)
 
 
@@ -175,7 +187,7 @@ class Target(abc.ABC):
         copy = model.clone()
         graph.infer_shapes(copy)
         found = [finding for rule in self.lint_rules() for finding in rule(copy)]
-        return tuple(sorted(found, key=lambda each: each.severity))
+        return worst_first(found)
 
     def read_back(
         self, model: ir.Model, provider: Provider = CPU

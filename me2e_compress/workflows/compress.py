@@ -43,6 +43,7 @@ from me2e_compress.workflows.compress_result import (
 )
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.int8_outcome import Int8Outcome
+from me2e_compress.workflows.lint import lint_written
 from me2e_compress.workflows.listener import SILENT, Listener
 
 Recipe: TypeAlias = str | Path | Sequence[Pass]
@@ -248,10 +249,7 @@ class Compression:
         modules: ModuleMap,
         frames: SplitFrames,
     ) -> CompressResult:
-        """Try, compress, measure and write; errors are those of :func:`compress`.
-
-        `passes` come from :meth:`CompressOptions.passes`.
-        """
+        """Try, compress, measure and write; errors are those of :func:`compress`."""
         start, options, listener = process_time(), self.options, self.listener
         source, model = loaded.path, loaded.model
         seen = frames.calibration or frames.samples
@@ -272,14 +270,14 @@ class Compression:
         if report.lossy and frames.measured is not None:
             first(report.model, self.output.name)
         loss = measure_loss(report, context, frames, Floor(options.floor), listener)
+        linted = lint_written(report.model, passes, self.output, options.target)
         seconds = process_time() - start
-        return write_result(report, loaded, self.output, int8, loss, seconds)
+        return write_result(report, loaded, self.output, int8, loss, seconds, linted)
 
 
 def _refuse_unproven(report: Report, options: CompressOptions) -> None:
     """Refuse exact passes that could not be run; who asked for no check gets none."""
-    promised = all(step.exact for step in report.steps)
-    if not promised or options.unproven or not options.verify_frames:
+    if report.lossy or options.unproven or not options.verify_frames:
         return
     for check in report.unproven:
         raise PreconditionError(

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError
+from me2e_compress.errors import GraphError, PreconditionError
 from me2e_compress.manager import Report
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.quantization.plan import plan_of, save_plan
@@ -17,8 +17,9 @@ from me2e_compress.runtime.atomic import write_document
 from me2e_compress.workflows.checks import Given, check_folder
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.int8_outcome import Int8Outcome
+from me2e_compress.workflows.lint import LintResult
 from me2e_compress.workflows.measured_loss import MeasuredLoss
-from me2e_compress.workflows.result import Result, Table, megabytes, plain
+from me2e_compress.workflows.result import Result, Status, Table, megabytes, plain
 from me2e_compress.zoo.weights_record import named_weights
 
 
@@ -35,6 +36,7 @@ class CompressResult(Result):
         loss: how true the graph stayed; None where every pass is exact.
         seconds: CPU time of everything but the writing.
         first_frames: of a stack, how each file for first frames came to be, by label.
+        lint: what the target's rules say of the graph; None where nothing is int8.
     """
 
     source: Path
@@ -49,6 +51,7 @@ class CompressResult(Result):
     first_frames: Mapping[str, "CompressResult"] = dataclasses.field(
         default_factory=dict
     )
+    lint: LintResult | None = None
 
     @property
     def report_path(self) -> Path:
@@ -100,7 +103,15 @@ class CompressResult(Result):
         )
         empty = "" if self.int8 is None else self.int8.empty
         lost = () if self.loss is None else self.loss.alerts()
-        return (*filter(None, [empty]), *lost, *first)
+        return (*filter(None, [empty]), *lost, *self._linted(), *first)
+
+    def _linted(self) -> Iterator[str]:
+        """Yield what the target refuses, computes otherwise, or is reported to."""
+        found = self.lint
+        if found is None:
+            return
+        told = (found.refusal, found.miscomputed, found.misreported)
+        yield from (f"lint: {each}" for each in told if each is not None)
 
     def verdict(self) -> Iterator[str]:
         """Yield what became int8, what is proven, and how far the outputs moved."""
@@ -109,6 +120,25 @@ class CompressResult(Result):
         yield from _proof(self.report)
         if self.loss is not None:
             yield from self.loss.lines()
+        if self.lint is not None:
+            yield f"lint: {self.lint.headline}"
+
+    @property
+    def status(self) -> Status:
+        """``refused`` if the target that was asked for refuses what was written."""
+        return super().status if self.refusal is None else "refused"
+
+    @property
+    def refusal(self) -> str | None:
+        """Why the target that the user named refuses a file; None if it takes all."""
+        linted = (each.lint for each in (self, *self.first_frames.values()))
+        asked = (each for each in linted if each is not None and each.asked)
+        return next(filter(None, (each.refusal for each in asked)), None)
+
+    def check(self) -> None:
+        """Raise PreconditionError if the target that was asked for refuses a file."""
+        if self.refusal is not None:
+            raise PreconditionError(f"written, but {self.refusal}")
 
     @property
     def _time(self) -> str:
@@ -141,6 +171,7 @@ class CompressResult(Result):
             "weights": self.weights,
             "int8": self.int8,
             "fidelity": None if self.loss is None else self.loss.record(),
+            "lint": None if self.lint is None else self.lint.summary(),
             "verdict": [*self.verdict(), *self.alerts()],
         }
         return {name: plain(each) for name, each in found.items()}
@@ -245,6 +276,7 @@ def write_result(
     int8: Int8Outcome | None,
     loss: MeasuredLoss | None,
     seconds: float,
+    linted: LintResult | None,
 ) -> CompressResult:
     """Write the graph and its plan, then the report, which vouches for both."""
     plan = plan_of(report.model)  # before writing: metadata may be malformed
@@ -254,7 +286,9 @@ def write_result(
         if plan is not None:
             save_plan(plan, beside(output, "plan"))
         sizes = graph.file_bytes(source), graph.file_bytes(output)
-        made = CompressResult(source, output, report, {}, *sizes, int8, loss, seconds)
+        made = CompressResult(
+            source, output, report, {}, *sizes, int8, loss, seconds, {}, linted
+        )
         record = report.record(source, output) | made.findings()
         write_document(beside(output, "report"), record, indent=2)
     return dataclasses.replace(made, record=record)

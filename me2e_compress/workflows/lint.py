@@ -3,17 +3,27 @@
 import dataclasses
 import functools
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError, RecipeError
-from me2e_compress.passes import Context
+from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import FixShapes
+from me2e_compress.passes.import_normalize import with_own_domains
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.targets import TARGETS, LintFinding, Target
+from me2e_compress.targets import (
+    SEVERITIES,
+    TARGETS,
+    LintFinding,
+    Severity,
+    Target,
+    worst_first,
+)
+from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx import BuildResult, check
 from me2e_compress.workflows.checks import load_map, model_path
 from me2e_compress.workflows.first_opening import try_first
@@ -31,9 +41,12 @@ class LintOptions:
         sm: GPU generation that is built for.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         provider: what opens a graph for onnxruntime.
+        target_version: of TensorRT, such as ``10.13``, whose reported faults count;
+            None tells those of every version.
 
     Raises:
-        RecipeError: TensorRT-RTX or a provider is given for a target it does not serve.
+        RecipeError: TensorRT-RTX, a version or a provider is given for a target it does
+            not serve, or the version is none.
     """
 
     target: str = "tensorrt"
@@ -41,10 +54,15 @@ class LintOptions:
     sm: int = 86
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
     provider: Provider = CPU
+    target_version: str | None = None
 
     def __post_init__(self) -> None:
         if self.trt_check and self.target != "tensorrt":
             raise RecipeError(f"--trt-check is for tensorrt, not for {self.target}")
+        if self.target_version is not None and self.target != "tensorrt":
+            raise RecipeError(
+                f"--target-version is for tensorrt, not for {self.target}"
+            )
         if self.provider != CPU and not self.judge.opens:
             raise RecipeError(
                 f"--provider and --plugins are onnxruntime's: lint for {self.target}"
@@ -54,55 +72,108 @@ class LintOptions:
     @functools.cached_property
     def judge(self) -> Target:
         """The target, whose rules judge the graph."""
-        return TARGETS.parse(self.target)
+        if self.target_version is None:
+            return TARGETS.parse(self.target)
+        try:
+            return TensorRT(version=self.target_version)
+        except ValueError as reason:
+            raise RecipeError(f"--target-version: {reason}") from reason
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class LintResult(Result):
-    """The findings of our rules, and TensorRT-RTX's answer; None if not asked."""
+    """The findings of our rules, and TensorRT-RTX's answer.
+
+    Attributes:
+        model: the file.
+        options: what was asked, and how.
+        findings: the worst first.
+        build: TensorRT-RTX's answer; None if not asked.
+        asked: whether a user named the target; else a pass did.
+    """
 
     model: Path
     options: LintOptions
     findings: tuple[LintFinding, ...]
-    build: BuildResult | None
+    build: BuildResult | None = None
+    asked: bool = True
 
     @property
     def refusal(self) -> str | None:
         """Why the target would refuse the graph, in one line; None if it would not."""
-        errors = [each for each in self.findings if each.severity == "error"]
-        if errors:
-            first = errors[0]
-            return (
-                f"{self.model}: {self.options.target} refuses it,"
-                f" {counted(len(errors), 'error')};"
-                f" {first.rule} {first.node!r}: {first.message}"
-            )
+        if said := self._first("error", f"{self.options.target} refuses it"):
+            return said
         if self.build is not None and not self.build.passed:
             return f"{self.model}: {_why(self.build)}"
         return None
 
     @property
+    def miscomputed(self) -> str | None:
+        """What the target would run, and compute otherwise; None if nothing."""
+        return self._first("wrong", f"{self.options.target} computes it otherwise")
+
+    @property
+    def misreported(self) -> str | None:
+        """What users report that the target computes wrongly; None if nothing."""
+        return self._first(
+            "reported wrong", f"{self.options.target} is reported to compute it wrongly"
+        )
+
+    def _first(self, severity: Severity, what: str) -> str | None:
+        """Count the findings of a severity, and tell the first."""
+        found = [each for each in self.findings if each.severity == severity]
+        if not found:
+            return None
+        first, noun = found[0], "error" if severity == "error" else "finding"
+        return (
+            f"{self.model}: {what}, {counted(len(found), noun)};"
+            f" {first.rule} {first.node!r}: {first.message}"
+        )
+
+    @property
     def status(self) -> Status:
-        """``refused`` if the target would not accept the graph."""
-        if self.refusal is not None:
+        """``refused`` if the target would not accept the graph, or miscompute it."""
+        if self.refusal is not None or self.miscomputed is not None:
             return "refused"
         return "warning" if self.findings else "ok"
 
     def check(self) -> None:
-        """Raise PreconditionError unless the target accepts the graph."""
-        if self.refusal is not None:
-            raise PreconditionError(self.refusal)
+        """Raise PreconditionError unless the target runs the graph, and rightly."""
+        if (reason := self.refusal or self.miscomputed) is not None:
+            raise PreconditionError(reason)
 
     @property
     def headline(self) -> str:
-        """The number of errors and warnings."""
+        """The number of findings of each severity, by our own rules and tables."""
         counts = Counter(each.severity for each in self.findings)
+        always = ("error", "warning")
+        said = [
+            counted(counts[each], each) if each in always else f"{counts[each]} {each}"
+            for each in SEVERITIES
+            if counts[each] or each in always
+        ]
+        version = self.options.target_version
+        runtime = f"{self.options.target} {version}" if version else self.options.target
         return (
-            f"{self.model.name} for {self.options.target}:"
-            f" {counted(counts['error'], 'error')},"
-            f" {counted(counts['warning'], 'warning')} (our own rules and operator"
-            " tables)"
+            f"{self.model.name} for {runtime}: {', '.join(said)}"
+            " (our own rules and operator tables)"
         )
+
+    def summary(self) -> list[dict[str, object]]:
+        """Return one row per rule: its severity, its nodes, and the first of them."""
+        rows: dict[tuple[str, str], list[LintFinding]] = {}
+        for each in self.findings:
+            rows.setdefault((each.severity, each.rule), []).append(each)
+        return [
+            {
+                "severity": severity,
+                "rule": rule,
+                "nodes": len(found),
+                "first": found[0].node,
+                "message": found[0].message,
+            }
+            for (severity, rule), found in rows.items()
+        ]
 
     def lines(self) -> tuple[str, ...]:
         """Return the headline, and TensorRT-RTX's answer."""
@@ -165,6 +236,22 @@ def lint(
     return LintResult(path, options, found, build)
 
 
+def lint_written(
+    model: ir.Model, passes: Sequence[Pass], output: Path, asked: str | None
+) -> LintResult | None:
+    """Ask the rules of the target that passes wrote int8 for; None where none did.
+
+    `output` is where the graph will be; it is not opened. `asked` is the target that
+    the user named, if any.
+    """
+    targets = [each.target for each in passes if isinstance(each, QuantizeInt8)]
+    if not targets:
+        return None
+    options = LintOptions(targets[-1])
+    found = options.judge.lint(with_own_domains(model))
+    return LintResult(Path(output.name), options, found, asked=asked is not None)
+
+
 def _found(
     model: ir.Model, name: str, options: LintOptions, listener: Listener
 ) -> tuple[LintFinding, ...]:
@@ -180,7 +267,7 @@ def _found(
     opened = [
         each for each in judge.read_back(model, provider) if each.node not in known
     ]
-    return tuple(sorted((*found, *opened), key=lambda each: each.severity))
+    return worst_first((*found, *opened))
 
 
 def _said(verdict: BuildResult, sm: int) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from me2e_compress.passes.convert_float16 import ConvertFloat16
 from me2e_compress.passes.convert_float32 import ConvertFloat32
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.session import Session
-from me2e_compress.targets import TARGETS
+from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.testing import check_pass
 from tests.frames import record
 from tests.nets import MODULES, conv_attention
@@ -53,7 +53,7 @@ def test_scales_are_of_the_type_of_the_graph(context: Context) -> None:
     placed = check_pass(PAPER, source, context).model
 
     assert scales(placed) == {"FLOAT16"}
-    assert TARGETS.parse("tensorrt").lint(placed) == ()
+    assert TensorRT(version="10.7").lint(placed) == ()
     found = compare(Session(source), Session(placed), list(context.frames or ()))
     assert min(each.sqnr_db for each in found.outputs) > 20
 
@@ -65,7 +65,7 @@ def test_int8_first_and_float16_then_gives_the_same_types(context: Context) -> N
     both = check_pass(ConvertFloat16(), int8, context).model
 
     assert scales(both) == {"FLOAT16"}
-    assert TARGETS.parse("tensorrt").lint(both) == ()
+    assert TensorRT(version="10.7").lint(both) == ()
     weights = {v.dtype.name for v in both.graph.initializers.values() if v.dtype}
     assert weights == {"FLOAT16", "INT8", "INT64"}
 

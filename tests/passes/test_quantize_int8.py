@@ -110,32 +110,6 @@ def test_the_rules_of_the_default_keep_small_layers_in_float(context: Context) -
     assert f"1 of 10 nodes int8; by rule: {rules}" in notes
 
 
-@pytest.mark.parametrize("target", ["tensorrt", "onnxruntime"])
-def test_what_was_placed_is_held_against_its_target(
-    context: Context, target: str
-) -> None:
-    notes = (
-        QuantizeInt8(rules="paper", target=target).run(conv_attention(), context).notes
-    )
-
-    assert notes[-1] == f"lint for {target}: nothing found"
-
-
-def test_what_the_target_refuses_is_noted(context: Context) -> None:
-    text = """
-    <ir_version: 9, opset_import: ["" : 17]>
-    det (float[1,3,8,8] image, float[8,3,1,1] w) => (float[1,8] y) {
-        ["/backbone/Conv"] a = Conv(image, w)
-        ["/backbone/Det"] y = Det(a)
-    }
-    """
-    model = net(text, {"w": np.ones((8, 3, 1, 1))})
-
-    notes = QuantizeInt8(rules="paper", scheme="feature-ext").run(model, context).notes
-
-    assert "TensorRT's parser does not take Det" in notes[-1]
-
-
 def test_a_rule_that_is_switched_off_objects_to_nothing(context: Context) -> None:
     options = QuantizeInt8(without=("small-product", "attention-weights"))
 

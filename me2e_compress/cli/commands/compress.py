@@ -78,3 +78,4 @@ def compress(
     with listening() as listener:
         found = workflow.compress(model, output, wanted, frames, options, listener)
     show(found)
+    found.check()

@@ -14,6 +14,9 @@ from me2e_compress.workflows.checks import sizes
 TrtCheck = Annotated[
     bool, typer.Option("--trt-check", help="also parse and build it by TensorRT-RTX")
 ]
+TargetVersion = Annotated[
+    str | None, typer.Option(help="of tensorrt, as 10.13: only what it is reported for")
+]
 
 
 def lint(
@@ -22,6 +25,7 @@ def lint(
         str, typer.Option(help="runtime of the graph: tensorrt or onnxruntime")
     ] = "tensorrt",
     trt_check: TrtCheck = False,
+    target_version: TargetVersion = None,
     sm: Annotated[int, typer.Option(help="GPU generation that is built for")] = 86,
     set_dim: given.SetDim = None,
     provider: given.Provider = "cpu",
@@ -29,7 +33,8 @@ def lint(
 ) -> None:
     """Check a graph for the runtime that will run it; exit code 1 if it refuses."""
     runs = provider_named(provider, plugins or ())
-    options = workflow.LintOptions(target, trt_check, sm, sizes(set_dim or ()), runs)
+    dims = sizes(set_dim or ())
+    options = workflow.LintOptions(target, trt_check, sm, dims, runs, target_version)
     with listening() as listener:
         found = workflow.lint(model, options, listener)
     every = found.tables(shown=len(found.findings)) if is_verbose() else None

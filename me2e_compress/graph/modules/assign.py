@@ -6,6 +6,7 @@ import onnx_ir as ir
 
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.graph.modules.assignment import Assignment, Placement
+from me2e_compress.graph.modules.detect import behind_a_prefix
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.modules.paths import parameter_path, scope_of
 
@@ -63,6 +64,7 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
         raise ModuleMapError(
             f"map {modules.name}: none of its patterns matches a parameter or a scope"
             f" of this graph, which has {_sample(model, scopes)}"
+            f"{behind_a_prefix(modules, _every_path(model, scopes))}"
         )
     for node, module in _spread(nodes, known, constant).items():
         placed.setdefault(node, Placement(module, "neighbour"))
@@ -74,14 +76,19 @@ def _check(model: ir.Model, modules: ModuleMap, scopes: Mapping[ir.Node, str]) -
     if not wanted:
         return
     # each required pattern must match a parameter or a scope
-    paths = dict.fromkeys(scopes.values()) | dict.fromkeys(_parameters(model))
+    paths = _every_path(model, scopes)
     found = {claim for path in paths for claim in modules.claims(path)}
     for module, pattern in wanted:
         if (module, pattern) not in found:
             raise ModuleMapError(
                 f"map {modules.name}: pattern {pattern!r} of module {module} matches"
                 f" no parameter and no scope; there are {_sample(model, scopes)}"
+                f"{behind_a_prefix(modules, paths)}"
             )
+
+
+def _every_path(model: ir.Model, scopes: Mapping[ir.Node, str]) -> dict[str, None]:
+    return dict.fromkeys(scopes.values()) | dict.fromkeys(_parameters(model))
 
 
 def _sample(model: ir.Model, scopes: Mapping[ir.Node, str]) -> str:

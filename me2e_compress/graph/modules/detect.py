@@ -1,12 +1,12 @@
 """Find the preset that fits a graph."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import onnx_ir as ir
 
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.graph.modules.module_map import ModuleMap, presets
-from me2e_compress.graph.modules.paths import parameter_path, scope_of
+from me2e_compress.graph.modules.paths import PathGlob, parameter_path, scope_of
 
 STACK = "me2e.stack"
 """Model metadata in which our exporters name the stack, e.g. ``vad-tiny``."""
@@ -81,8 +81,42 @@ def map_of_files(
             raise ModuleMapError(
                 f"map {found.name}: pattern {pattern!r} of module {module} matches no"
                 " parameter and no scope in any of the files"
+                f"{behind_a_prefix(found, paths)}"
             )
     return found.lenient()
+
+
+_DEEPEST = 3
+"""Components of a prefix that is looked for: wrappers nest this deep at most."""
+
+
+def behind_a_prefix(modules: ModuleMap, paths: Iterable[str]) -> str:
+    """Suggest what a map lacks where a prefix hides its names; empty if none does.
+
+    The prefix behind which most of its patterns match a path is named, with the first
+    of them.
+    """
+    found: dict[str, dict[tuple[str, str], None]] = {}
+    for path in paths:
+        parts = [part for part in path.split(".") if part]
+        for depth in range(1, min(_DEEPEST, len(parts) - 1) + 1):
+            if claims := modules.claims(".".join(parts[depth:])):
+                prefix = ".".join(parts[:depth])
+                found.setdefault(prefix, {}).update(dict.fromkeys(claims))
+    # a pattern that matches anywhere matches without a prefix, too
+    named = {
+        prefix: [text for _, text in claims if not PathGlob(text).anywhere]
+        for prefix, claims in found.items()
+    }
+    best = max(named, key=lambda prefix: (len(named[prefix]), -len(prefix)), default="")
+    if not best or not named[best]:
+        return ""
+    strip = ", ".join(f'"{part}"' for part in best.split("."))
+    return (
+        f"; behind the prefix {best!r} {len(named[best])} of its patterns match, as"
+        f" {f'{best}.{named[best][0]}'!r}: write strip = [{strip}] into a copy of the"
+        " map"
+    )
 
 
 def _fit(modules: ModuleMap, paths: list[str]) -> tuple[float, int]:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import onnx_ir as ir
 
+from me2e_compress.display import counted
 from me2e_compress.graph import graphs_of, nodes_of, provenance
 
 _TYPE_ATTRIBUTES = ("to", "dtype", "output_datatype")
@@ -16,7 +17,7 @@ _BY_WIDTH = ("BitCast",)
 
 
 def demote(model: ir.Model, by: str) -> tuple[int, str]:
-    """Turn float64 into float32 everywhere; return the changes, and why doubles stayed.
+    """Turn float64 into float32 everywhere; return the changes, and what to say of it.
 
     Nothing changes where an input, output or unknown operator has doubles. Finite
     numbers beyond float32's range are clipped, so that a mask of ``-1.8e308`` stays
@@ -34,11 +35,14 @@ def demote(model: ir.Model, by: str) -> tuple[int, str]:
         if found := _demote_attributes(node):
             provenance.inherit(node, [node], by=by)
             count += found
+    nodes = dict[ir.Node, None]()
     for value in _values(model):
         if value.type is not None and _is_double(value.type):
             value.type = _single(value.type)
             count += 1
-    return count, ""
+            if (node := value.producer()) is not None:
+                nodes[node] = None
+    return count, f"float64 became float32: {counted(len(nodes), 'node')}"
 
 
 def _doubles(model: ir.Model) -> Iterator[object]:

@@ -16,11 +16,13 @@ from me2e_compress.graph import (
 )
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN
 from me2e_compress.operators import find
+from me2e_compress.runtime.kernel_types import without_kernel
 from me2e_compress.runtime.runnable import known_operators
 from me2e_compress.targets.base import (
     LintFinding,
     LintRule,
     error,
+    name_of,
     of_opset,
     valid,
     warning,
@@ -60,6 +62,12 @@ def _remedy(node: ir.Node) -> str:
     return ": attach-bodies writes one, expand-operators the body in its place"
 
 
+def kernels(model: ir.Model) -> Iterator[LintFinding]:
+    """Find operators that have a kernel, but none for these element types."""
+    for node, missing in without_kernel(model):
+        yield error("kernel", node, missing)
+
+
 def signed_activations(model: ir.Model) -> Iterator[LintFinding]:
     """Find layers that read int8: only uint8 by int8 has fast kernels.
 
@@ -92,7 +100,7 @@ def unanswered(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def padded_pools(model: ir.Model) -> Iterator[LintFinding]:
-    """Find a Pad of zeros before a MaxPool, which onnxruntime 1.31 computes wrongly.
+    """Find a Pad of zeros before a MaxPool: onnxruntime 1.31 computes it wrongly.
 
     Its Pad fusion turns the zeros into the pool's own padding, which is minus infinity;
     inputs that are never negative give the same result. Our own sessions disable it.
@@ -104,9 +112,10 @@ def padded_pools(model: ir.Model) -> Iterator[LintFinding]:
         # Without negative values the result is the same.
         before = producer_of(pad.inputs[0])
         if before is None or before.op_type not in _NEVER_NEGATIVE:
-            yield error(
+            yield LintFinding(
+                "wrong",
                 "padded-pool",
-                node,
+                name_of(node),
                 f"reads the zeros of Pad {pad.name!r}: onnxruntime's Pad fusion makes "
                 "them minus infinity; open it with disabled_optimizers=['Pad_Fusion']",
             )
@@ -140,6 +149,7 @@ RULES: tuple[LintRule, ...] = (
     of_opset,
     opset,
     operators,
+    kernels,
     signed_activations,
     unanswered,
     padded_pools,

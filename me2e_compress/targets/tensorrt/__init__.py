@@ -27,7 +27,8 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.targets.base import LintRule, Target
 from me2e_compress.targets.tensorrt.costs import MACHINES, costs_of
-from me2e_compress.targets.tensorrt.lint import RULES
+from me2e_compress.targets.tensorrt.lint import rules
+from me2e_compress.targets.tensorrt.lint.support_matrix import version_of
 from me2e_compress.targets.weights import QuantizedWeight, weights_of
 from me2e_compress.targets.writer import Writer
 
@@ -41,17 +42,22 @@ class TensorRT(Target):
     Attributes:
         machine: ``orin``: layers that are predicted to be slower there in int8 than in
             float16 stay float (rule ``cost``); empty predicts nothing.
+        version: of TensorRT, such as ``10.13``, that :meth:`lint` asks; empty asks
+            every one and names them.
     """
 
     name: ClassVar[str] = "tensorrt"
     half_since: ClassVar[int | None] = 19
     machine: str = ""
+    version: str = ""
 
     def __post_init__(self) -> None:
         if self.machine and self.machine not in MACHINES:
             raise ValueError(
                 f"no machine {self.machine}; there are {', '.join(MACHINES)}"
             )
+        if self.version:
+            version_of(self.version)
 
     def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
         """List the inputs of weighted layers and residual branches."""
@@ -100,7 +106,7 @@ class TensorRT(Target):
 
     def lint_rules(self) -> tuple[LintRule, ...]:
         """Return the rules of its parser and of explicit quantization."""
-        return RULES
+        return rules(version_of(self.version) if self.version else None)
 
 
 class _Pairs:

@@ -126,3 +126,54 @@ def test_pads_that_onnxruntime_folds_into_a_pool(
 
     assert [each.rule for each in lint] == found
     assert all("Pad 'edge'" in each.message for each in lint)
+    assert {each.severity for each in lint} <= {"wrong"}  # it runs
+
+
+SAMPLED = "(float[1,1,2,2] x, double[1,1,1,2] g) => (float[1,1,1,1] y)"
+SAMPLE = """
+    a = Cast<to=11>(x) [sampler] s = GridSample(a, g) y = Cast<to=1>(s)
+"""
+
+
+def no_kernels(opset: int, signature: str, body: str) -> list[str]:
+    model = ir.from_onnx_text(
+        f'<ir_version: 9, opset_import: ["" : {opset}]> m {signature} {{ {body} }}'
+    )
+    return [
+        f"{each.node}: {each.message}"
+        for each in OnnxRuntime().lint(model)
+        if each.rule == "kernel" and each.severity == "error"
+    ]
+
+
+def test_types_that_no_kernel_takes() -> None:
+    assert no_kernels(16, SAMPLED, SAMPLE) == [
+        "sampler: onnxruntime has no kernel for GridSample of float64"
+    ]
+
+
+def test_types_that_a_newer_kernel_takes() -> None:
+    assert no_kernels(20, SAMPLED, SAMPLE) == []
+
+
+def test_float64_within_a_graph_has_a_remedy() -> None:
+    signature = SAMPLED.replace("double[1,1,1,2]", "float[1,1,1,2]")
+    body = SAMPLE.replace("(a, g)", "(a, b)").replace("a =", "b = Cast<to=11>(g) a =")
+
+    (said,) = no_kernels(16, signature, body)
+
+    assert said.endswith(": compress -r exact makes it float32")
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        "(float16[2] x) => (float16[2] y) { y = Erf(x) }",  # cast to float32
+        "(double[2] x) => (double[2] y) { y = Gelu(x) }",  # made of others
+        "(double[2] x) => (double[2] y) { a = Sigmoid(x) y = Mul(x, a) }",
+    ],
+)
+def test_types_that_onnxruntime_gets_along_with(call: str) -> None:
+    signature, _, body = call.partition(" {")
+
+    assert no_kernels(20, signature, body.rstrip("}")) == []

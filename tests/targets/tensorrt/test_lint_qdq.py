@@ -11,16 +11,17 @@ from me2e_compress.graph import rewrite
 from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.targets import TARGETS, LintFinding
+from me2e_compress.targets import LintFinding
 from me2e_compress.targets.tensorrt import TensorRT
 from tests.nets import MODULES, conv_attention, net
 
 FULL = QuantScheme.named("full", MODULES)
+RUNTIME = TensorRT(version="10.7")
 
 
 def found(text: str, opset: int = 17) -> list[tuple[str, str, str]]:
     model = ir.from_onnx_text(f'<ir_version: 9, opset_import: ["" : {opset}]>' + text)
-    return [shown(each) for each in TARGETS.parse("tensorrt").lint(model)]
+    return [shown(each) for each in RUNTIME.lint(model)]
 
 
 def shown(finding: LintFinding) -> tuple[str, str, str]:
@@ -36,7 +37,7 @@ def placed(rules: str) -> ir.Model:
 
 @pytest.mark.parametrize("rules", ["paper", "tensorrt"])
 def test_what_we_place_has_no_findings(rules: str) -> None:
-    assert TARGETS.parse("tensorrt").lint(placed(rules)) == ()
+    assert RUNTIME.lint(placed(rules)) == ()
 
 
 def _scale(value: float) -> Callable[[ir.Model], None]:
@@ -128,7 +129,7 @@ def test_what_is_broken_is_found(
     model = placed("paper")
     change(model)
 
-    ours = [each for each in TARGETS.parse("tensorrt").lint(model) if each.rule == rule]
+    ours = [each for each in RUNTIME.lint(model) if each.rule == rule]
 
     assert ours
     assert message in ours[0].message
@@ -249,6 +250,4 @@ def test_graphs_of_other_quantizers_are_judged_the_same() -> None:
     """
     model = net(text, {"w": np.ones((16, 16))})
 
-    assert [each.rule for each in TARGETS.parse("tensorrt").lint(model)] == [
-        "float-weight"
-    ]
+    assert [each.rule for each in RUNTIME.lint(model)] == ["float-weight"]

@@ -12,7 +12,6 @@ TAKEN = "m (float[9] x, int64[1] k) => (float[A] y, int64[A] i) <int64[1] most =
 DEFORMED = (
     "m (float[1,1,4,4] x, float[1,1,1,1] w, float[1,2,6,6] o) => (float[1,1,A,B] y)"
 )
-SCATTERED = "m (float[4] x, int64[2] i, float[2] u) => (float[4] y)"
 RECURRENT = "m (float[2,1,4] x, float[1,12,4] w, float[1,12,3] r) => (float[2,1,1,3] y)"
 NORMALIZED = "m (float[2,4] x, float[4] g) => (float[2,4] y, float[2,1] mean)"
 REDUCED = "m (float[2,4] x, int64[1] a) => (float[2,1] y) <int64[1] one = {1}>"
@@ -53,12 +52,6 @@ CALLS = [
         DEFORMED,
         "y = DeformConv<pads=[0,1,2,1]>(x, w, o)",
         "pads [0, 1, 2, 1] differ between begin and end",
-    ),
-    (SCATTERED, "y = ScatterElements(x, i, u)", None),
-    (
-        SCATTERED,
-        'y = ScatterElements<reduction="max">(x, i, u)',
-        "reduction max, must be none",
     ),
     (RECURRENT, "y = LSTM<hidden_size=3>(x, w, r)", None),
     (RECURRENT, "y = LSTM<hidden_size=3, layout=1>(x, w, r)", "layout must be 0"),

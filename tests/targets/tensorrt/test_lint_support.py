@@ -5,6 +5,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.targets import TARGETS, LintFinding
+from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.lint.support_matrix import (
     LATER,
     SUPPORTED,
@@ -95,10 +96,11 @@ def test_every_operator_of_onnx_is_in_one_list() -> None:
             "GridSample: rank 5, must be 4",
         ),
         (
-            "m (float[1,1,9] x, float[1,1,3] w) => (float[1,1,7] y) { y = Conv(x, w) }",
+            "m (float[1,1,2,2,2,2] x, float[1,1,1,1,1,1] w) => (float[A] y)"
+            " { y = Conv(x, w) }",
             17,
             "restriction",
-            "Conv: rank 3, must be 4 or 5",
+            "Conv: rank 6, must be 3, 4 or 5",
         ),
         (
             "m (float[1,1,4,4] x) => (float[1,1,2,2] y, int64[1,1,2,2] i)"
@@ -121,6 +123,36 @@ def test_what_the_parser_does_not_take(
     assert (rule, message) in said(text, opset)
 
 
+@pytest.mark.parametrize(
+    "call",
+    [
+        "(int64[2] x, int64 a, int64 b) => (int64[2] y) { y = Clip(x, a, b) }",
+        "(int32[2] x, int32 a) => (int32[2] y) { y = Clip(x, a) }",
+        "(bool[2] x) => (int64[1,A] y) { y = NonZero(x) }",
+        "(int64[2] x) => (int64[1,A] y) { y = NonZero(x) }",
+        "(bool[2] x, bool[2] a) => (bool[2] y) { y = Equal(x, a) }",
+        "(float[1,1,9] x, float[1,1,3] w) => (float[1,1,7] y) { y = Conv(x, w) }",
+        "(float[1,1,9] x) => (float[1,1,7] y) { y = MaxPool<kernel_shape=[3]>(x) }",
+        "(float[4] x, int64[2] i, float[2] u) => (float[4] y)"
+        ' { y = ScatterElements<reduction="max">(x, i, u) }',
+    ],
+)
+def test_what_the_importers_take_beyond_the_matrix(call: str) -> None:
+    assert said(f"m {call}", 19) == []
+
+
+@pytest.mark.parametrize(
+    ("version", "severity"), [("", "warning"), ("10.11", "error"), ("10.12", None)]
+)
+def test_a_type_that_came_later(version: str, severity: str | None) -> None:
+    text = "m (int64[2] x, int64[2] p) => (int64[2] y) { y = Pow(x, p) }"
+    model = ir.from_onnx_text(f'<ir_version: 9, opset_import: ["" : 17]> {text}')
+
+    findings = TensorRT(version=version).lint(model)
+
+    assert [each.severity for each in findings] == ([severity] if severity else [])
+
+
 def test_two_float_types_in_one_operator() -> None:
     (each,) = (
         each
@@ -133,13 +165,27 @@ def test_two_float_types_in_one_operator() -> None:
 
 
 @pytest.mark.parametrize(
-    ("opset", "severity"), [(8, "error"), (9, None), (20, None), (21, "warning")]
+    ("opset", "version", "severity"),
+    [
+        (8, "", "error"),
+        (9, "", None),
+        (20, "", None),
+        (21, "", "warning"),
+        (25, "", "warning"),
+        (26, "", "error"),
+        (21, "10.13", "warning"),
+        (24, "10.15", None),
+        (25, "11.4", "warning"),
+        (25, "11.5", None),
+    ],
 )
-def test_opsets(opset: int, severity: str | None) -> None:
+def test_opsets(opset: int, version: str, severity: str | None) -> None:
     text = "m (float[2] x) => (float[2] y) { y = Relu(x) }"
+    head = f'<ir_version: 9, opset_import: ["" : {opset}]>'
 
-    rules = {each.rule: each.severity for each in found(text, opset)}
+    found = TensorRT(version=version).lint(ir.from_onnx_text(head + text))
 
+    rules = {each.rule: each.severity for each in found}
     assert rules.get("opset") == severity
 
 

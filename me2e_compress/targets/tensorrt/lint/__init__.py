@@ -1,17 +1,14 @@
-"""Lint rules: does TensorRT's parser accept a graph, and is its int8 run as int8?"""
+"""Lint rules: does TensorRT's parser accept a graph, and is its int8 run as int8?
+
+And does a version of TensorRT, as users report, compute it wrongly or slowly?
+"""
 
 from me2e_compress.targets.base import LintRule, of_opset, valid
-from me2e_compress.targets.tensorrt.lint import (
-    qdq,
-    support,
-)
+from me2e_compress.targets.tensorrt.lint import qdq, support
+from me2e_compress.targets.tensorrt.lint.reported import reported
+from me2e_compress.targets.tensorrt.lint.support_matrix import Version
 
-RULES: tuple[LintRule, ...] = (
-    valid,
-    of_opset,
-    support.opset,
-    support.operators,
-    support.element_types,
+_RULES: tuple[LintRule, ...] = (
     support.one_type,
     support.plugins,
     support.plugin_shapes,
@@ -29,3 +26,10 @@ RULES: tuple[LintRule, ...] = (
     qdq.half_quantized,
     qdq.float_weights,
 )
+
+
+def rules(version: Version | None) -> tuple[LintRule, ...]:
+    """Return the rules for a version of TensorRT; None for any since 8.6."""
+    parser = support.Parser(version)
+    found = (parser.opset, parser.operators, parser.element_types)
+    return (valid, of_opset, *found, *_RULES, reported(version))

@@ -1,5 +1,6 @@
 """Parser support: operators, plugins, opsets, types, and restrictions."""
 
+import dataclasses
 from collections.abc import Callable, Iterator
 
 import onnx_ir as ir
@@ -12,67 +13,84 @@ from me2e_compress.targets.base import LintFinding, error, warning
 from me2e_compress.targets.quantized import PAIR
 from me2e_compress.targets.tensorrt.lint.support_matrix import (
     LATER,
+    NEWEST_OPSETS,
     SUPPORTED,
+    TYPES_LATER,
     UNSUPPORTED,
     Plugin,
+    Version,
     known_plugins,
+    version_of,
 )
 
-OPSETS = (9, 20, 24)
-"""Oldest opset; newest of TensorRT 10.1; newest of 10.15."""
+OLDEST_OPSET = 9
 
 _DATA_INPUT = {"OneHot": 2, "Where": 1}
 _TYPE_OF_OUTPUT = ("Constant", "ConstantOfShape", "If", "Loop", "RandomNormal")
 _UNTYPED = ("RandomUniform", "Scan", "Shape", "Size")
 
 
-def opset(model: ir.Model) -> Iterator[LintFinding]:
-    """Check the graph's opset against those that parsers read."""
-    found = opset_of(model)
-    oldest, newest, later = OPSETS
-    if not oldest <= found <= later:
-        yield error("opset", None, f"opset {found}: parsers read {oldest} to {later}")
-    elif found > newest:
-        yield warning(
-            "opset", None, f"opset {found} needs TensorRT 10.15; 10.1 reads {newest}"
-        )
+@dataclasses.dataclass(frozen=True)
+class Parser:
+    """What the parser of one version takes; of None, what came late is a warning."""
 
+    version: Version | None = None
 
-def operators(model: ir.Model) -> Iterator[LintFinding]:
-    """Find operators that the parser refuses, or that are unknown."""
-    for node in nodes_of(model):
-        if is_plugin(node) or node.op_type in PAIR:
-            continue
-        name = node.op_type
-        if name in UNSUPPORTED:
-            yield error("operator", node, f"TensorRT's parser does not take {name}")
-        elif name in LATER:
-            yield warning(
-                "operator", node, f"{name} needs TensorRT {LATER[name]} or later"
-            )
-        elif name not in SUPPORTED:
-            yield error("operator", node, f"{name} stands in no support matrix")
+    def opset(self, model: ir.Model) -> Iterator[LintFinding]:
+        """Check the graph's opset against those that parsers read."""
+        found, last = opset_of(model), max(NEWEST_OPSETS.values())
+        if not OLDEST_OPSET <= found <= last:
+            said = f"opset {found}: parsers read {OLDEST_OPSET} to {last}"
+            yield error("opset", None, said)
+            return
+        # never an error: it was read from some version in between on
+        since = next(each for each, newest in NEWEST_OPSETS.items() if found <= newest)
+        oldest, given = next(iter(NEWEST_OPSETS)), self.version
+        if since != oldest and (given is None or given < version_of(since)):
+            said = f"TensorRT {since} reads it, {oldest} reads {NEWEST_OPSETS[oldest]}"
+            yield warning("opset", None, f"opset {found}: {said}")
 
+    def operators(self, model: ir.Model) -> Iterator[LintFinding]:
+        """Find operators that the parser refuses, or that are unknown."""
+        for node in nodes_of(model):
+            if is_plugin(node) or node.op_type in PAIR:
+                continue
+            name = node.op_type
+            if name in UNSUPPORTED:
+                yield error("operator", node, f"TensorRT's parser does not take {name}")
+            elif name in LATER:
+                yield from self._late("operator", node, name, LATER[name])
+            elif name not in SUPPORTED:
+                yield error("operator", node, f"{name} stands in no support matrix")
 
-def element_types(model: ir.Model) -> Iterator[LintFinding]:
-    """Find data of a type that its operator does not accept."""
-    for node in nodes_of(model):
-        taken = SUPPORTED.get(node.op_type) if is_standard(node) else None
-        kind = _data_type(node)
-        if taken is None or kind is None or kind in taken:
-            continue
-        # TensorRT casts float64 down by itself.
-        if kind == ir.DataType.DOUBLE:
-            yield warning(
-                "element-type", node, f"{node.op_type} of float64 is cast down"
-            )
-        elif node.op_type not in _UNTYPED:
-            names = ", ".join(sorted(each.name.lower() for each in taken))
-            yield error(
-                "element-type",
-                node,
-                f"{node.op_type} of {kind.name.lower()}; it accepts {names}",
-            )
+    def element_types(self, model: ir.Model) -> Iterator[LintFinding]:
+        """Find data of a type that its operator does not accept."""
+        for node in nodes_of(model):
+            taken = SUPPORTED.get(node.op_type) if is_standard(node) else None
+            kind = _data_type(node)
+            if taken is None or kind is None:
+                continue
+            what = f"{node.op_type} of {kind.name.lower()}"
+            late, since = TYPES_LATER.get(node.op_type, (frozenset(), ""))
+            if kind in late:
+                yield from self._late("element-type", node, what, since)
+            elif kind == ir.DataType.DOUBLE:  # TensorRT casts it down by itself
+                said = f"{node.op_type} of float64 is cast down"
+                yield warning("element-type", node, said)
+            elif kind not in taken and node.op_type not in _UNTYPED:
+                names = ", ".join(sorted(each.name.lower() for each in taken))
+                yield error("element-type", node, f"{what}; it accepts {names}")
+
+    def _late(
+        self, rule: str, node: ir.Node | None, what: str, since: str
+    ) -> Iterator[LintFinding]:
+        """Say that something needs a version: an error if the parser is older."""
+        if self.version is None:
+            yield warning(rule, node, f"{what} needs TensorRT {since} or later")
+        elif self.version < version_of(since):
+            given = ".".join(map(str, self.version))
+            said = f"{what} needs TensorRT {since} or later, not {given}"
+            yield error(rule, node, said)
 
 
 def one_type(model: ir.Model) -> Iterator[LintFinding]:
@@ -184,9 +202,9 @@ def restrictions(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def _image(node: ir.Node) -> str | None:
-    """Check for two or three spatial dimensions."""
+    """Check for at most three spatial dimensions; one is made two by the parser."""
     rank = rank_of(node.inputs[0])
-    return None if rank in (None, 4, 5) else f"rank {rank}, must be 4 or 5"
+    return None if rank in (None, 3, 4, 5) else f"rank {rank}, must be 3, 4 or 5"
 
 
 def _four(node: ir.Node) -> str | None:
@@ -267,7 +285,6 @@ _CHECKS: dict[str, tuple[Callable[[ir.Node], str | None], ...]] = {
     "MaxPool": (_image, _undilated, _first_output),
     "OneHot": (_constant(1, "depth"),),
     "Resize": (_resize,),
-    "ScatterElements": (_no_reduction,),
     "ScatterND": (_no_reduction,),
     "Squeeze": (_constant(1, "axes"),),
     "TopK": (_top_k,),

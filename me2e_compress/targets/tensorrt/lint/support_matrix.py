@@ -1,15 +1,21 @@
 """Tables of the operators that TensorRT's ONNX parser supports, and of plugins.
 
 Operators are those of onnx-tensorrt's support matrix, ``docs/operators.md``, of
-TensorRT 10.15; those that 10.1 (opset 20) did not support are listed apart. Others are
-unknown, and reported. Names, inputs and attributes of plugins come from the dialects of
-the fused operators. TensorRT finds a plugin by the node's operator name,
+TensorRT 10.15 (onnx/onnx-tensorrt fa5aa9f, the newest of which the sources could be
+had), with what its importers (``onnxOpImporters.cpp`` and ``importerUtils.cpp`` of
+10.1, 10.10 and 10.15) take beyond it: integers in Clip (by Max and Min) and NonZero,
+booleans in Equal and NonZero, convolutions and pools of one spatial dimension, and
+ScatterElements with a reduction. What came after 10.1 has the version of its changelog.
+Others are unknown, and reported. Names, inputs and attributes of plugins come from the
+dialects of the fused operators. TensorRT finds a plugin by the node's operator name,
 ``plugin_version`` and ``plugin_namespace``.
 """
 
 import dataclasses
 import functools
+import re
 from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 import onnx_ir as ir
 
@@ -25,9 +31,9 @@ _CAST = _ANY | {ir.DataType.UINT8}
 
 _BY_TYPE: dict[frozenset[ir.DataType], str] = {
     _BOOL: "And Not Or Xor",
-    _HALF: "DeformConv GridSample Mish NonMaxSuppression NonZero RoiAlign",
+    _HALF: "DeformConv GridSample Mish NonMaxSuppression RoiAlign",
     _FLOAT: """
-        Acos Acosh Asin Asinh Atan Atanh AveragePool BatchNormalization Ceil Celu Clip
+        Acos Acosh Asin Asinh Atan Atanh AveragePool BatchNormalization Ceil Celu
         Conv ConvTranspose Cos Cosh CumSum Dropout Einsum Elu Erf Exp Floor Gemm
         GlobalAveragePool GlobalLpPool GlobalMaxPool GroupNormalization GRU HardSigmoid
         HardSwish Hardmax InstanceNormalization IsInf LayerNormalization LeakyRelu Log
@@ -37,16 +43,17 @@ _BY_TYPE: dict[frozenset[ir.DataType], str] = {
         Softmax Softplus Softsign Sqrt Tan Tanh ThresholdedRelu Upsample
         """,
     _NUMBER: """
-        Abs Add ArgMax ArgMin DepthToSpace Div Equal Gelu Greater GreaterOrEqual IsNaN
+        Abs Add ArgMax ArgMin Clip DepthToSpace Div Gelu Greater GreaterOrEqual IsNaN
         Less LessOrEqual Max Mean Min Mod Mul Neg Pad Pow Range ReduceL1 ReduceL2
         ReduceLogSum ReduceLogSumExp ReduceMax ReduceMean ReduceMin ReduceProd
         ReduceSum ReduceSumSquare Relu Scatter ScatterElements ScatterND Shrink Sign
         SpaceToDepth Sub Sum TopK
         """,
     _ANY: """
-        Concat Constant ConstantOfShape Expand EyeLike Flatten Gather GatherElements
-        GatherND Identity If Loop OneHot Reshape ReverseSequence Shape Size Slice Split
-        Squeeze Tile Transpose Trilu Unsqueeze Where
+        Concat Constant ConstantOfShape Equal Expand EyeLike Flatten Gather
+        GatherElements GatherND Identity If Loop NonZero OneHot Reshape
+        ReverseSequence Shape Size Slice Split Squeeze Tile Transpose Trilu Unsqueeze
+        Where
         """,
     _CAST: "Cast CastLike",
 }
@@ -56,15 +63,38 @@ SUPPORTED: dict[str, frozenset[ir.DataType]] = {
 }
 """Element types of the data that an operator accepts; pairs have their own rules."""
 
-LATER: dict[str, str] = dict.fromkeys(
-    (
-        "Attention", "BlackmanWindow", "HammingWindow", "HannWindow",
-        "RMSNormalization", "RotaryEmbedding", "STFT", "TensorScatter",
-    ),
-    "10.15",
-)  # fmt: skip
-"""Operators that TensorRT 10.1 did not support, and the version whose matrix has
-them."""
+LATER: dict[str, str] = {
+    **dict.fromkeys(("BlackmanWindow", "HammingWindow", "HannWindow"), "10.4"),
+    "STFT": "10.5",
+    "Attention": "10.14",
+    **dict.fromkeys(("RMSNormalization", "RotaryEmbedding", "TensorScatter"), "10.15"),
+}
+"""Operators that TensorRT 10.1 did not support, and the version that brought them."""
+
+TYPES_LATER: dict[str, tuple[frozenset[ir.DataType], str]] = {
+    "Pow": (_NUMBER - _FLOAT, "10.12"),
+}
+"""Element types that came to an operator after 10.1, and the version that did it."""
+
+NEWEST_OPSETS: dict[str, int] = {"10.1": 20, "10.15": 24, "11.5": 25}
+"""Newest opset that the parser of a version reads (operators.md of 10.1 and of 10.15;
+NVIDIA's "ONNX Opset Guide" of 11.x): one between two of them reads at least the older
+one's."""
+
+Version: TypeAlias = tuple[int, int]
+"""Major and minor: patches change no table."""
+
+
+def version_of(text: str) -> Version:
+    """Read a version such as 10.13, or 10.13.3.9, whose last two numbers do not count.
+
+    Raises:
+        ValueError: it is no version.
+    """
+    if found := re.fullmatch(r"(\d{1,3})\.(\d{1,3})(\.\d{1,4}){0,2}", text):
+        return int(found[1]), int(found[2])
+    raise ValueError(f"{text!r} is no version of TensorRT, such as 10.13")
+
 
 UNSUPPORTED = frozenset(
     {

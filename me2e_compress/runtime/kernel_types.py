@@ -1,0 +1,123 @@
+"""The element types that onnxruntime's CPU has kernels for, by its own list of them.
+
+A graph with an operator of another type is not opened at all: GridSample of float64
+before opset 20, for one, which exporters write where a Python number leaked in.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+
+import onnx
+import onnx_ir as ir
+from onnxruntime.capi import (
+    onnxruntime_pybind11_state as _native,  # pyright: ignore[reportAttributeAccessIssue]
+)
+
+from me2e_compress.graph import opset_of
+from me2e_compress.graph.nodes import is_read, is_standard, nodes_in
+
+_NEWEST = 2**31 - 1
+"""The last version of a kernel that nothing has replaced."""
+_CAST_BY_ITSELF = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
+"""Types that onnxruntime casts to float32 and back where it has no kernel."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Kernel:
+    """One kernel: versions of its operator, and types by the name of a constraint."""
+
+    first: int
+    last: int
+    types: Mapping[str, Sequence[str]]
+
+    def serves(self, since: int) -> bool:
+        """Return whether it is of the operator as of a version (as onnxruntime)."""
+        if self.last == _NEWEST:
+            return since == self.first
+        return self.first <= since <= self.last
+
+
+def without_kernel(model: ir.Model) -> Iterator[tuple[ir.Node, str]]:
+    """Yield the nodes that onnxruntime has no kernel for, with what is missing.
+
+    Types must be known, by the file or by inference: a node of unknown types is not
+    judged, nor one of an operator that is made of others.
+    """
+    opset, advice = opset_of(model), _advice(model)
+    for node in nodes_in(model.graph):
+        if not is_standard(node) or not any(map(is_read, node.outputs)):
+            continue
+        if missing := _missing(node, opset):
+            said = f"onnxruntime has no kernel for {node.op_type} of {missing}"
+            yield node, f"{said}{advice if 'float64' in missing else ''}"
+
+
+def _missing(node: ir.Node, opset: int) -> str:
+    """Name the element types that no kernel takes together; empty if one does."""
+    kernels, schema = _kernels().get(node.op_type, ()), _schema(node.op_type, opset)
+    if not kernels or schema is None:
+        return ""
+    given = _given(node, schema)
+    if given is None:
+        return ""
+    for kernel in kernels:
+        if kernel.serves(schema.since_version) and all(
+            word in kernel.types.get(name, (word,)) for name, word, _ in given
+        ):
+            return ""
+    return " and ".join(dict.fromkeys(kind for _, _, kind in given))
+
+
+def _given(
+    node: ir.Node, schema: onnx.defs.OpSchema
+) -> list[tuple[str, str, str]] | None:
+    """Return (constraint, type as onnxruntime writes it, its name) of all tensors.
+
+    None where a type is not known, or is one that onnxruntime casts by itself.
+    """
+    found = dict[tuple[str, str], str]()
+    sides = ((node.inputs, schema.inputs), (node.outputs, schema.outputs))
+    for values, formals in sides:
+        for index, value in enumerate(values):
+            formal = formals[min(index, len(formals) - 1)]
+            if value is None or (not value.name and value.dtype is None):
+                continue
+            kind = value.dtype
+            if kind is None or kind in _CAST_BY_ITSELF:
+                return None
+            word = kind.name.lower()
+            for name in (formal.type_str, formal.name):
+                plain = "float64" if kind == ir.DataType.DOUBLE else word
+                found[name, f"tensor({word})"] = plain
+    return [(name, word, plain) for (name, word), plain in found.items()]
+
+
+@functools.cache
+def _schema(op_type: str, opset: int) -> onnx.defs.OpSchema | None:
+    """Return an operator's definition; None of what is made of other operators."""
+    try:
+        found = onnx.defs.get_schema(op_type, opset, "")
+    except onnx.defs.SchemaError:
+        return None
+    is_made = found.has_function or found.has_context_dependent_function
+    return None if is_made else found
+
+
+@functools.cache
+def _kernels() -> Mapping[str, tuple[_Kernel, ...]]:
+    """Return the CPU's kernels of ONNX's own operators, by operator; 8 ms, once."""
+    found: dict[str, list[_Kernel]] = {}
+    for each in _native.get_all_opkernel_def():
+        if each.provider == "CPUExecutionProvider" and not each.domain:
+            kernel = _Kernel(*each.version_range, dict(each.type_constraints))
+            found.setdefault(each.op_name, []).append(kernel)
+    return {name: tuple(kernels) for name, kernels in found.items()}
+
+
+def _advice(model: ir.Model) -> str:
+    """Say what writes float32, unless the graph's inputs or outputs are float64."""
+    ports = (*model.graph.inputs, *model.graph.outputs)
+    if any(each.dtype == ir.DataType.DOUBLE for each in ports):
+        return ""
+    return ": compress -r exact makes it float32"
