@@ -31,6 +31,7 @@ from me2e_compress.workflows.check_model import ModelCheck
 from me2e_compress.workflows.doctor import Checkup
 from me2e_compress.workflows.inspect_result import InspectResult
 from me2e_compress.workflows.int8_outcome import Int8Outcome
+from me2e_compress.workflows.lint import RuleSummary
 from me2e_compress.workflows.measured_loss import MeasuredLoss
 from me2e_compress.zoo.weights_record import WeightsRecord
 
@@ -40,7 +41,7 @@ NAMED = (
     *(Ranges, PortUse, Fidelity, OpenLoop, Step, Verification, Decision, QuantPlan),
     *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity, Remedy, Rung),
     *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
-    *(Int8Outcome, WeightsRecord),
+    *(Int8Outcome, RuleSummary, WeightsRecord),
 )
 """Classes that the forms name; what their fields name is found."""
 HEAD = """\

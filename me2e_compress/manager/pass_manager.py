@@ -233,7 +233,8 @@ class _Books:
             self.verifications.append(equivalence.skipped(names, reason))
             return ()
         notes = [n for each in self.steps if each.name in names for n in each.notes]
-        return tuple(f"not proven: {names[0]}, {n}: {reason}" for n in notes)
+        begins = "what is proven begins with what it made"
+        return tuple(f"not proven: {names[0]}, {n}: {reason}; {begins}" for n in notes)
 
     def _enter(self, current: Pass, result: PassResult, seconds: float) -> None:
         after = graph.size(result.model)

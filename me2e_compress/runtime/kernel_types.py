@@ -44,19 +44,18 @@ def without_kernel(model: ir.Model) -> Iterator[tuple[ir.Node, str]]:
     Types must be known, by the file or by inference: a node of unknown types is not
     judged, nor one of an operator that is made of others.
     """
-    opset, advice = opset_of(model), _advice(model)
+    opset = opset_of(model)
     for node in nodes_in(model.graph):
         if not is_standard(node) or not any(map(is_read, node.outputs)):
             continue
         if missing := _missing(node, opset):
-            said = f"onnxruntime has no kernel for {node.op_type} of {missing}"
-            yield node, f"{said}{advice if 'float64' in missing else ''}"
+            yield node, f"onnxruntime has no kernel for {node.op_type} of {missing}"
 
 
 def _missing(node: ir.Node, opset: int) -> str:
     """Name the element types that no kernel takes together; empty if one does."""
     kernels, schema = _kernels().get(node.op_type, ()), _schema(node.op_type, opset)
-    if not kernels or schema is None:
+    if schema is None or node.op_type == "Constant":  # which becomes a weight
         return ""
     given = _given(node, schema)
     if given is None:
@@ -86,6 +85,8 @@ def _given(
             kind = value.dtype
             if kind is None or kind in _CAST_BY_ITSELF:
                 return None
+            if not isinstance(value.type, ir.TensorType):
+                return None  # a sequence, of whatever
             word = kind.name.lower()
             for name in (formal.type_str, formal.name):
                 plain = "float64" if kind == ir.DataType.DOUBLE else word
@@ -115,9 +116,9 @@ def _kernels() -> Mapping[str, tuple[_Kernel, ...]]:
     return {name: tuple(kernels) for name, kernels in found.items()}
 
 
-def _advice(model: ir.Model) -> str:
+def remedy(model: ir.Model, missing: str) -> str:
     """Say what writes float32, unless the graph's inputs or outputs are float64."""
     ports = (*model.graph.inputs, *model.graph.outputs)
-    if any(each.dtype == ir.DataType.DOUBLE for each in ports):
+    if "float64" not in missing or any(e.dtype == ir.DataType.DOUBLE for e in ports):
         return ""
-    return ": compress -r exact makes it float32"
+    return ": import-normalize makes it float32 (compress -r exact)"

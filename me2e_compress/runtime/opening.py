@@ -23,7 +23,7 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.files import INLINE_LIMIT_BYTES
 from me2e_compress.graph.nodes import is_read
-from me2e_compress.runtime.kernel_types import without_kernel
+from me2e_compress.runtime.kernel_types import remedy, without_kernel
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import runnable, unsupported
 
@@ -131,8 +131,9 @@ def _reason(model: ir.Model, provider: Provider) -> str:
         return ""
     typed = model.clone()
     graph.infer_shapes(typed)
-    node, said = next(without_kernel(typed), (None, ""))
-    return said if node is None else f"{said} (node {node.name!r})"
+    for node, said in without_kernel(typed):
+        return f"{said} (node {node.name!r}){remedy(typed, said)}"
+    return ""
 
 
 def _lending(

@@ -29,10 +29,8 @@ class LintFinding:
     """One problem of a graph for its target.
 
     Attributes:
-        severity: with an ``error`` the target refuses the graph, with ``wrong`` it
-            runs it and computes something else; with a ``warning`` it runs, but not as
-            int8, or slowly. What users report of some versions is ``reported refused``,
-            ``wrong`` or ``slow``.
+        severity: with ``error`` it is refused, with ``wrong`` computed otherwise, with
+            ``warning`` slow, or in float; with ``reported``, users say so of a version.
         rule: id of the rule.
         node: name of the node; empty for a finding about the whole graph.
         message: what was found; and what is expected.

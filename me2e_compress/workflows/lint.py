@@ -41,12 +41,11 @@ class LintOptions:
         sm: GPU generation that is built for.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         provider: what opens a graph for onnxruntime.
-        target_version: of TensorRT, such as ``10.13``, whose reported faults count;
-            None tells those of every version.
+        target_version: of TensorRT, such as ``10.13``; None tells of every version.
 
     Raises:
-        RecipeError: TensorRT-RTX, a version or a provider is given for a target it does
-            not serve, or the version is none.
+        RecipeError: An option is given for a target that it does not serve, or the
+            version is none.
     """
 
     target: str = "tensorrt"
@@ -78,6 +77,17 @@ class LintOptions:
             return TensorRT(version=self.target_version)
         except ValueError as reason:
             raise RecipeError(f"--target-version: {reason}") from reason
+
+
+@dataclasses.dataclass(frozen=True)
+class RuleSummary:
+    """What one rule found: in how many nodes, the first of them, and what of it."""
+
+    severity: Severity
+    rule: str
+    nodes: int
+    first: str
+    message: str
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -139,7 +149,7 @@ class LintResult(Result):
 
     def check(self) -> None:
         """Raise PreconditionError unless the target runs the graph, and rightly."""
-        if (reason := self.refusal or self.miscomputed) is not None:
+        if reason := self.refusal or self.miscomputed:
             raise PreconditionError(reason)
 
     @property
@@ -159,21 +169,15 @@ class LintResult(Result):
             " (our own rules and operator tables)"
         )
 
-    def summary(self) -> list[dict[str, object]]:
-        """Return one row per rule: its severity, its nodes, and the first of them."""
-        rows: dict[tuple[str, str], list[LintFinding]] = {}
+    def summary(self) -> tuple[RuleSummary, ...]:
+        """Return one row per rule."""
+        rows: dict[tuple[Severity, str], list[LintFinding]] = {}
         for each in self.findings:
             rows.setdefault((each.severity, each.rule), []).append(each)
-        return [
-            {
-                "severity": severity,
-                "rule": rule,
-                "nodes": len(found),
-                "first": found[0].node,
-                "message": found[0].message,
-            }
-            for (severity, rule), found in rows.items()
-        ]
+        return tuple(
+            RuleSummary(*key, len(found), found[0].node, found[0].message)
+            for key, found in rows.items()
+        )
 
     def lines(self) -> tuple[str, ...]:
         """Return the headline, and TensorRT-RTX's answer."""
@@ -241,8 +245,7 @@ def lint_written(
 ) -> LintResult | None:
     """Ask the rules of the target that passes wrote int8 for; None where none did.
 
-    `output` is where the graph will be; it is not opened. `asked` is the target that
-    the user named, if any.
+    Nothing is opened. `asked` is the target that the user named, if any.
     """
     targets = [each.target for each in passes if isinstance(each, QuantizeInt8)]
     if not targets:

@@ -297,3 +297,59 @@ def test_weights_outside_the_model_s_folder_are_not_read(
 
     assert "the data of tokens lie at 'weights.bin'" in said
     assert "private.bin, outside the model's folder: not read" in said
+
+
+POOLED = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    m (float[1,16,8,8] x) => (float[%s] y)
+    <int64[8] p = {0,0,1,1,0,0,1,1}, float[16,16,1,1] w = {%s}> {
+        a = Tanh(x) b = Pad(a, p)
+        ["/backbone/MaxPool"] c = MaxPool<kernel_shape=[3,3]>(b)
+        ["/backbone/Conv"] d = Conv(c, w)
+        ["/backbone/End"] y = %s(d)
+    }
+"""
+LINTED = "compress pooled.onnx --scheme full --rules paper --frames pictures -o o.onnx"
+
+
+def pooled(folder: Path, end: str = "Relu", shape: str = "1,16,8,8") -> None:
+    weight = ",".join(str(number) for number in range(256))
+    model = ir.from_onnx_text(POOLED % (shape, weight, end))
+    graph.save(model, folder / "pooled.onnx")
+    draws = np.random.default_rng(0).normal(size=(1, 16, 8, 8))
+    write_frames(folder / "pictures", x=draws.astype(np.float32))
+
+
+def test_what_the_target_computes_otherwise_is_an_alert(
+    cli: Cli, tmp_path: Path
+) -> None:
+    pooled(tmp_path)
+
+    found = cli.document(f"{LINTED} --target onnxruntime")
+
+    assert found["status"] == "warning"
+    assert "lint: o.onnx for onnxruntime: 0 errors, 1 wrong" in str(found["verdict"])
+    assert "padded-pool '/backbone/MaxPool'" in found["verdict"][-1]
+    (row,) = found["lint"]
+    assert (row["severity"], row["rule"], row["nodes"]) == ("wrong", "padded-pool", 1)
+    assert cli("lint o.onnx --target onnxruntime").code == 1
+
+
+@pytest.mark.parametrize(
+    ("target", "code", "status"),
+    [("--target tensorrt", 1, "refused"), ("", 0, "warning")],
+)
+def test_a_target_that_is_named_must_take_what_is_written(
+    cli: Cli, tmp_path: Path, target: str, code: int, status: str
+) -> None:
+    pooled(tmp_path, "Det", "1,16")
+
+    said = cli(f"{LINTED} {target}")
+    found = cli.document(f"{LINTED} {target}", code=code)
+
+    assert said.code == code
+    assert found["status"] == status
+    alert = "o.onnx: tensorrt refuses it, 1 error; operator '/backbone/End'"
+    assert f"lint: {alert}" in found["verdict"][-1]
+    assert (f"written, but {alert}" in said.err) == bool(code)
+    assert "Det" in kinds(tmp_path / "o.onnx")

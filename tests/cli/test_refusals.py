@@ -129,6 +129,11 @@ OTHERS = {
     "lint open.onnx --set-dim rows=1": "no open dimension is called 'rows'",
     "lint dense.onnx --target npu": "no target 'npu'; there are tensorrt",
     "lint dense.onnx --target onnxruntime --trt-check": "--trt-check is for tensorrt",
+    "lint dense.onnx --target-version ten": "target-version: 'ten' is no version of",
+    "lint dense.onnx --target-version 10": "'10' is no version of TensorRT, such as",
+    "lint dense.onnx --target onnxruntime --target-version 10.13": (
+        "--target-version is for tensorrt, not for onnxruntime"
+    ),
     "lint dense.onnx --plugins in.onnx": "lint for tensorrt opens no session",
     "list wheels": "no kind 'wheels'; there are passes, rules",
     "demo -o out --routes 0": "0 routes were asked for",

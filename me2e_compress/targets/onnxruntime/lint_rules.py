@@ -16,7 +16,7 @@ from me2e_compress.graph import (
 )
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN
 from me2e_compress.operators import find
-from me2e_compress.runtime.kernel_types import without_kernel
+from me2e_compress.runtime.kernel_types import remedy, without_kernel
 from me2e_compress.runtime.runnable import known_operators
 from me2e_compress.targets.base import (
     LintFinding,
@@ -65,7 +65,7 @@ def _remedy(node: ir.Node) -> str:
 def kernels(model: ir.Model) -> Iterator[LintFinding]:
     """Find operators that have a kernel, but none for these element types."""
     for node, missing in without_kernel(model):
-        yield error("kernel", node, missing)
+        yield error("kernel", node, f"{missing}{remedy(model, missing)}")
 
 
 def signed_activations(model: ir.Model) -> Iterator[LintFinding]:

@@ -1,3 +1,5 @@
+import dataclasses
+
 import onnx_ir as ir
 import pytest
 
@@ -169,6 +171,37 @@ def test_a_required_pattern_that_matches_nothing_is_an_error() -> None:
         "map mine: pattern 'det.cls' of module det matches no parameter and no scope;"
         " there are det.reg"
     )
+
+
+def test_a_prefix_that_hides_every_name_is_named() -> None:
+    mine = ModuleMap.parse(
+        '[modules.neck]\nrole = "feature"\npatterns = ["neck"]\n'
+        '[modules.det]\nrole = "prediction"\noptional = ["det.cls", "**.Abs"]',
+        "mine",
+    )
+    body = '["/net/agent/neck/Relu"] a = Relu(x) ["/net/agent/det/cls/Neg"] b = Neg(a)'
+    model = read("(float[2] x) => (float[2] y)", f"{body} y = Abs(b)")
+    with pytest.raises(ModuleMapError) as caught:
+        assign(model, mine)
+    assert str(caught.value).endswith(
+        "; behind the prefix 'net.agent' 2 of its patterns match, as 'net.agent.neck':"
+        ' write strip = ["net", "agent"] into a copy of the map'
+    )
+    # and so it is
+    assert placed(assign(model, dataclasses.replace(mine, strip=("net", "agent")))) == {
+        "a": ("neck", "scope"),
+        "b": ("det", "scope"),
+        "y": ("det", "neighbour"),
+    }
+
+
+def test_a_preset_behind_a_prefix_is_told_of_it() -> None:
+    model = read(
+        "(float[2] x) => (float[2] y)",
+        '["/net/perception/Relu"] a = Relu(x) ["/net/join_traj/Neg"] y = Neg(a)',
+    )
+    with pytest.raises(ModuleMapError, match=r'behind.*write strip = \["net"\]'):
+        assign(model, ModuleMap.load("tcp"))
 
 
 def test_a_required_pattern_may_match_and_lose() -> None:

@@ -162,7 +162,7 @@ def test_float64_within_a_graph_has_a_remedy() -> None:
 
     (said,) = no_kernels(16, signature, body)
 
-    assert said.endswith(": compress -r exact makes it float32")
+    assert said.endswith(": import-normalize makes it float32 (compress -r exact)")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,95 @@
+"""A graph in float64: what cannot run it says so, what makes it float32 does, too."""
+
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from tests.command import Cli, write_frames
+
+SAMPLED = """
+    <ir_version: 9, opset_import: ["" : 16]>
+    m (float[1,2,3,3] x, float[1,3,3,2] g) => (float[1,2,3,3] y)
+    <double h = {0.5}, float[3,3] w = {1,0,0,0,1,0,0,0,1}> {
+        a = Cast<to=11>(x) b = Cast<to=11>(g)
+        ["/neck/GridSample"] s = GridSample(a, b)
+        t = Mul(s, h)
+        o = Cast<to=1>(t)
+        y = MatMul(o, w)
+    }
+"""
+NO_KERNEL = (
+    "onnxruntime has no kernel for GridSample of float64 (node '/neck/GridSample'):"
+    " import-normalize makes it float32 (compress -r exact)"
+)
+
+
+def write(folder: Path, text: str) -> None:
+    graph.save(ir.from_onnx_text(text), folder / "double.onnx")
+
+
+@pytest.fixture(autouse=True)
+def double(tmp_path: Path) -> None:
+    write(tmp_path, SAMPLED)
+    draws = np.random.default_rng(0)
+    x = draws.normal(size=(1, 2, 3, 3)).astype(np.float32)
+    g = draws.uniform(-1, 0, size=(1, 3, 3, 2)).astype(np.float32)
+    write_frames(tmp_path / "frames", x=x, g=g)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "compare double.onnx double.onnx frames",
+        "profile double.onnx frames -o t.json --samples 2",
+    ],
+)
+def test_what_runs_it_says_why_it_cannot(cli: Cli, line: str) -> None:
+    assert cli.refused(line).endswith(NO_KERNEL)
+
+
+def test_ranges_are_measured_on_its_float32_form(cli: Cli, tmp_path: Path) -> None:
+    paper = '[[pass]]\nname = "quantize-int8"\nrules = "paper"\n'
+    (tmp_path / "paper.toml").write_text(paper)
+
+    cli.done("calibrate double.onnx frames -o ranges.json -r paper.toml")
+
+
+def test_the_verdict_says_that_float64_is_not_what_was_compared(cli: Cli) -> None:
+    found = cli.document("compress double.onnx -r exact -o out.onnx --frames frames")
+
+    same, told = found["verdict"][:2]
+    assert same.startswith("every output is the same")
+    assert told == (
+        "not proven: import-normalize, float64 became float32: 4 nodes:"
+        f" {NO_KERNEL}; what is proven begins with what it made"
+    )
+    cli.done("compare out.onnx out.onnx frames")
+
+
+def test_float64_that_runs_is_proven_against_itself(cli: Cli, tmp_path: Path) -> None:
+    text = SAMPLED.replace("GridSample(a, b)", "Mul(a, h)")
+    write(tmp_path, text)
+
+    found = cli.document("compress double.onnx -r exact -o out.onnx --frames frames")
+
+    (check,) = found["verifications"]
+    assert check["passes"][0] == "import-normalize"
+    assert not any("not proven" in line for line in found["verdict"])
+
+
+def test_the_lint_names_it_although_a_pool_is_wrong_too(
+    cli: Cli, tmp_path: Path
+) -> None:
+    text = SAMPLED.replace(
+        "y = MatMul(o, w)",
+        "p = Pad(o, pads) y = MaxPool<kernel_shape=[3,3]>(p)",
+    ).replace("<double h", "<int64[8] pads = {0,0,1,1,0,0,1,1}, double h")
+    write(tmp_path, text)
+
+    found = cli.document("lint double.onnx --target onnxruntime", code=1)
+
+    rules = [(each["severity"], each["rule"]) for each in found["findings"]]
+    assert rules == [("error", "kernel"), ("wrong", "padded-pool")]
