@@ -6,7 +6,6 @@ To add a target, write its class, then add it to this table.
 from me2e_compress.errors import RecipeError
 from me2e_compress.registry import Registry
 from me2e_compress.targets.base import (
-    SEVERITIES,
     LintFinding,
     LintRule,
     Severity,
@@ -15,11 +14,9 @@ from me2e_compress.targets.base import (
     of_opset,
     valid,
     warning,
-    worst_first,
 )
 
 __all__ = [
-    "SEVERITIES",
     "TARGETS",
     "LintFinding",
     "LintRule",
@@ -29,7 +26,6 @@ __all__ = [
     "of_opset",
     "valid",
     "warning",
-    "worst_first",
 ]
 
 _HERE = "me2e_compress.targets"

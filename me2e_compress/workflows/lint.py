@@ -15,14 +15,8 @@ from me2e_compress.passes.fix_shapes import FixShapes
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.targets import (
-    SEVERITIES,
-    TARGETS,
-    LintFinding,
-    Severity,
-    Target,
-    worst_first,
-)
+from me2e_compress.targets import TARGETS, LintFinding, Severity, Target
+from me2e_compress.targets.base import SEVERITIES, worst_first
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx import BuildResult, check
 from me2e_compress.workflows.checks import load_map, model_path

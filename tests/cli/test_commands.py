@@ -23,6 +23,7 @@ from me2e_compress.zoo.weights_record import WeightsRecord
 from tests.command import Cli, strict
 from tests.docs.documents import faults
 from tests.installed import install
+from tests.nets import save_text
 from tests.targets.onnxruntime.lowered import MATMUL_RELU
 
 NAMES = sorted(COMMANDS)

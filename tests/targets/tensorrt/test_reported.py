@@ -1,12 +1,14 @@
 """What users report of TensorRT: each row finds its pattern, in its versions alone."""
 
 import dataclasses
+import re
+from pathlib import Path
 
 import onnx_ir as ir
 import pytest
 
 from me2e_compress.targets.tensorrt import TensorRT
-from me2e_compress.targets.tensorrt.lint.reported import REPORTS, Report
+from me2e_compress.targets.tensorrt.lint.reported import FAULTS, ReportedFault
 
 SAMPLES = "(float[1,8,4,4] x, float[1,3,5,2] g, float[1,1,3,5] w) => (float[A,B,C] y)"
 BODY = "s = GridSample(x, g) a = Softmax(w) m = Mul(s, a) y = ReduceSum<keepdims=0>"
@@ -162,17 +164,17 @@ NOT_FOUND = {
 def rules(opset: int, signature: str, body: str, version: str = "") -> set[str]:
     head = f'<ir_version: 10, opset_import: ["" : {opset}, "trt" : 1]>'
     model = ir.from_onnx_text(f"{head} m {signature} {{ {body} }}")
-    names = {each.rule for each in REPORTS}
+    names = {each.rule for each in FAULTS}
     return {each.rule for each in TensorRT(version=version).lint(model)} & names
 
 
-def row(rule: str) -> Report:
-    (found,) = (each for each in REPORTS if each.rule == rule)
+def row(rule: str) -> ReportedFault:
+    (found,) = (each for each in FAULTS if each.rule == rule)
     return found
 
 
 def test_every_row_has_a_graph_of_its_own_and_one_that_is_nearly_so() -> None:
-    names = [each.rule for each in REPORTS]
+    names = [each.rule for each in FAULTS]
     assert names == list(FOUND) == list(NOT_FOUND)
 
 
@@ -229,14 +231,21 @@ def test_a_version_has_what_is_reported_of_it(
     assert (rule in rules(*FOUND[rule], version)) == concerns
 
 
-@pytest.mark.parametrize("each", REPORTS, ids=lambda each: each.rule)
-def test_a_row_names_versions_thread_and_remedy(each: Report) -> None:
+@pytest.mark.parametrize("each", FAULTS, ids=lambda each: each.rule)
+def test_a_row_names_versions_thread_and_remedy(each: ReportedFault) -> None:
     assert each.what in each.message
     assert each.remedy in each.message
     assert f"{each.versions}, {each.source}" in each.message
     # a thread by its number, or a file of a repository
     assert "#" in each.source or each.source.endswith(".md")
     assert dataclasses.replace(each, first="", last="").concerns((8, 6))
+
+
+def test_the_page_lists_every_row_with_its_versions() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "quantization.md").read_text("utf-8")
+    told = re.findall(r"^`([\w-]+)` \| ([^|]+) \|", page, re.MULTILINE)
+    rows = [(each.rule, each.versions.removeprefix("TensorRT ")) for each in FAULTS]
+    assert [each for each in told if each[0] in FOUND] == rows
 
 
 @pytest.mark.parametrize("text", ["10", "10.x", "ten", "10.13.3.9.1", "v10.13", "10."])

@@ -21,7 +21,7 @@ REFUSED: Severity = "reported refused"
 
 
 @dataclasses.dataclass(frozen=True)
-class Report:
+class ReportedFault:
     """One thing that users report of some versions.
 
     Attributes:
@@ -61,8 +61,11 @@ class Report:
     @property
     def versions(self) -> str:
         """The versions it was reported of, in words."""
-        told = f"TensorRT {self.first}" if self.first else "TensorRT of no told version"
-        return f"{told} to {self.last}" if self.last else told
+        if not self.first:
+            return "version not told"
+        if self.last:
+            return f"TensorRT {self.first} to {self.last}"
+        return f"TensorRT {self.first}" + " on" * self.open
 
     @property
     def message(self) -> str:
@@ -72,15 +75,15 @@ class Report:
 
 _SPARSEDRIVE = "Wanglaoban3/sparsedrive-tensorrt-deploy-implement"
 
-REPORTS: tuple[Report, ...] = (
-    Report(
+FAULTS: tuple[ReportedFault, ...] = (
+    ReportedFault(
         "grid-sample-mode", WRONG, ("GridSample",), patterns.new_words_for_modes,
         "10.13", "11.1", True, "NVIDIA/TensorRT#4646, onnx/onnx-tensorrt#1060",
         "opset 20 calls bilinear linear and bicubic cubic; the parser knows the old"
         " words alone and samples the nearest pixel",
         "leave the attribute out, for linear, or export with opset 16 to 19",
     ),
-    Report(
+    ReportedFault(
         "decomposed-attention", WRONG, ("Mul", "MatMul", "Einsum"),
         patterns.decomposed_attention,
         "10.14", "11.1", True, "NVIDIA/TensorRT#4813",
@@ -88,46 +91,46 @@ REPORTS: tuple[Report, ...] = (
         " word; one report is of 10.13 with a dynamic batch",
         "fuse-operators and translate-plugins make it the plugin's node",
     ),
-    Report(
+    ReportedFault(
         "float32-grid-sample", WRONG, ("GridSample",), patterns.float32_island,
         "10.14", "", True, "pytorch/TensorRT#4074",
         "a GridSample kept in float32 within a float16 graph answers wrongly",
         "sample in float16, or keep what is around it in float32, too",
     ),
-    Report(
+    ReportedFault(
         "clip-bound", WRONG, ("Clip",), patterns.clipped_product,
         "10.12", "10.13", True, "NVIDIA/TensorRT#4606",
         "MatMul, Add and a Clip that begins at 0 lose the upper bound: ReLU6 becomes"
         " ReLU",
         "write Max and Min, or a bound of the Clip that is computed",
     ),
-    Report(
+    ReportedFault(
         "resize-of-if", WRONG, ("Resize",), patterns.conditional_resize,
         "11.1", "11.2", True, "NVIDIA/TensorRT#4846",
         "a Resize of the Transpose of what an If gives answers wrongly",
         "fold the If (fold-constants with fixed shapes), or transpose inside it",
     ),
-    Report(
+    ReportedFault(
         "half-attention", WRONG, ("MatMul",), patterns.half_attention,
         "10.16", "", True, "NVIDIA/TensorRT#4837",
         "fused attention in float16 or bfloat16 answers wrongly on GPUs of SM 120",
         "keep it in float32 there, or compare the engine with the graph",
     ),
-    Report(
+    ReportedFault(
         "attention-keys", WRONG, ("Softmax",), patterns.more_keys_than_float16,
         "", "", True, "tier4/autoware-ml#95",
         f"fused attention in float16 over more than {patterns.LARGEST_FLOAT16:,} keys"
         " sums beyond float16 and gives NaN",
         "keep this attention in float32 or bfloat16",
     ),
-    Report(
+    ReportedFault(
         "half-variance", WRONG, ("ReduceMean",), patterns.half_squares,
         "8.5", "10.10", True, "NVIDIA/TensorRT#2564, NVIDIA/TensorRT#4493",
         "the variance of a layer normalization overflows in float16",
         "fuse-basic writes LayerNormalization from opset 17 on, which TensorRT"
         " computes in float32; or keep it in float32",
     ),
-    Report(
+    ReportedFault(
         "modulated-convolution", WRONG,
         ("ModulatedDeformableConv2dTRT", "ModulatedDeformableConv2dTRT2"),
         patterns.plugin,
@@ -135,7 +138,7 @@ REPORTS: tuple[Report, ...] = (
         "BEVFormer_tensorrt's plugin as it was answers wrongly (mAP 0)",
         "build the plugin with the patch of NVIDIA/DL4AGX#94",
     ),
-    Report(
+    ReportedFault(
         "int8-product", REFUSED, ("Gemm", "MatMul"), patterns.int8_product,
         "8.6", "", False, f"{_SPARSEDRIVE}, docs/OPTIMIZATION_SUMMARY.md",
         "int8 outside of the convolutions of a driving stack was not built"
@@ -143,7 +146,7 @@ REPORTS: tuple[Report, ...] = (
         "if yours fails so, keep the heads in float: --scheme feature-ext",
         once=True,
     ),
-    Report(
+    ReportedFault(
         "bfloat16-deconvolution", REFUSED, ("ConvTranspose",),
         patterns.bfloat16_deconvolution,
         "11.0", "11.2", True,
@@ -151,7 +154,7 @@ REPORTS: tuple[Report, ...] = (
         "ConvTranspose in bfloat16 has no kernel",
         "cast around it to float16 or float32",
     ),
-    Report(
+    ReportedFault(
         "broadcast-product", SLOW, ("MatMul",), patterns.broadcast_product,
         "8.6", "", False, f"{_SPARSEDRIVE}, docs/OPTIMIZATION_SUMMARY.md",
         "a MatMul of many axes that repeats both sides gets the slowest kernel: 5.8"
@@ -159,7 +162,7 @@ REPORTS: tuple[Report, ...] = (
         " axes",
         "reshape both sides to three axes",
     ),
-    Report(
+    ReportedFault(
         "strided-softmax", SLOW, ("Softmax",), patterns.strided_softmax,
         "", "", True, f"{_SPARSEDRIVE}, TECH_DETAILS.md",
         "a Softmax over a long axis that is not the last: 3 to 4 ms over 7,200"
@@ -171,8 +174,8 @@ REPORTS: tuple[Report, ...] = (
 
 def reported(version: Version | None) -> LintRule:
     """Return the rule that finds what is reported of a version, None: of any."""
-    rows: dict[str, list[Report]] = {}
-    for each in REPORTS:
+    rows: dict[str, list[ReportedFault]] = {}
+    for each in FAULTS:
         if each.concerns(version):
             for op_type in each.op_types:
                 rows.setdefault(op_type, []).append(each)
