@@ -7,6 +7,7 @@ before opset 20, for one, which exporters write where a Python number leaked in.
 import dataclasses
 import functools
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import onnx
 import onnx_ir as ir
@@ -98,7 +99,7 @@ def _given(
 def _schema(op_type: str, opset: int) -> onnx.defs.OpSchema | None:
     """Return an operator's definition; None of what is made of other operators."""
     try:
-        found = onnx.defs.get_schema(op_type, opset, "")
+        found: Any = onnx.defs.get_schema(op_type, opset, "")  # stubs lack functions
     except onnx.defs.SchemaError:
         return None
     is_made = found.has_function or found.has_context_dependent_function
@@ -111,7 +112,8 @@ def _kernels() -> Mapping[str, tuple[_Kernel, ...]]:
     found: dict[str, list[_Kernel]] = {}
     for each in _native.get_all_opkernel_def():
         if each.provider == "CPUExecutionProvider" and not each.domain:
-            kernel = _Kernel(*each.version_range, dict(each.type_constraints))
+            first, last = each.version_range
+            kernel = _Kernel(first, last, dict(each.type_constraints))
             found.setdefault(each.op_name, []).append(kernel)
     return {name: tuple(kernels) for name, kernels in found.items()}
 

@@ -40,8 +40,8 @@ def demote(model: ir.Model, by: str) -> tuple[int, str]:
         if value.type is not None and _is_double(value.type):
             value.type = _single(value.type)
             count += 1
-            if (node := value.producer()) is not None:
-                nodes[node] = None
+            if (made := value.producer()) is not None:
+                nodes[made] = None
     return count, f"float64 became float32: {counted(len(nodes), 'node')}"
 
 
