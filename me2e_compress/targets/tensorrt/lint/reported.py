@@ -78,7 +78,8 @@ _SPARSEDRIVE = "Wanglaoban3/sparsedrive-tensorrt-deploy-implement"
 FAULTS: tuple[ReportedFault, ...] = (
     ReportedFault(
         "grid-sample-mode", WRONG, ("GridSample",), patterns.new_words_for_modes,
-        "10.13", "11.1", True, "NVIDIA/TensorRT#4646, onnx/onnx-tensorrt#1060",
+        # reported of 10.13 and 11.1; so are the parser's sources from 10.1 on
+        "10.1", "11.1", True, "NVIDIA/TensorRT#4646, onnx/onnx-tensorrt#1060",
         "opset 20 calls bilinear linear and bicubic cubic; the parser knows the old"
         " words alone and samples the nearest pixel",
         "leave the attribute out, for linear, or export with opset 16 to 19",
