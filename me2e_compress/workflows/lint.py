@@ -255,6 +255,8 @@ def _found(
     """Return the rules' findings and, if none is an error, those of opening it."""
     judge, provider = options.judge, options.provider
     found = judge.lint(model)
+    if provider.native != CPU.native:  # the list of kernels is the CPU's
+        found = tuple(each for each in found if each.rule != "kernel")
     if any(each.severity == "error" for each in found):
         return found
     if judge.opens:

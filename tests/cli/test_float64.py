@@ -93,3 +93,10 @@ def test_the_lint_names_it_although_a_pool_is_wrong_too(
 
     rules = [(each["severity"], each["rule"]) for each in found["findings"]]
     assert rules == [("error", "kernel"), ("wrong", "padded-pool")]
+
+
+def test_another_provider_is_not_held_to_the_kernels_of_the_cpu(cli: Cli) -> None:
+    said = cli.refused("lint double.onnx --target onnxruntime --provider cuda")
+
+    assert "cuda" in said
+    assert "kernel" not in said

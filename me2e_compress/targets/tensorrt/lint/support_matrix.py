@@ -3,12 +3,12 @@
 Operators are those of onnx-tensorrt's support matrix, ``docs/operators.md``, of
 TensorRT 10.15 (onnx/onnx-tensorrt fa5aa9f, the newest of which the sources could be
 had), with what its importers (``onnxOpImporters.cpp`` and ``importerUtils.cpp`` of
-10.1, 10.10 and 10.14 or later) take beyond it: integers in Clip (by Max and Min) and NonZero,
-booleans in Equal and NonZero, convolutions and pools of one spatial dimension, and
-ScatterElements with a reduction. What came after 10.1 has the version of its changelog.
-Others are unknown, and reported. Names, inputs and attributes of plugins come from the
-dialects of the fused operators. TensorRT finds a plugin by the node's operator name,
-``plugin_version`` and ``plugin_namespace``.
+10.1, 10.10 and 10.14 or later) take beyond it: integers in Clip (by Max and Min) and
+NonZero, booleans in Equal and NonZero, convolutions and pools of one spatial dimension,
+and ScatterElements with a reduction. What came after 10.1 has the version of its
+changelog. Others are unknown, and reported. Names, inputs and attributes of plugins
+come from the dialects of the fused operators. TensorRT finds a plugin by the node's
+operator name, ``plugin_version`` and ``plugin_namespace``.
 """
 
 import dataclasses
