@@ -146,9 +146,9 @@ NOT_FOUND = {
          "y = ConvTranspose(x, w)"),
     ),
     "broadcast-product": (
-        (17, "(float[1,6,10,30,4,4] x, float[1,6,10,30,4,1] w) => (float[A] y)",
+        (17, "(float[1,6,9,9,4,4] x, float[1,6,9,9,4,1] w) => (float[1,6,9,9,4,1] y)",
          "y = MatMul(x, w)"),
-        (17, "(float[1,6,1,1,4,4] x, float[1,6,10,30,4,1] w) => (float[A] y)",
+        (17, "(float[1,6,1,1,4,4] x, float[1,6,9,9,4,1] w) => (float[1,6,9,9,4,1] y)",
          "y = MatMul(x, w)"),
         (17, "(float[6,1,4,4] x, float[1,30,4,1] w) => (float[6,30,4,1] y)",
          "y = MatMul(x, w)"),

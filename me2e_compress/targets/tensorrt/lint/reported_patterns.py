@@ -29,7 +29,7 @@ HIGH_RANK = 5
 
 def new_words_for_modes(node: ir.Node, opset: int) -> bool:
     """Find a GridSample whose mode has its name of opset 20; left out it is read."""
-    return opset >= 20 and node.attributes.get_string("mode", "") in ("linear", "cubic")
+    return node.attributes.get_string("mode", "") in ("linear", "cubic")
 
 
 def decomposed_attention(node: ir.Node, opset: int) -> bool:
