@@ -1,7 +1,7 @@
 """95 % intervals of means over routes, each stated as what it is.
 
-Routes of one scenario type are alike (their driving scores correlate by 0.3 to 0.55 on
-the 220 routes), so there are two questions and two intervals:
+Routes of one scenario type are alike (``benchmarks.bench_intervals`` says how much), so
+there are two questions and two intervals:
 
 * over *these types*: other routes of the same types might have been drawn. Routes are
   resampled within each type;
@@ -24,6 +24,8 @@ from me2e_compress.metrics.measure import Estimate, Measure
 
 CONFIDENCE = 0.95
 RESAMPLES = 4_000
+TRIALS = 20_000
+"""Draws for a p-value: thirty tests corrected by Holm ask for small ones."""
 
 Floats = npt.NDArray[np.float64]
 Interval = tuple[float | None, float | None]
@@ -89,6 +91,40 @@ def intervals(
     return here, anew
 
 
+def drawn_anew(
+    rows: Floats, types: Sequence[str], of_sums: Callable[[Floats], Floats], seed: int
+) -> Floats:
+    """Return a statistic of `TRIALS` sets of types drawn anew, as `intervals` draws.
+
+    Of fewer than two types there are none.
+
+    Args:
+        rows: Numbers of each route [routes, k].
+        types: The scenario type of each route.
+        of_sums: Takes sums over the drawn routes [trials, k], returns [trials].
+        seed: The same seed gives the same draws.
+    """
+    names, type_of = np.unique(np.array(types, str), return_inverse=True)
+    if len(names) < 2:
+        return np.zeros(0)
+    sums = np.zeros((len(names), rows.shape[1]))
+    np.add.at(sums, type_of, rows)
+    weights = _drawn(np.random.default_rng(seed), len(names), TRIALS)
+    return np.asarray(of_sums(weights @ sums))
+
+
+def p_value(draws: Floats, edge: float) -> float:
+    """Return the two-sided p-value of an edge: below 0.05 as the interval excludes it.
+
+    It is at least 2 / (draws + 1). Draws that all are equal say nothing of what was not
+    seen: 1.
+    """
+    if not len(draws) or _is_a_point((float(draws.min()), float(draws.max()))):
+        return 1.0
+    beyond = min(int((draws <= edge).sum()), int((draws >= edge).sum()))
+    return min(1.0, 2.0 * (1 + beyond) / (len(draws) + 1))
+
+
 def unseen_share(n: int) -> float:
     """Return the largest share that n draws without a hit leave open, with 95 %.
 
@@ -142,13 +178,15 @@ def _anew(type_of: npt.NDArray[np.intp], types: int, seed: int) -> Floats:
     return _drawn(np.random.default_rng(seed), types)[:, type_of]
 
 
-def _drawn(random: np.random.Generator, size: int) -> Floats:
+def _drawn(
+    random: np.random.Generator, size: int, resamples: int = RESAMPLES
+) -> Floats:
     """Return [resamples, size] how often each was drawn, scaled to a sum of size."""
     draws = max(size - 1, 1)
-    picked = random.integers(size, size=(RESAMPLES, draws))
-    picked += size * np.arange(RESAMPLES)[:, None]
-    counts = np.bincount(picked.ravel(), minlength=RESAMPLES * size)
-    return counts.reshape(RESAMPLES, size).astype(np.float64) * (size / draws)
+    picked = random.integers(size, size=(resamples, draws))
+    picked += size * np.arange(resamples)[:, None]
+    counts = np.bincount(picked.ravel(), minlength=resamples * size)
+    return counts.reshape(resamples, size).astype(np.float64) * (size / draws)
 
 
 def _middle(values: Floats) -> Interval:
