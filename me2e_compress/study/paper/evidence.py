@@ -70,9 +70,12 @@ def evidence(question: PaperQuestion, result: PaperDrives, step: float) -> Found
     else:
         found = _difference(question, drives, result.study.seed)
     crossed = _crossed_steps(drives, result) if found.ways else ()
-    shift = 0.0
-    if crossed:  # what a frame is worth is known of driving scores alone
-        shift = step if question.column == "DS" else np.inf
+    if not crossed:
+        return found
+    # what a frame is worth is known of driving scores alone
+    known = question.column == "DS"
+    crossed += (f"{step:g} points are taken off" if known else "so no verdict",)
+    shift = step if known else np.inf
     return Found(found.estimate, found.ways, (*found.notes, *crossed), shift)
 
 
@@ -115,7 +118,8 @@ def _crossed_steps(
         if abs(median - edge) <= NOISE * median:
             found.append(
                 f"{each.variant} takes {median:.1f} ms, a step of equation 4 is at"
-                f" {edge:.0f}, and runs differ by {NOISE:.1%}: a frame may be noise"
+                f" {edge:.0f}, and runs differ by {100 * NOISE:g} %: a frame may be"
+                " noise"
             )
     return tuple(dict.fromkeys(found))
 
@@ -217,7 +221,7 @@ def _latency(question: PaperQuestion, result: PaperDrives) -> Found:
     if fewest < FEWEST_RUNS:
         why = (
             f"{_medians(one)} and {_medians(other)}: medians of {FEWEST_RUNS} separated"
-            f" runs decide, since two runs of one file differ by {NOISE:.1%}"
+            f" runs decide, since two runs of one file differ by {100 * NOISE:g} %"
         )
         return Found(Estimate.missing("ms", why))
     ratio = question.column == "times"

@@ -16,6 +16,10 @@ from me2e_compress.study.paper.questions import (
 from me2e_compress.workflows.result import Cell, Table
 
 
+FIRST = "first form"
+"""Of a question whose drives do not know it, and that nobody changed."""
+
+
 class Verdict(StrEnum):
     """What the drives say about a finding; they say nothing of other roads."""
 
@@ -105,19 +109,21 @@ def _asked(question: PaperQuestion, now: PaperQuestions, result: PaperDrives) ->
         return question.seen
     then = result.asked
     if then is None or any(each.questions != then.sha256 for each in drives):
-        return question.seen or "in the first form"
+        return question.seen or FIRST
     return then.since(question, now)
 
 
 def told_of_questions(result: PaperDrives, found: tuple[Finding, ...]) -> str:
     """Say which questions were asked, and whether the drives were made for them."""
-    now, known = (
-        PaperQuestions.load(result.study.questions),
-        {each.questions for each in result.finished},
-    )
+    now = PaperQuestions.load(result.study.questions)
+    known = {each.questions for each in result.finished}
     said = f"The questions: {now.name}, sha256 {now.sha256}"
     if not known - {""}:
-        return f"{said}; the digest of the questions is not in these records."
+        return (
+            f"{said}; the digest of the questions is not in these records. Where"
+            f" {FIRST} is said, the question was written before the drives; that whole"
+            " types are drawn, and Holm's correction, were decided after."
+        )
     if known == {now.sha256}:
         return f"{said}; they were asked before these drives."
     then = ", ".join(sorted(known - {now.sha256, ""}))
@@ -131,7 +137,7 @@ def told_of_questions(result: PaperDrives, found: tuple[Finding, ...]) -> str:
 def findings_table(result: PaperDrives, found: tuple[Finding, ...]) -> Table:
     """Show every question with its verdict and intervals."""
     tested = len({each.question.compared for each in found if each.p is not None})
-    alpha = PaperQuestions.load(result.study.questions).alpha
+    asked = PaperQuestions.load(result.study.questions)
     return Table(
         f"The paper's findings{result.study.preview}",
         (
@@ -141,9 +147,10 @@ def findings_table(result: PaperDrives, found: tuple[Finding, ...]) -> Table:
         tuple(_row(each) for each in found),
         "The difference, paired by route, stands with its 95 % interval over scenario"
         " types drawn anew (latencies: over runs); that over these types alone stands"
-        f" beside. Same direction: of {tested} tests at {alpha:g}, corrected by Holm,"
-        " this one lies on the paper's side of its edge; other direction: on the other;"
-        " not shown: neither. highway-env confirms nothing about CARLA."
+        f" beside. Same direction: p, corrected by Holm over {tested} tests, is below"
+        f" {asked.alpha:g}, and the difference on the paper's side of the edge; other"
+        " direction: on the other; not shown: neither. highway-env confirms nothing"
+        " about CARLA."
         f" {told_of_questions(result, found)}",
         words=4,
     )
@@ -155,15 +162,15 @@ def _row(finding: Finding) -> tuple[Cell, ...]:
     anew = replace(estimate, low=estimate.anew_low, high=estimate.anew_high)
     signed = question.column != "times"
     shown = estimate_cell(anew, signed=signed)
+    if not shown.reason:
+        shown = Cell(f"{shown.text} {anew.measure.unit}", shown.detail)
     narrow = estimate_cell(estimate, signed=signed).detail
     return (
         Cell(question.asks),
         Cell(question.paper),
         Cell(test),
         Cell(finding.verdict.value),
-        shown
-        if shown.reason
-        else Cell(f"{shown.text} {anew.measure.unit}", shown.detail),
+        shown,
         Cell(narrow or MISSING),
         Cell(MISSING if p is None else f"{p:.2g}" if p < 0.995 else "1"),
         Cell(finding.asked),
