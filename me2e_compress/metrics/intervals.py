@@ -14,6 +14,7 @@ and Snowden 1985). Where nothing differed, resampling would promise a width of z
 then the interval is that of the largest share of routes that could differ unseen.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from statistics import fmean
 
@@ -75,20 +76,19 @@ def intervals(
         value: What the statistic is of the routes as they are.
         bounds: Smallest and largest value of a route, if there are any.
     """
-    _, type_of, sizes = np.unique(
-        np.array(types, str), return_inverse=True, return_counts=True
-    )
     if len(types) < 2:
         return (None, None), (None, None)
-    here = _middle(statistic(_within_types(type_of, sizes, seed)))
+    within, anew = _weights(tuple(types), seed)
+    here = _middle(statistic(within))
     if _is_a_point(here):
         here = unseen_interval(value, len(types), bounds)
-    if len(sizes) < 2:
+    kinds = len(set(types))
+    if kinds < 2:
         return here, (None, None)
-    anew = _middle(statistic(_anew(type_of, len(sizes), seed)))
-    if _is_a_point(anew):
-        anew = unseen_interval(value, len(sizes), bounds)
-    return here, anew
+    over_types = _middle(statistic(anew))
+    if _is_a_point(over_types):
+        over_types = unseen_interval(value, kinds, bounds)
+    return here, over_types
 
 
 def drawn_anew(
@@ -158,24 +158,24 @@ def binomial_interval(successes: int, n: int) -> Interval:
     return 100.0 * float(interval.low), 100.0 * float(interval.high)
 
 
-def _within_types(
-    type_of: npt.NDArray[np.intp], sizes: npt.NDArray[np.intp], seed: int
-) -> Floats:
-    """Return [resamples, routes] weights: routes drawn again within their types.
+@functools.lru_cache(maxsize=2)  # a page asks of the same routes hundreds of times
+def _weights(types: tuple[str, ...], seed: int) -> tuple[Floats, Floats]:
+    """Return two [resamples, routes] weights: drawn within types, and types anew.
 
     Types with one route are one stratum together.
     """
+    names, type_of, sizes = np.unique(
+        np.array(types, str), return_inverse=True, return_counts=True
+    )
     stratum = np.where(sizes[type_of] == 1, -1, type_of)
-    random, total = np.random.default_rng(seed), np.zeros((RESAMPLES, len(stratum)))
+    random, within = np.random.default_rng(seed), np.zeros((RESAMPLES, len(stratum)))
     for name in np.unique(stratum):
         members = np.flatnonzero(stratum == name)
-        total[:, members] = _drawn(random, len(members))
-    return total
-
-
-def _anew(type_of: npt.NDArray[np.intp], types: int, seed: int) -> Floats:
-    """Return [resamples, routes] weights: whole types drawn again."""
-    return _drawn(np.random.default_rng(seed), types)[:, type_of]
+        within[:, members] = _drawn(random, len(members))
+    anew = _drawn(np.random.default_rng(seed), len(names))[:, type_of]
+    within.setflags(write=False)
+    anew.setflags(write=False)
+    return within, anew
 
 
 def _drawn(

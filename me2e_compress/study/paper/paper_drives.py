@@ -66,12 +66,12 @@ class ModelFacts:
     macs: int | None = None
     int8: Int8Counts | None = None
     latency_us: tuple[int, ...] = ()
-    runs_us: tuple[int, ...] = ()
     modules_us: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     modelled_j: float | None = None
     joules: tuple[float, float, float] | None = None
     no_joules: str = "not measured"
     failure: str = ""
+    runs_us: tuple[int, ...] = ()
 
     def latency_ms(self, percent: float) -> float | None:
         """Return a percentile of the latencies; None if none were measured."""

@@ -15,7 +15,6 @@ from me2e_compress.study.paper.questions import (
 )
 from me2e_compress.workflows.result import Cell, Table
 
-
 FIRST = "first form"
 """Of a question whose drives do not know it, and that nobody changed."""
 

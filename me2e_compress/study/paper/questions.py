@@ -139,6 +139,11 @@ class PaperQuestions:
 
     def __post_init__(self) -> None:
         check_unique("question", [each.name for each in self.question])
+        if not (0.0 < self.alpha < 1.0 and self.step >= 0.0):
+            raise StudyError(
+                f"alpha {self.alpha:g} and step {self.step:g}: alpha lies between 0 and"
+                " 1, and a step is not negative"
+            )
 
     @classmethod
     def load(cls, path: Path | None = None) -> Self:
