@@ -30,8 +30,8 @@ FEWEST_RUNS = 5
 """Separated runs of which the medians are compared."""
 TIMES = "times"
 NOISE = 0.035
-"""Share by which the medians of two runs of one file differ: float and optimizer, 430.0
-and 415.1 ms in ``benchmarks/paper/variants.json``. Samples of one run tell nothing of
+"""Share by which the medians of two runs of one file differ: float and optimizer, 430.1
+and 415.2 ms in ``benchmarks/paper/variants.json``. Samples of one run tell nothing of
 it: their lag-1 autocorrelation is 0.8."""
 
 
