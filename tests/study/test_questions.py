@@ -1,6 +1,7 @@
 """Questions as data: which files are taken, and what decides one."""
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -10,9 +11,19 @@ from scipy.stats import norm
 
 from me2e_compress.errors import StudyError
 from me2e_compress.study import load_study
+from me2e_compress.study.paper.published import (
+    INT8,
+    LIMITED,
+    MODULES_AWAY,
+    MODULES_AWAY_OF_VAD,
+    RATES,
+    RATES_RT,
+    PublishedDrive,
+)
 from me2e_compress.study.paper.questions import PaperQuestion, PaperQuestions, PAt
 
 SHIPPED = PaperQuestions.load()
+Side = Literal["above", "below", "within"]
 HEAD = 'interval = "types"\ncorrection = "holm"\nalpha = 0.05\nstep = 2.0\n'
 ASKED = '[[question]]\nname = "a"\nasks = "?"\npaper = ""\n'
 DRIVES = 'of = "x.y"\nminus = "z.y"\n'
@@ -28,17 +39,54 @@ def certain(edge: float) -> float:
 
 
 def question(
-    holds: str, edge: float = 0.0, turned: float | None = None
+    holds: Side, edge: float = 0.0, turned: float | None = None
 ) -> PaperQuestion:
     return PaperQuestion(
         "a", "?", "", of="x.y", minus="z.y", holds=holds, edge=edge, turned=turned
-    )  # type: ignore[arg-type]
+    )
 
 
 @pytest.mark.parametrize("asked", SHIPPED.question, ids=lambda each: each.name)
 def test_no_test_fails_the_papers_own_figures(asked: PaperQuestion) -> None:
     for figure in asked.figures:
         assert asked.judge(figure, certain) == (1, 0.0)
+
+
+def at(fps: float) -> float:
+    return next(row.ds for row in RATES if row.fps == fps)
+
+
+def away(name: str, stack: dict[str, PublishedDrive] = MODULES_AWAY) -> float:
+    return stack[name].ds - stack["float"].ds
+
+
+def test_the_figures_are_those_of_the_papers_tables() -> None:
+    figures = {each.name: each.figures for each in SHIPPED.question}
+    fast, ten, four = (row.ds for row in LIMITED)
+    told = {
+        "rate-20": [at(20) - at(1)],
+        "rate-below-10": [at(10) - at(1) - (at(20) - at(10))],
+        "rate-above-24": [at(30) - at(24)],
+        "rate-10": [ten - four - (fast - ten)],
+        "rate-4": [four - fast],
+        "tail": [RATES_RT["UniAD"].ds - at(2)],
+        "occ": [away("minus-occ")],
+        "map": [away("minus-map")],
+        "map-vad": [away("map", MODULES_AWAY_OF_VAD)],
+        "motion": [away("minus-motion"), away("motion", MODULES_AWAY_OF_VAD)],
+        "motion-occ": [away("minus-occ-motion") - away("minus-occ")],
+        "map-motion": [
+            away("minus-map-motion"),
+            away("map-motion", MODULES_AWAY_OF_VAD),
+        ],
+        "occ-map": [away("minus-occ-map")],
+        "occ-map-motion": [away("minus-occ-map-motion")],
+        "whole-way": [INT8["feature-ext"].ds - MODULES_AWAY["float"].ds],
+    }
+
+    for name, expected in told.items():
+        assert list(figures[name]) == pytest.approx(expected, abs=0.005), name
+    assert figures["int8-full"][0] == pytest.approx(INT8["full"].ds - INT8["exact"].ds)
 
 
 def test_every_question_asks_of_drives_that_the_study_makes() -> None:
@@ -159,7 +207,7 @@ def test_within_is_both_no_worse_and_no_better(
 
 @given(VALUES, st.sampled_from(["above", "below", "within"]), MARGINS)
 def test_a_shift_makes_no_verdict_easier(
-    value: float, holds: str, shift: float
+    value: float, holds: Side, shift: float
 ) -> None:
     asked, p_at = question(holds, 2.0 if holds == "within" else 0.0), about(value)
     side, p = asked.judge(value, p_at)

@@ -1,6 +1,7 @@
 """What the drives say about a question: an estimate, and how sure it is."""
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -28,7 +29,6 @@ FEWEST_STATIC = 5
 one collision decides."""
 FEWEST_RUNS = 5
 """Separated runs of which the medians are compared."""
-TIMES = "times"
 NOISE = 0.035
 """Share by which the medians of two runs of one file differ: float and optimizer, 430.1
 and 415.2 ms in ``benchmarks/paper/variants.json``. Samples of one run tell nothing of
@@ -215,6 +215,8 @@ def _eer(question: PaperQuestion, result: PaperDrives) -> Found:
 
 def _latency(question: PaperQuestion, result: PaperDrives) -> Found:
     """Compare medians of runs that were made in turn, by Student's t over the runs."""
+    from scipy import stats  # takes a second to import
+
     one, other = (result.fact(each.split(".")[0]) for each in question.drives)
     runs = [np.array(each.runs_us, np.float64) / 1e3 for each in (one, other)]
     fewest = min(len(each) for each in runs)
@@ -224,26 +226,20 @@ def _latency(question: PaperQuestion, result: PaperDrives) -> Found:
             f" runs decide, since two runs of one file differ by {100 * NOISE:g} %"
         )
         return Found(Estimate.missing("ms", why))
-    ratio = question.column == "times"
-    first, second = (np.log(each) if ratio else each for each in runs)
+    times = question.column == "times"
+    first, second = (np.log(each) if times else each for each in runs)
     gaps = first[:fewest] - second[:fewest]
-    return _of_runs(gaps, np.exp if ratio else np.asarray, TIMES if ratio else "ms")
-
-
-def _of_runs(gaps: Floats, shown: Callable[[float], float], unit: str) -> Found:
-    from scipy import stats  # takes a second to import
-
     mean, error = float(gaps.mean()), float(gaps.std(ddof=1)) / len(gaps) ** 0.5
     reach = float(stats.t.ppf(0.975, len(gaps) - 1)) * error
 
     def p_at(edge: float) -> float:
-        at = np.log(edge) if unit == TIMES else edge
-        t = abs(mean - at) / max(error, 1e-12)
+        t = abs(mean - (math.log(edge) if times else edge)) / max(error, 1e-12)
         return float(2.0 * stats.t.sf(t, len(gaps) - 1))
 
-    value, *ends = (float(shown(mean + each)) for each in (0.0, -reach, reach))
-    estimate = Estimate(Measure(value, unit), None, None, len(gaps), *ends)
-    return Found(estimate, ((value, p_at),))
+    ends = (mean, mean - reach, mean + reach)
+    value, low, high = (math.exp(each) for each in ends) if times else ends
+    measure = Measure(value, "times" if times else "ms")
+    return Found(Estimate(measure, None, None, fewest, low, high), ((value, p_at),))
 
 
 def _medians(fact: ModelFacts) -> str:

@@ -71,9 +71,9 @@ def findings(result: PaperDrives) -> tuple[Finding, ...]:
     found = [evidence(each, result, asked.step) for each in asked.question]
     judged = [_judged(*each) for each in zip(asked.question, found, strict=True)]
     largest = dict[object, float]()
-    for question, each, (_, p) in zip(asked.question, found, judged, strict=True):
+    for question, each, (_, raw) in zip(asked.question, found, judged, strict=True):
         if each.ways:
-            largest[question.compared] = max(p, largest.get(question.compared, 0.0))
+            largest[question.compared] = max(raw, largest.get(question.compared, 0.0))
     corrected = dict(zip(largest, holm(list(largest.values())), strict=True))
     answers = []
     for question, each, (side, _) in zip(asked.question, found, judged, strict=True):

@@ -146,7 +146,7 @@ class PaperQuestions:
             )
 
     @classmethod
-    def load(cls, path: Path | None = None) -> Self:
+    def load(cls, path: Path | None = None) -> "PaperQuestions":
         """Read a file, or those that ship.
 
         Raises:
