@@ -145,6 +145,30 @@ def test_shares_of_too_few_collisions_are_not_compared(result: PaperResult) -> N
     assert enough.found.estimate.value == 1.0
 
 
+def test_p_values_are_corrected_over_all_differences_of_the_page(
+    result: PaperResult,
+) -> None:
+    raw = dict[tuple[str, ...], float]()
+    for each in result.findings:
+        judged = [
+            each.question.judge(v, p, each.found.shift) for v, p in each.found.ways
+        ]
+        agree = len({side for side, _ in judged}) == 1
+        if judged:
+            compared, p = each.question.compared, max(p for _, p in judged)
+            raw[compared] = max(raw.get(compared, 0.0), p if agree else 1.0)
+
+    # Holm by its definition: rejected at p if all smaller ones are, at their own levels
+    ordered = sorted(raw.values())
+    for each in result.findings:
+        if each.p is not None:
+            rank = ordered.index(raw[each.question.compared]) + 1
+            steps = [p * (len(ordered) - at) for at, p in enumerate(ordered[:rank])]
+            assert each.p == pytest.approx(min(1.0, max(steps)))
+            if each.p >= 0.05:
+                assert each.verdict is Verdict.NOT_SHOWN
+
+
 def test_two_claims_on_one_difference_are_one_test(result: PaperResult) -> None:
     one, other = finding(result, "map"), finding(result, "map-vad")
 

@@ -22,6 +22,7 @@ from me2e_compress.study import (
 )
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.paper.accident import Accident, plans_before
+from me2e_compress.study.paper.evidence import FEWEST_RUNS
 from me2e_compress.study.paper.paper_result import PaperResult
 from me2e_compress.study.paper.paper_run import read_paper
 from me2e_compress.study.paper.questions import SHIPPED
@@ -313,6 +314,8 @@ def test_models_are_timed_and_weighed(models: Path, tmp_path: Path) -> None:
 
     [fact] = found.facts
     assert len(fact.latency_us) == 10
+    assert len(fact.runs_us) == FEWEST_RUNS
+    assert all(100_000 < each < 400_000 for each in fact.runs_us)
     assert min(fact.latency_us) <= 200_001 <= max(fact.latency_us) + 2
     assert fact.parameters is not None
     assert sum(map(len, fact.modules_us.values())) > 0
