@@ -2,7 +2,8 @@
 
 ``python -m benchmarks.bench_energy`` simulates measurements of models of several frame
 times and powers by counters that move every 100 ms and look at 25 ms of these, and
-prints how often the 95 % interval holds the true joules, and how wide it is.
+prints how often the 95 % interval holds the true joules, and how wide it is. The step
+is learnt as the meter learns it.
 """
 
 import argparse
@@ -86,9 +87,11 @@ def _rows(
             schedule=schedule,
             detuned=detuned,
         )
-        rows = zip(found.windows, found.taken_j, found.mean_j, strict=True)
-        for windows, taken, mean in rows:
-            by = estimate(windows, counter.step_s, load.idle_w)
+        rows = zip(
+            *(found.windows, found.steps_s, found.taken_j, found.mean_j), strict=True
+        )
+        for windows, step_s, taken, mean in rows:
+            by = estimate(windows, step_s, load.idle_w)
             yield by.low, by.j_per_frame, by.high, taken, mean
 
 

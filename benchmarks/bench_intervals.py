@@ -1,24 +1,66 @@
-"""Do the intervals over routes hold the truth? And how alike are routes of one type?
+"""Do the intervals over routes hold the truth? And what do kept drives show?
 
-``python -m benchmarks.bench_intervals [RESULTS...]`` draws sets of 44 types with 5
-routes, alike within a type, and prints how often each 95 % interval holds the mean of
-those types, and that of all types. Of folders of results it prints how alike the
-driving scores of a type are, and those of the differences to the first folder.
+``python -m benchmarks.bench_intervals`` draws sets of 44 types with 5 routes, alike
+within a type, and prints how often each 95 % interval holds the mean of those types,
+and that of all types.
+
+    python -m benchmarks.bench_intervals benchmarks/driver/schemes/routes.csv
+    python -m benchmarks.bench_intervals ROUTES.csv ... --minus minus-track.ideal
+
+prints of kept drives, ``SCHEME.CONDITION``, the driving score and the success with both
+intervals, and how alike the scores of a type are; then the same of the differences to
+the first scheme under the same condition, or to ``--minus``.
 """
 
 import argparse
+import csv
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from me2e_compress.evaluators.highway.results import ResultsFolder
-from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.intervals import mean_estimate
+from me2e_compress.metrics.measure import Estimate
 
 TYPES, VARIANTS = 44, 5
-Scores = Mapping[str, tuple[str, float]]
-"""Type and driving score by route."""
+
+
+@dataclass(frozen=True)
+class KeptDrive:
+    """Driving score and success in percent, by route; or differences of both."""
+
+    scores: Mapping[str, tuple[float, float]]
+    bounds: tuple[float, float] = (0.0, 100.0)
+
+    def __sub__(self, other: "KeptDrive") -> "KeptDrive":
+        gaps = {
+            route: (score - other.scores[route][0], rate - other.scores[route][1])
+            for route, (score, rate) in self.scores.items()
+        }
+        low, high = self.bounds[0] - other.bounds[1], self.bounds[1] - other.bounds[0]
+        return KeptDrive(gaps, (low, high))
+
+    @property
+    def types(self) -> list[str]:
+        """Scenario type of each route."""
+        return [route.rpartition("_")[0] for route in self.scores]
+
+    def mean(self, column: int = 0) -> Estimate:
+        """Return the mean of the driving score (0) or of the success (1)."""
+        values = [each[column] for each in self.scores.values()]
+        return mean_estimate(values, self.types, "%", bounds=self.bounds)
+
+    @property
+    def correlation(self) -> float:
+        """Correlation of the driving scores of two routes of a type."""
+        values = [score for score, _ in self.scores.values()]
+        return intra_type_correlation([*zip(self.types, values, strict=True)])
+
+    @property
+    def scatter(self) -> float:
+        """Standard deviation of the driving score over routes."""
+        return float(np.std([score for score, _ in self.scores.values()], ddof=1))
 
 
 def coverage(correlation: float, simulations: int, seed: int) -> Mapping[str, float]:
@@ -55,33 +97,56 @@ def intra_type_correlation(rows: Sequence[tuple[str, float]]) -> float:
     size = len(rows) / len(groups)
     between = size * np.var([np.mean(each) for each in groups.values()], ddof=1)
     within = np.mean([np.var(each, ddof=1) for each in groups.values()])
-    return float((between - within) / (between + (size - 1.0) * within))
+    return float((between - within) / max(between + (size - 1.0) * within, 1e-12))
 
 
-def scores_of(folder: Path) -> Scores:
-    """Read the driving score of every route of a folder of results."""
-    episodes = ResultsFolder.open(folder).episodes().values()
-    return {e.route: (e.scenario, route_score(e).composed) for e in episodes}
+def kept_drives(path: Path) -> dict[str, KeptDrive]:
+    """Read the drives of a ``routes.csv`` by ``SCHEME.CONDITION``."""
+    found = dict[str, dict[str, tuple[float, float]]]()
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            scores = found.setdefault(f"{row['scheme']}.{row['condition']}", {})
+            score = float(row["driving_score_percent"])
+            scores[row["route"]] = score, 100.0 * int(row["succeeded"])
+    return {name: KeptDrive(scores) for name, scores in found.items()}
+
+
+def told(drive: KeptDrive) -> str:
+    """Say both means with both intervals, and how alike the scores of a type are."""
+    said = []
+    for column, name in enumerate(("DS", "SR")):
+        mean = drive.mean(column)
+        said.append(
+            f"{name} {mean.value:.1f} ({mean.low:.1f} to {mean.high:.1f}; types anew"
+            f" {mean.anew_low:.1f} to {mean.anew_high:.1f})"
+        )
+    alike = f"correlation {drive.correlation:.2f}, scatter {drive.scatter:.1f}"
+    return ", ".join((*said, alike))
 
 
 def main() -> None:
     """Print both."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("results", nargs="*", type=Path)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("routes", nargs="*", type=Path, help="routes.csv of drives")
+    parser.add_argument("--minus", help="SCHEME.CONDITION")
     parser.add_argument("--simulations", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    for correlation in (0.0, 0.3, 0.55):
-        held = coverage(correlation, asked.simulations, asked.seed)
-        told = ", ".join(f"{name} {share:.1%}" for name, share in held.items())
-        print(f"correlation {correlation:.2f}: the 95 % interval holds {told}")
-    folders = [scores_of(each) for each in asked.results]
-    for path, scores in zip(asked.results, folders, strict=True):
-        print(f"{path}: correlation {intra_type_correlation([*scores.values()]):.2f}")
-        if scores is not folders[0]:
-            first = folders[0]
-            gaps = [(kind, value - first[r][1]) for r, (kind, value) in scores.items()]
-            print(f"  of the differences: {intra_type_correlation(gaps):.2f}")
+    if not asked.routes:
+        for correlation in (0.0, 0.3, 0.55):
+            held = coverage(correlation, asked.simulations, asked.seed)
+            said = ", ".join(f"{name} {share:.1%}" for name, share in held.items())
+            print(f"correlation {correlation:.2f}: the 95 % interval holds {said}")
+        return
+    drives = {n: e for path in asked.routes for n, e in kept_drives(path).items()}
+    first = next(iter(drives)).partition(".")[0]
+    for name, drive in drives.items():
+        print(f"{name}: {told(drive)}")
+        minus = asked.minus or f"{first}.{name.partition('.')[2]}"
+        if minus != name:
+            print(f"  minus {minus}: {told(drive - drives[minus])}")
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ latencies that were charged (``traces/``).
 
 import argparse
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -17,8 +18,9 @@ from me2e_compress.errors import Me2eError
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.study import load_study
 from me2e_compress.study.paper.paper_drives import FILE
+from me2e_compress.study.paper.paper_findings import Verdict
 from me2e_compress.study.paper.paper_run import read_paper
-from me2e_compress.study.paper.questions import Verdict
+from me2e_compress.study.paper.questions import SHIPPED
 from me2e_compress.study.workspace import Workspace
 
 ROOT = Path(__file__).parents[1]
@@ -29,7 +31,9 @@ HEAD = """\
 
     me2e-compress study paper -o paper --workers 2
 
-asks the questions of the paper that this toolkit follows (*Software-hardware co-optimization of modular end-to-end driving*, arXiv 2601.07393) of the driver that ships, on the 220 routes of highway-env: its tables 2 to 6, figures 5 to 7, the share of collisions by partner, and each of its findings as a question: *confirmed* where the whole 95 % interval of a paired difference lies on its side, *opposite* where it lies on the other, *not confirmed* where it holds both. `--dry-run` says what that drives: 36 drives of 220 routes; they took nearly four hours on two shared cores, and a second run takes seconds. It goes on where it was ended, `--tables 2,3` drives a part, and `--routes 44` is a preview, which every title says.
+asks the questions of the paper that this toolkit follows (*Software-Hardware Co-optimization for Modular E2E AV Paradigm: A Unified Framework of Optimization Approaches, Simulation Environment and Evaluation Metrics*, arXiv 2601.07393) of the driver that ships, on the 220 routes of highway-env: its tables 2 to 6, figures 5 to 7, the share of collisions by partner, and each of its findings as a question. `--dry-run` says what that drives, in hours on two cores; a second run takes seconds. It goes on where it was ended, `--tables 2,3` drives a part, and `--routes 44` is a preview, which every title says.
+
+The questions, with test, edge, interval and correction, stand in [a file](../me2e_compress/study/paper/questions.toml) (a study of yours names its own, `questions = "FILE.toml"`). `records/` keeps the file as it was before the first drive, and each drive its digest: a question that was added or changed later is marked so. A difference is sure where its p-value, over whole scenario types drawn anew and corrected by Holm over the page, is below 0.05; "no worse" is no more than 2 points of driving score worse. Latencies are compared by medians of five separated runs; EER_AV only where all normalizations agree; and where a median lies within noise of a step of equation 4, a frame's worth of driving score is taken off. A verdict is of this driver on this road: highway-env confirms nothing about CARLA.
 
 Energy is measured where the machine has a counter; what is modelled from MACs and bytes stands in columns of its own. `--weigh FOLDER` counts another stack's files in table 4, such as VAD-tiny's:
 
@@ -43,8 +47,20 @@ Energy is measured where the machine has a counter; what is modelled from MACs a
 NOTHING = "Not driven yet. Its answers will stand here.\n"
 
 
-def page(records: Path) -> str:
+def committed(path: Path) -> str:
+    """Return when a file was last committed; empty where git does not know it."""
+    command = ("git", "log", "-1", "--format=%cI", "--", path)
+    try:
+        found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    except OSError:
+        return ""
+    return found.stdout.strip()
+
+
+def page(records: Path, asked_at: str) -> str:
     """Write the page of a folder of finished drives; of none it says so.
+
+    ``asked_at`` is when the questions were committed; empty if nobody knows.
 
     Raises:
         StudyError: A file cannot be read.
@@ -56,9 +72,10 @@ def page(records: Path) -> str:
     counts = ", ".join(
         f"{verdicts.count(each)} {each.value}" for each in Verdict if each in verdicts
     )
+    since = f"committed {asked_at}" if asked_at else "not committed"
     answer = (
         f"Of its {len(verdicts)} findings {counts}. {found.headline}; driven on"
-        f" {found.machine}. All of this is written by `python -m"
+        f" {found.machine}; questions {since}. All of this is written by `python -m"
         " benchmarks.bench_paper` from [every route](../benchmarks/paper), and `study"
         " paper --records benchmarks/paper -o OUT` draws the figures.\n\n"
     )
@@ -74,8 +91,8 @@ def keep(records: Path) -> None:
         for each in study.conditions
         for variant in study.driven_under(each)
     }
-    for path in sorted((*records.glob("*.jsonl"), *records.glob("*.json"))):
-        if path.suffix == ".json" or path.name in asked:
+    for path in sorted(records.iterdir()):
+        if path.suffix in (".json", ".toml") or path.name in asked:
             shutil.copyfile(path, KEPT / path.name)
     for path in sorted((records.parent / TRACES.name).glob("*.json")):
         shutil.copyfile(path, TRACES / path.name)
@@ -89,9 +106,9 @@ def main() -> None:
     given = parser.parse_args()
     try:
         if given.records is not None:
-            page(given.records)  # what cannot be read is not kept
+            page(given.records, "")  # what cannot be read is not kept
             keep(given.records)
-        write_bytes(PAGE, page(KEPT).encode())
+        write_bytes(PAGE, page(KEPT, committed(SHIPPED)).encode())
     except Me2eError as error:
         sys.exit(f"bench_paper: {error}")
 

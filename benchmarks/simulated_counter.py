@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from me2e_compress.runtime.energy.counter_step import learnt_step
 from me2e_compress.runtime.energy.estimate import Window, detuning
 from me2e_compress.runtime.energy.schedule import EnergySchedule
 
@@ -85,11 +86,13 @@ class Simulated:
 
     Attributes:
         windows: of every measurement.
+        steps_s: of the counter, as each measurement learnt it.
         taken_j: joules a frame that its frames took.
         mean_j: joules a frame that such frames take on average, at that warmth.
     """
 
     windows: list[list[Window]]
+    steps_s: list[float]
     taken_j: Floats
     mean_j: Floats
 
@@ -114,11 +117,13 @@ def simulate(
         detuned: hold frames up that keep step with the counter, as the meter does.
     """
     windows, frames = schedule.windows, schedule.frames(load.frame_s)
-    pause = detuning(load.frame_s, frames, counter.step_s) if detuned else 0.0
+    steps = [_learnt(counter, random, schedule.idle_s) for _ in range(measurements)]
+    pauses = [detuning(load.frame_s, frames, each) * detuned for each in steps]
+    pause = np.repeat(pauses, windows)
     lead = int(np.ceil(LEAD_S / load.frame_s))
     shape = (measurements * windows, lead + frames + lead)
     span = frames * (load.frame_s + pause) + schedule.lead_in_s
-    begun = np.tile(2 * span * np.arange(windows), measurements)
+    begun = 2 * span * np.tile(np.arange(windows), measurements)
     warmth = -np.expm1(-(schedule.warm_up_s + begun) / load.drift_s)
     warm = 1 + load.drift * warmth[:, None]
 
@@ -126,7 +131,11 @@ def simulate(
     full = 1 + load.spread * random.standard_normal(shape)
     if load.burst_every:
         full *= np.where(random.random(shape) < 1 / load.burst_every, load.burst, 1.0)
-    seconds = [length * load.busy, length * (1 - load.busy), np.full(shape, pause)]
+    seconds = [
+        length * load.busy,
+        length * (1 - load.busy),
+        np.broadcast_to(pause[:, None], shape),
+    ]
     at_most = load.mean_j() / load.frame_s
     pause_w = np.repeat(random.uniform(load.idle_w, at_most, measurements), windows)
     power = [load.busy_w * full * warm, load.rest_w * warm, pause_w[:, None]]
@@ -141,14 +150,30 @@ def simulate(
     begin, end = times[:, 3 * lead], times[:, 3 * (lead + frames)]
     moved = _moved(counter, random, times, energy, begin, end)
     found = [
-        Window(start, start + each, frames, counted, pause * frames)
-        for start, each, counted in zip(begun, end - begin, moved, strict=True)
+        Window(start, start + each, frames, counted, paused * frames)
+        for start, each, counted, paused in zip(
+            *(begun, end - begin, moved, pause), strict=True
+        )
     ]
     return Simulated(
         [found[at : at + windows] for at in range(0, len(found), windows)],
+        steps,
         taken.reshape(-1, windows).mean(1),
         mean.reshape(-1, windows).mean(1),
     )
+
+
+def _learnt(counter: Counter, random: np.random.Generator, for_s: float) -> float:
+    """Learn the counter's step as the meter does: sleeps end late, in each another."""
+    now, late = random.uniform(0, counter.step_s), random.uniform(0, 2e-3)
+
+    def sleep(seconds: float) -> None:
+        nonlocal now
+        now += seconds + late
+
+    found = learnt_step(lambda: now // counter.step_s, lambda: now, sleep, for_s)
+    assert found is not None
+    return found
 
 
 def _moved(

@@ -72,12 +72,14 @@ class EerResult:
         routes: [n] points per route by variant, for paired comparisons.
         scale: None if nothing could be scored.
         left_out: Number of routes left out of all variants, by the missing measure.
+        kept: [all routes] whether each was scored.
     """
 
     scores: Mapping[str, Estimate]
     routes: Mapping[str, Floats]
     scale: EerScale | None
     left_out: Mapping[str, int]
+    kept: npt.NDArray[np.bool_]
 
     @property
     def ranking(self) -> tuple[str, ...]:
@@ -139,7 +141,7 @@ def eer(
         kinds = types or [str(i) for i in range(len(kept))]
         kinds = [kind for kind, keep in zip(kinds, kept, strict=True) if keep]
         scores[name] = mean_estimate(routes[name].tolist(), kinds, POINTS, seed)
-    return EerResult(scores, routes, None if reason else scale, left_out)
+    return EerResult(scores, routes, None if reason else scale, left_out, kept)
 
 
 def route_eer(table: Floats, crashed: npt.NDArray[np.bool_], scale: EerScale) -> Floats:

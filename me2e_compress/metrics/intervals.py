@@ -1,7 +1,7 @@
 """95 % intervals of means over routes, each stated as what it is.
 
-Routes of one scenario type are alike (their driving scores correlate by 0.3 to 0.55 on
-the 220 routes), so there are two questions and two intervals:
+Routes of one scenario type are alike (``benchmarks.bench_intervals`` says how much), so
+there are two questions and two intervals:
 
 * over *these types*: other routes of the same types might have been drawn. Routes are
   resampled within each type;
@@ -14,6 +14,7 @@ and Snowden 1985). Where nothing differed, resampling would promise a width of z
 then the interval is that of the largest share of routes that could differ unseen.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from statistics import fmean
 
@@ -24,6 +25,8 @@ from me2e_compress.metrics.measure import Estimate, Measure
 
 CONFIDENCE = 0.95
 RESAMPLES = 4_000
+TRIALS = 20_000
+"""Draws for a p-value: thirty tests corrected by Holm ask for small ones."""
 
 Floats = npt.NDArray[np.float64]
 Interval = tuple[float | None, float | None]
@@ -73,20 +76,53 @@ def intervals(
         value: What the statistic is of the routes as they are.
         bounds: Smallest and largest value of a route, if there are any.
     """
-    _, type_of, sizes = np.unique(
-        np.array(types, str), return_inverse=True, return_counts=True
-    )
     if len(types) < 2:
         return (None, None), (None, None)
-    here = _middle(statistic(_within_types(type_of, sizes, seed)))
+    within, anew = _weights(tuple(types), seed)
+    here = _middle(statistic(within))
     if _is_a_point(here):
         here = unseen_interval(value, len(types), bounds)
-    if len(sizes) < 2:
+    kinds = len(set(types))
+    if kinds < 2:
         return here, (None, None)
-    anew = _middle(statistic(_anew(type_of, len(sizes), seed)))
-    if _is_a_point(anew):
-        anew = unseen_interval(value, len(sizes), bounds)
-    return here, anew
+    over_types = _middle(statistic(anew))
+    if _is_a_point(over_types):
+        over_types = unseen_interval(value, kinds, bounds)
+    return here, over_types
+
+
+def drawn_anew(
+    rows: Floats, types: Sequence[str], of_sums: Callable[[Floats], Floats], seed: int
+) -> Floats:
+    """Return a statistic of `TRIALS` sets of types drawn anew, as `intervals` draws.
+
+    Of fewer than two types there are none.
+
+    Args:
+        rows: Numbers of each route [routes, k].
+        types: The scenario type of each route.
+        of_sums: Takes sums over the drawn routes [trials, k], returns [trials].
+        seed: The same seed gives the same draws.
+    """
+    names, type_of = np.unique(np.array(types, str), return_inverse=True)
+    if len(names) < 2:
+        return np.zeros(0)
+    sums = np.zeros((len(names), rows.shape[1]))
+    np.add.at(sums, type_of, rows)
+    weights = _drawn(np.random.default_rng(seed), len(names), TRIALS)
+    return np.asarray(of_sums(weights @ sums))
+
+
+def p_value(draws: Floats, edge: float) -> float:
+    """Return the two-sided p-value of an edge: below 0.05 as the interval excludes it.
+
+    It is at least 2 / (draws + 1). Draws that all are equal say nothing of what was not
+    seen: 1.
+    """
+    if not len(draws) or _is_a_point((float(draws.min()), float(draws.max()))):
+        return 1.0
+    beyond = min(int((draws <= edge).sum()), int((draws >= edge).sum()))
+    return min(1.0, 2.0 * (1 + beyond) / (len(draws) + 1))
 
 
 def unseen_share(n: int) -> float:
@@ -122,33 +158,35 @@ def binomial_interval(successes: int, n: int) -> Interval:
     return 100.0 * float(interval.low), 100.0 * float(interval.high)
 
 
-def _within_types(
-    type_of: npt.NDArray[np.intp], sizes: npt.NDArray[np.intp], seed: int
-) -> Floats:
-    """Return [resamples, routes] weights: routes drawn again within their types.
+@functools.lru_cache(maxsize=2)  # a page asks of the same routes hundreds of times
+def _weights(types: tuple[str, ...], seed: int) -> tuple[Floats, Floats]:
+    """Return two [resamples, routes] weights: drawn within types, and types anew.
 
     Types with one route are one stratum together.
     """
+    names, type_of, sizes = np.unique(
+        np.array(types, str), return_inverse=True, return_counts=True
+    )
     stratum = np.where(sizes[type_of] == 1, -1, type_of)
-    random, total = np.random.default_rng(seed), np.zeros((RESAMPLES, len(stratum)))
+    random, within = np.random.default_rng(seed), np.zeros((RESAMPLES, len(stratum)))
     for name in np.unique(stratum):
         members = np.flatnonzero(stratum == name)
-        total[:, members] = _drawn(random, len(members))
-    return total
+        within[:, members] = _drawn(random, len(members))
+    anew = _drawn(np.random.default_rng(seed), len(names))[:, type_of]
+    within.setflags(write=False)
+    anew.setflags(write=False)
+    return within, anew
 
 
-def _anew(type_of: npt.NDArray[np.intp], types: int, seed: int) -> Floats:
-    """Return [resamples, routes] weights: whole types drawn again."""
-    return _drawn(np.random.default_rng(seed), types)[:, type_of]
-
-
-def _drawn(random: np.random.Generator, size: int) -> Floats:
+def _drawn(
+    random: np.random.Generator, size: int, resamples: int = RESAMPLES
+) -> Floats:
     """Return [resamples, size] how often each was drawn, scaled to a sum of size."""
     draws = max(size - 1, 1)
-    picked = random.integers(size, size=(RESAMPLES, draws))
-    picked += size * np.arange(RESAMPLES)[:, None]
-    counts = np.bincount(picked.ravel(), minlength=RESAMPLES * size)
-    return counts.reshape(RESAMPLES, size).astype(np.float64) * (size / draws)
+    picked = random.integers(size, size=(resamples, draws))
+    picked += size * np.arange(resamples)[:, None]
+    counts = np.bincount(picked.ravel(), minlength=resamples * size)
+    return counts.reshape(resamples, size).astype(np.float64) * (size / draws)
 
 
 def _middle(values: Floats) -> Interval:

@@ -120,6 +120,7 @@ class Study:
         pairs: Drives to compare, ``VARIANT.CONDITION`` of both.
         report: What is made of the results: a comparison, or the paper's tables, one
             per block.
+        questions: What is asked of the paper's drives; None asks what ships.
         evaluator: ``highway``, or another evaluator by its name and options, with
             routes and conditions of its own.
 
@@ -143,6 +144,7 @@ class Study:
     blocks: tuple[StudyBlock, ...] = ()
     pairs: tuple[tuple[str, str], ...] = ()
     report: Literal["comparison", "paper"] = "comparison"
+    questions: Path | None = None
     evaluator: str = HIGHWAY
 
     def __post_init__(self) -> None:
@@ -219,7 +221,7 @@ class Study:
 
     def inputs(self) -> Iterator[str | Path]:
         """List the files and folders that it reads."""
-        yield from filter(None, (self.frames, self.held_out))
+        yield from filter(None, (self.frames, self.held_out, self.questions))
         yield from self.provider.plugins
         for each in self.variants:
             named = (each.policy, each.module_map, each.adapter, each.trace)

@@ -5,7 +5,7 @@ A drive of 220 routes takes 30 MB of episodes and 0.1 MB of these lines.
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -30,6 +30,7 @@ class _Head:
     variant: str
     condition: str
     made_by: dict[str, Any]
+    questions: str = ""
 
 
 _HEAD, _ROUTE = TypeAdapter(_Head), TypeAdapter(RouteSummary)
@@ -53,6 +54,7 @@ class DriveRecord:
         made_by: Its fingerprint without the routes.
         difference: Paired by route with the baseline under the same condition; None for
             the baseline itself.
+        questions: Digest of the questions that it was driven for; empty if unknown.
         apart: By route, how far it was from the baseline; without routes that have no
             frames.
     """
@@ -65,6 +67,7 @@ class DriveRecord:
     difference: PairedDifference | None = None
     apart: Mapping[str, Apart] = field(default_factory=dict)
     reason: str = ""
+    questions: str = ""
 
     @classmethod
     def of(
@@ -146,6 +149,7 @@ class DriveRecord:
             "variant": self.variant,
             "condition": self.condition,
             "made_by": self.made_by,
+            **({"questions": self.questions} if self.questions else {}),
         }
         rows = [_ROUTE.dump_python(each, mode="json") for each in self.routes]
         lines = [json.dumps(row, ensure_ascii=False) for row in (head, *rows)]
@@ -171,7 +175,8 @@ class DriveRecord:
                 raise documents.MalformedError(f"names route {twice[0]} twice")
             if not isinstance(head.made_by.get("set_size"), int):
                 raise documents.MalformedError("it does not say of how many routes")
-            return cls(head.variant, head.condition, routes, head.made_by)
+            found = cls(head.variant, head.condition, routes, head.made_by)
+            return replace(found, questions=head.questions)
 
     def difference_from(self, made_by: Mapping[str, Any]) -> str:
         """Say how another fingerprint differs from its own; empty if it does not."""

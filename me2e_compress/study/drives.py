@@ -33,7 +33,10 @@ from me2e_compress.workflows.other_evaluators import (
 
 @dataclass(frozen=True)
 class DriveSetup:
-    """What all drives share; ``means_us`` caches means for ``mean_of`` conditions."""
+    """What all drives share; ``means_us`` caches means for ``mean_of`` conditions.
+
+    ``questions`` is the digest of the questions that its drives are to answer.
+    """
 
     study: Study
     clock: Clock
@@ -42,6 +45,7 @@ class DriveSetup:
     listener: Listener
     means_us: dict[str, int] = field(default_factory=dict)
     image_sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
+    questions: str = ""
 
     def under(
         self, condition: Condition, prepared: Sequence[PreparedVariant]
@@ -116,7 +120,10 @@ class DriveSetup:
                 raise StudyError(f"{path}: of another evaluation: {other}")
             return kept
         episodes = self._episodes(prepared, condition) or ()
-        record = DriveRecord.of(variant.name, condition.name, made_by, episodes)
+        record = replace(
+            DriveRecord.of(variant.name, condition.name, made_by, episodes),
+            questions=self.questions,
+        )
         record.save(path)
         return record
 

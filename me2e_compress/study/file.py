@@ -20,6 +20,7 @@ from me2e_compress.runtime.providers import provider_named
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
+from me2e_compress.study.paper.questions import PaperQuestions
 from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.other_evaluators import HIGHWAY, is_highway
@@ -59,9 +60,9 @@ def load_study(
 
     Raises:
         GraphError: A policy is neither a file nor a shipped model.
-        StudyError: The file is missing or not valid TOML, a key is unknown, missing or
-            of another type, frames are invalid, code is not trusted, or the study is
-            inconsistent.
+        StudyError: The file or its questions are missing or not valid TOML, a key is
+            unknown, missing or of another type, frames are invalid, code is not
+            trusted, or the study is inconsistent.
         RecipeError: A recipe or pass is unknown.
         EvaluationError: Routes or latency are unknown.
         ProviderError: A provider or library is missing.
@@ -93,6 +94,8 @@ def load_study(
     # resolve its names, and check what it refers to
     study = _Reader(path).study(table, routes, plugins)
     study.check_recordings()
+    if study.report == "paper":
+        PaperQuestions.load(study.questions)
     return study
 
 
@@ -128,6 +131,7 @@ class _Study(_Table):
     plugins: list[str] = Field(default_factory=list)
     record: FramesToRecord | None = None
     report: Literal["comparison", "paper"] = "comparison"
+    questions: str | None = None
     latency: Timing = Field(default_factory=Timing)
     variant: list[_Variant] = Field(validation_alias=AliasChoices("variant", "scheme"))
     """Files written before variants had their name say ``[[scheme]]``."""
@@ -202,6 +206,7 @@ class _Reader:
             blocks=table.block,
             pairs=tuple((each.of, each.against) for each in table.pair),
             report=table.report,
+            questions=self._file(table.questions),
         )
 
     def _variant(self, table: _Variant) -> Variant:

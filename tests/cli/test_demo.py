@@ -36,7 +36,7 @@ def test_the_demo_compresses_drives_and_reports(cli: Cli, tmp_path: Path) -> Non
     assert len(shown.splitlines()) <= 25
     assert "on the road: too few routes; 0 of 1 routes differ" in shown
     assert (
-        "1 route cannot show a difference below 24 points, all 220 (--routes all) n"
+        "1 route cannot show a difference below 25 points, all 220 (--routes all) n"
         in shown
     )
     record = json.loads((out / "study.json").read_text())

@@ -260,7 +260,7 @@ def test_a_study_that_ships_is_found_where_no_file_is() -> None:
     study = load_study("paper")
 
     assert study.report == "paper"
-    assert len(study.variants) == 14
+    assert len(study.variants) == 17
     assert [each.name for each in study.blocks][:2] == ["table-2", "table-3"]
 
 

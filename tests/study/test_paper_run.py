@@ -1,7 +1,9 @@
 """The paper's study on drivers that need no images."""
 
+import hashlib
 import json
 import math
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,8 +22,10 @@ from me2e_compress.study import (
 )
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.paper.accident import Accident, plans_before
+from me2e_compress.study.paper.evidence import FEWEST_RUNS
 from me2e_compress.study.paper.paper_result import PaperResult
 from me2e_compress.study.paper.paper_run import read_paper
+from me2e_compress.study.paper.questions import SHIPPED
 from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
 from me2e_compress.study.workload import held_frames, workload
 from me2e_compress.workflows.listener import SILENT
@@ -120,7 +124,75 @@ def test_tables_follow_from_the_records_alone(driven: Path) -> None:
 
     assert read.tables() == run.tables()
     assert read.machine == run.machine
-    assert read.lines() == run.lines() == (run.headline,)
+    assert read.lines() == run.lines()
+    assert "they were asked before these drives" in run.lines()[1]
+
+
+ONE = """interval = "types"
+correction = "holm"
+alpha = 0.05
+step = 2.0
+[[question]]
+name = "rate"
+asks = "Slow is worse"
+paper = "it was"
+of = "blind.slow"
+minus = "blind.ideal"
+holds = "below"
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "asked"),
+    [
+        (lambda text: text, "before its drives"),
+        (lambda text: text.replace("[[", "# a comment\n[["), "before its drives"),
+        (lambda text: text.replace("below", "above"), "changed after its drives"),
+        (lambda text: text.replace("0.05", "0.5"), "changed after its drives"),
+        (lambda text: text.replace('"rate"', '"r"'), "added after seeing results"),
+    ],
+)
+def test_questions_that_changed_after_their_drives_are_named(
+    driven: Path, tmp_path: Path, change: Callable[[str], str], asked: str
+) -> None:
+    # the records of a folder whose drives were made for these questions
+    file, records = tmp_path / "asked.toml", tmp_path / "records"
+    shutil.copytree(driven / "records", records)
+    (records / "questions.toml").write_text(ONE)
+    digest = hashlib.sha256(ONE.encode()).hexdigest()
+    for path in records.glob("*.jsonl"):
+        replace(DriveRecord.load(path), questions=digest).save(path)
+    file.write_text(change(ONE))
+
+    found = read_paper(replace(ASKED, questions=file), records)
+
+    assert found.findings[0].asked == asked
+    told = found.lines()[1]
+    assert ("they were asked before these drives" in told) == (file.read_text() == ONE)
+    if asked != "before its drives":
+        name = found.findings[0].question.name
+        assert told.endswith(
+            f"changed after drives that were made for {digest}: {name}."
+        )
+        assert told in found.tables()[0].note
+
+
+def test_a_drive_knows_its_questions_unless_they_came_later(
+    driven: Path, tmp_path: Path
+) -> None:
+    name = Path("records", "faster.ideal.jsonl")
+    asked = hashlib.sha256(SHIPPED.read_bytes()).hexdigest()
+    assert DriveRecord.load(driven / name).questions == asked
+    folder = tmp_path / "without"
+    shutil.copytree(driven, folder)
+    (folder / "records" / "questions.toml").unlink()
+    (folder / name).unlink()
+
+    found = run_paper(ASKED, folder, Here())
+
+    assert DriveRecord.load(folder / name).questions == ""
+    assert not (folder / "records" / "questions.toml").exists()
+    assert "before its drives" not in {each.asked for each in found.findings}
 
 
 def test_a_record_of_another_evaluation_is_not_taken(driven: Path) -> None:
@@ -242,6 +314,8 @@ def test_models_are_timed_and_weighed(models: Path, tmp_path: Path) -> None:
 
     [fact] = found.facts
     assert len(fact.latency_us) == 10
+    assert len(fact.runs_us) == FEWEST_RUNS
+    assert all(100_000 < each < 400_000 for each in fact.runs_us)
     assert min(fact.latency_us) <= 200_001 <= max(fact.latency_us) + 2
     assert fact.parameters is not None
     assert sum(map(len, fact.modules_us.values())) > 0

@@ -17,6 +17,8 @@ SENSED = 0.25
 """Share of a step in which the counter samples the power: 25 ms of 100 ms on A100 and
 H100 (Yang, Adamek and Armour, Part-time Power Measurements, SC 2024); other devices
 sample longer and beat less."""
+UNSURE = 2e-4
+"""Share of the counter's step by which a learnt one is off: a poll of 2 ms in 10 s."""
 BEATS = 0.05
 """Beat from which frames and counter are no longer independent."""
 
@@ -74,7 +76,8 @@ def estimate(
     its part-time sensing and its noise show in their spread. If the windows lie closer
     together than the step (``step_s``) alone allows, its error replaces the spread: a
     window of whole steps and ``r`` more seconds holds one step more or less by chance,
-    a standard deviation of power x sqrt(r (step - r)). Energy in pauses lies between
+    a standard deviation of power x sqrt(r (step - r)), for the worst r that the step,
+    which is `UNSURE`, leaves open. Energy in pauses lies between
     idle (0 if unknown) and mean power: the middle is subtracted, and half the distance
     is added to the interval in quadrature.
     """
@@ -96,7 +99,8 @@ def estimate(
     free = len(windows) - 1 - bends
     left = spent - np.polynomial.Polynomial.fit(middle, spent, bends)(middle)
     # The spread is at least what the counter's step allows.
-    beyond = taken % step_s  # of whole steps: what the two ends can differ by
+    from_whole = np.abs(taken - step_s * np.round(taken / step_s))
+    beyond = np.minimum(from_whole + UNSURE * taken, step_s / 2)
     ends = watts / frames * np.sqrt(beyond * (step_s - beyond))
     variance = max(float(left @ left) / free, float(np.mean(ends**2)))
     # Combine noise and the uncertainty of the pauses.

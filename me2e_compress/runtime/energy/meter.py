@@ -11,6 +11,7 @@ from statistics import fmean, median
 import numpy as np
 
 from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.energy.counter_step import learnt_step
 from me2e_compress.runtime.energy.energy_result import (
     CountedBy,
     EnergyResult,
@@ -31,11 +32,6 @@ Work = Callable[[], object]
 Every = Callable[[float, Callable[[], None]], AbstractContextManager[None]]
 """Calls a function every so many seconds while the context is open."""
 
-_STEPS = 5
-"""Updates of a counter to wait for when its step is measured."""
-_LONGEST_STEP_S = 2.0
-"""A counter that does not move for this long does not work."""
-_POLL_S = 0.002
 _SHORTEST_PAUSE_S = 1e-3
 """Shorter pauses are not reliable; they are accumulated."""
 
@@ -88,8 +84,8 @@ class EnergyMeter:
             else contextlib.nullcontext()
         ):
             # Idle and warm up before the windows.
-            step_s = self._reader.step_s or self._learnt_step()
-            idle = [self._idle()]
+            first, step_s = self._idle_and_step()
+            idle = [first]
             frame_s = self._warm_up(work)
             # Alternate the models, so that drift falls on all alike.
             for done, name in enumerate(turns):
@@ -97,7 +93,7 @@ class EnergyMeter:
                 spans[name].append(self._work(work[name], frame_s[name], step_s))
             self._on_window(len(turns), len(turns), turns[-1])
             self._sleep(self._schedule.lead_in_s)
-            idle.append(self._idle())
+            idle.append(self._idle(self._sleep))
             self._sleep(2 * SAMPLED_S)  # the last sample of power lies behind it
         # Idle power is the mean of before and after.
         idle_w = fmean(self._window(each).watts for each in idle)
@@ -141,24 +137,23 @@ class EnergyMeter:
             joules = self._power.joules(span.begin_s, span.end_s)
         return Window(span.begin_s, span.end_s, span.frames, joules, span.paused_s)
 
-    def _learnt_step(self) -> float:
-        """Measure the counter's update interval from its changes."""
-        if not self._reader.counts:
-            return SAMPLED_S
-        moved, last = [self._clock()], self._reader.joules()
-        while len(moved) < _STEPS + 2:  # the first wait is but a part of a step
-            self._sleep(_POLL_S)
-            now = self._reader.joules()
-            if now != last:
-                moved.append(self._clock())
-            elif self._clock() - moved[-1] > _LONGEST_STEP_S:
-                raise EnergyError(self._says(f"stands still at {now:g} J"))
-            last = now
-        return float(np.median(np.diff(moved[1:])))
+    def _idle_and_step(self) -> tuple[_Span, float]:
+        """Measure the idle device, and meanwhile the counter's step if none is told."""
+        reader, steps = self._reader, list[float]()
 
-    def _idle(self) -> _Span:
+        def watch(for_s: float) -> None:
+            found = learnt_step(reader.joules, self._clock, self._sleep, for_s)
+            if found is None:
+                raise EnergyError(self._says(f"stands still at {reader.joules():g} J"))
+            steps.append(found)
+
+        told = reader.step_s or (None if reader.counts else SAMPLED_S)
+        span = self._idle(watch if told is None else self._sleep)
+        return span, told or steps[0]
+
+    def _idle(self, wait: Callable[[float], None]) -> _Span:
         begin, before = self._read()
-        self._sleep(self._schedule.idle_s)
+        wait(self._schedule.idle_s)
         end, after = self._read()
         return _Span(begin, end, 0, self._moved(before, after, end - begin))
 

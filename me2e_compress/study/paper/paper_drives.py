@@ -14,6 +14,7 @@ from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome
 from me2e_compress.study.paper.accident import Accident
+from me2e_compress.study.paper.questions import PaperQuestions
 
 FILE = "variants.json"
 SCHEMES = ("exact", "prediction", "feature-ext", "full")
@@ -48,6 +49,8 @@ class ModelFacts:
         macs: Multiply-accumulates of one inference.
         int8: None for a file without a plan.
         latency_us: Latencies of inferences alone, warm, on the target device.
+        runs_us: Medians of separated runs, each with sessions opened anew, in turn with
+            those of the other variants.
         modules_us: Latencies by module under a profiler, on the target device.
         modelled_j: Joules per frame from published energies of MACs and bytes.
         joules: Measured joules per frame, and the ends of their 95 % interval; None
@@ -68,6 +71,7 @@ class ModelFacts:
     joules: tuple[float, float, float] | None = None
     no_joules: str = "not measured"
     failure: str = ""
+    runs_us: tuple[int, ...] = ()
 
     def latency_ms(self, percent: float) -> float | None:
         """Return a percentile of the latencies; None if none were measured."""
@@ -132,16 +136,27 @@ _KEPT = TypeAdapter(KeptFacts)
 class PaperDrives(StudyOutcome):
     """The drives of the paper's study so far, and facts about the files that drove.
 
-    Its drives have no scores, its facts stand for variants.
+    Its drives have no scores, its facts stand for variants; ``asked`` are the questions
+    as they were before the first drive, if that is known.
     """
 
     facts: tuple[ModelFacts, ...] = ()
     accident: Accident | None = None
+    asked: PaperQuestions | None = None
 
     @property
     def finished(self) -> tuple[DriveRecord, ...]:
         """The drives that did not fail."""
         return tuple(each for each in self.drives if not each.reason)
+
+    @property
+    def distinct(self) -> int:
+        """Number of drives that differ in more than what was charged."""
+        found = {
+            tuple(replace(e, latency_us=(), latency_sum_us=0) for e in each.routes)
+            for each in self.finished
+        }
+        return len(found)
 
     def fact(self, variant: str) -> ModelFacts:
         """Return the facts about a variant; empty facts if it was not prepared."""

@@ -1,242 +1,176 @@
-"""The paper's findings as questions, with the test that answers each."""
+"""Answers to the paper's questions; none is written down, all follow from drives."""
 
-from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any
 
-from me2e_compress.metrics.measure import Estimate
-from me2e_compress.metrics.route_values import DC, DE, DS
-from me2e_compress.study.cells import MINUS
+from me2e_compress.metrics.differences import holm
+from me2e_compress.study.cells import MISSING, estimate_cell
+from me2e_compress.study.paper.evidence import Found, evidence
 from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.study.paper.published import (
-    INT8,
-    LIMITED,
-    RATES,
-    PublishedDrive,
-)
 from me2e_compress.study.paper.questions import (
-    Evidence,
-    Finding,
+    BEFORE,
     PaperQuestion,
-    Rule,
-    falls,
-    not_lower_by,
-    within,
+    PaperQuestions,
 )
+from me2e_compress.workflows.result import Cell, Table
 
-IDEAL, TEN, FOUR, ONE = (
-    ("float", name) for name in ("ideal", "fps-10", "fps-4", "fps-1")
-)
-DEVICE, CONSTANT = ("float", "device"), ("float", "constant")
-HALF_SPREAD_OF_DE = (max(r.de for r in RATES) - min(r.de for r in RATES)) / 2
-"""Points: how far the paper's efficiency, "largely constant", lies from its middle."""
+FIRST = "first form"
+"""Of a question whose drives do not know it, and that nobody changed."""
+
+
+class Verdict(StrEnum):
+    """What the drives say about a finding; they say nothing of other roads."""
+
+    SAME = "same direction here"
+    NOT_SHOWN = "not shown here"
+    OTHER = "other direction here"
+    NOT_TESTED = "not tested"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The answer to a question, and the estimate that it follows from.
+
+    Attributes:
+        p: Two-sided p-value, corrected for all questions of the page; None if nothing
+            was tested.
+        asked: How the question stood before its drives.
+    """
+
+    question: PaperQuestion
+    verdict: Verdict
+    found: Found
+    p: float | None
+    asked: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return question, verdict, and the estimate or why there is none."""
+        estimate = self.found.estimate
+        reason = estimate.measure.reason
+        return {
+            "name": self.question.name,
+            "question": self.question.asks,
+            "paper": self.question.paper,
+            "test": self.question.test,
+            "verdict": self.verdict.value,
+            "estimate": None if reason else estimate.to_json(),
+            "p": self.p,
+            "asked": self.asked,
+            "notes": list(self.found.notes),
+            "reason": reason or None,
+        }
 
 
 def findings(result: PaperDrives) -> tuple[Finding, ...]:
-    """Answer every question, in the paper's order."""
-    return tuple(each.answer(result) for each in QUESTIONS)
+    """Answer every question; the p-values are corrected by Holm over all tested.
+
+    Two claims about one difference are one test, with the larger of their p-values.
+    """
+    asked = PaperQuestions.load(result.study.questions)
+    found = [evidence(each, result, asked.step) for each in asked.question]
+    judged = [_judged(*each) for each in zip(asked.question, found, strict=True)]
+    largest = dict[object, float]()
+    for question, each, (_, raw) in zip(asked.question, found, judged, strict=True):
+        if each.ways:
+            largest[question.compared] = max(raw, largest.get(question.compared, 0.0))
+    corrected = dict(zip(largest, holm(list(largest.values())), strict=True))
+    answers = []
+    for question, each, (side, _) in zip(asked.question, found, judged, strict=True):
+        p = corrected[question.compared] if each.ways else None
+        verdict = _verdict(side, p, asked.alpha)
+        when = _asked(question, asked, result)
+        answers.append(Finding(question, verdict, each, p, when))
+    return tuple(answers)
 
 
-def _untested(why: str) -> Callable[[Evidence], Estimate]:
-    return lambda _: Estimate.missing("points", why)
+def _judged(question: PaperQuestion, found: Found) -> tuple[int, float]:
+    """Return side and p-value on which all ways to compute it agree."""
+    judged = [question.judge(value, p_at, found.shift) for value, p_at in found.ways]
+    sides = {side for side, _ in judged}
+    if len(sides) != 1:
+        return 0, 1.0
+    return judged[0][0], max(p for _, p in judged)
 
 
-def _lost(row: PublishedDrive, whole: PublishedDrive) -> float:
-    """Return the share of its driving score that the paper lost."""
-    return 1.0 - row.ds / whole.ds
+def _verdict(side: int, p: float | None, alpha: float) -> Verdict:
+    if p is None:
+        return Verdict.NOT_TESTED
+    if p >= alpha or not side:
+        return Verdict.NOT_SHOWN
+    return Verdict.SAME if side > 0 else Verdict.OTHER
 
 
-def _keeps(cell: tuple[str, str], share: float) -> Callable[[Evidence], Rule]:
-    """Return a rule that no more than a share of a drive's score is lost."""
-
-    def rule(evidence: Evidence) -> Rule:
-        mean = evidence.drive(cell).mean(DS, evidence.seed).value
-        return not_lower_by(share * (mean or 0.0))
-
-    return rule
-
-
-RATE_QUESTIONS = (
-    PaperQuestion(
-        "More decisions a second drive better, up to 20",
-        "DS +20.33 % from 1 to 20 FPS (table 2)",
-        "DS at 20 FPS minus DS at 1 FPS",
-        lambda e: e.difference(IDEAL, ONE),
-    ),
-    PaperQuestion(
-        "Most of that is gained below 10 a second",
-        "gains diminish above about 10 FPS",
-        "what DS gains from 1 to 10 FPS, minus what it gains from 10 to 20",
-        lambda e: e.change_of_change(ONE, TEN, IDEAL),
-    ),
-    PaperQuestion(
-        "Beyond 24 a second driving gets worse",
-        "DS peaks at 20 to 24 FPS, 40.63, and is 40.15 at 30",
-        "none",
-        _untested(
-            "equation 4 at a step of 50 ms makes 14 to 30 FPS one condition, in CARLA"
-            " as here: the paper's difference is chance or a finer step"
-        ),
-    ),
-    PaperQuestion(
-        "Comfort falls as the rate rises",
-        f"DC {MINUS}33.33 % at 20 FPS against below 5",
-        "DC at 20 FPS minus DC at 1 FPS",
-        lambda e: e.difference(IDEAL, ONE, DC),
-        lambda _: falls,
-    ),
-    PaperQuestion(
-        "Efficiency does not depend on the rate",
-        "DE remains largely constant, 126.89 to 141.38",
-        f"DE at 20 FPS minus DE at 1 FPS, within ±{HALF_SPREAD_OF_DE:.1f} points, half"
-        " of the paper's own spread",
-        lambda e: e.difference(IDEAL, ONE, DE),
-        lambda _: within(HALF_SPREAD_OF_DE),
-    ),
-    PaperQuestion(
-        "10 decisions a second cost little against 22",
-        f"DS {MINUS}{_lost(LIMITED[1], LIMITED[0]):.2%} (table 6)",
-        "DS at 10 FPS minus DS at 22 FPS, no more lost than that share",
-        lambda e: e.difference(TEN, IDEAL),
-        _keeps(IDEAL, _lost(LIMITED[1], LIMITED[0])),
-    ),
-    PaperQuestion(
-        "4 decisions a second cost driving score",
-        f"DS {MINUS}{_lost(LIMITED[2], LIMITED[0]):.2%} (table 6)",
-        "DS at 4 FPS minus DS at 22 FPS",
-        lambda e: e.difference(FOUR, IDEAL),
-        lambda _: falls,
-    ),
-    PaperQuestion(
-        "Power falls in proportion to the rate",
-        "613.58 W at 22 FPS, 246.21 at 10, 138.56 at 4",
-        "none",
-        _untested(
-            "no counter of energy; joules a frame times rate, as the paper writes it,"
-            " is proportional by construction (its own watts are not: 138.56 W at 4"
-            " FPS are 34.6 J a frame, 613.58 W at 22 are 27.9)"
-        ),
-    ),
-)
+def _asked(question: PaperQuestion, now: PaperQuestions, result: PaperDrives) -> str:
+    """Say how a question stood before its drives, by their records if they know it."""
+    drives = [result.drive(*each.split(".")) for each in question.drives]
+    if question.untested or any(each.reason for each in drives):
+        return question.seen
+    then = result.asked
+    if then is None or any(each.questions != then.sha256 for each in drives):
+        return question.seen or FIRST
+    return then.since(question, now)
 
 
-def _of_the_stage(where: str, tail: str, even: str) -> tuple[PaperQuestion, ...]:
-    """Ask about the collision optimisation at one speed of the network."""
-    # tail and mean latency, with and without the stage
-    with_it = ("optimizer", tail)
+def told_of_questions(result: PaperDrives, found: tuple[Finding, ...]) -> str:
+    """Say which questions were asked, and whether the drives were made for them."""
+    now = PaperQuestions.load(result.study.questions)
+    known = {each.questions for each in result.finished}
+    said = f"The questions: {now.name}, sha256 {now.sha256}"
+    if not known - {""}:
+        return (
+            f"{said}; the digest of the questions is not in these records. Where"
+            f" {FIRST} is said, the question was written before the drives; that whole"
+            " types are drawn, and Holm's correction, were decided after."
+        )
+    if known == {now.sha256}:
+        return f"{said}; they were asked before these drives."
+    then = ", ".join(sorted(known - {now.sha256, ""}))
+    late = [e.question.name for e in found if e.found.ways and e.asked != BEFORE]
     return (
-        PaperQuestion(
-            "Spikes in critical frames cost driving score at equal mean latency"
-            f" {where}",
-            "the collision optimisation takes over 150 ms where obstacles are near",
-            "DS of the driver with that stage, charged where it is called, minus the"
-            " same at its mean latency",
-            lambda e: e.difference(with_it, ("optimizer", even)),
-            lambda _: falls,
-        ),
-        PaperQuestion(
-            f"Without the stage it drives better at equal mean latency {where}",
-            "DS +16.94 % without occupancy, which only triggers the stage (scheme 1)",
-            "DS without the stage at its mean latency, minus with it as it is charged",
-            lambda e: e.difference(("float", even), with_it),
-        ),
-        PaperQuestion(
-            f"Without the stage it drives better, and faster for it {where}",
-            "the same",
-            "DS without the stage and its time, minus with both",
-            lambda e: e.difference(("float", tail), with_it),
-        ),
+        f"{said}; changed after drives that were made for {then or 'none'}:"
+        f" {', '.join(late) or 'what was not driven'}."
     )
 
 
-LATENCY_QUESTIONS = (
-    PaperQuestion(
-        "At equal mean latency, a long tail costs driving score",
-        "UniAD at its own latency, 2.31 FPS: DS 30.69; at fixed 2 FPS: 33.50",
-        "float under its own latencies minus float at their mean, every decision",
-        lambda e: e.difference(DEVICE, CONSTANT),
-        lambda _: falls,
-    ),
-    *_of_the_stage("(slow device)", "device-tail", "device-even"),
-    *_of_the_stage("(10 decisions a second)", "tail", "even"),
-)
-MODULE_QUESTIONS = (
-    PaperQuestion(
-        "Without occupancy it drives better",
-        "DS +16.94 % (scheme 1)",
-        "DS of minus-occ minus float, each at its own latency",
-        lambda e: e.difference(("minus-occ", "device"), DEVICE),
-    ),
-    PaperQuestion(
-        "Without motion it drives worse",
-        "DS 28.81 of 30.69 (scheme 3)",
-        "DS of minus-motion minus float",
-        lambda e: e.difference(("minus-motion", "device"), DEVICE),
-        lambda _: falls,
-    ),
-    PaperQuestion(
-        "Without motion it drives worse, occupancy away too",
-        "DS 17.24 (scheme 5) of 35.89 (scheme 1)",
-        "DS of minus-occ-motion minus minus-occ",
-        lambda e: e.difference(("minus-occ-motion", "device"), ("minus-occ", "device")),
-        lambda _: falls,
-    ),
-    PaperQuestion(
-        "Without the map it drives no worse",
-        "DS 32.24 of 30.69 (scheme 2)",
-        "DS of minus-map minus float",
-        lambda e: e.difference(("minus-map", "device"), DEVICE),
-    ),
-    PaperQuestion(
-        "Without the map more of the collisions are with static things",
-        "55.07 % of all collisions (schemes 2 and 6)",
-        "their share without the map minus their share with it",
-        lambda e: e.static_share(("minus-map", "device"), DEVICE),
-    ),
-)
-INT8_QUESTIONS = (
-    PaperQuestion(
-        "Int8 feature extraction keeps the driving score",
-        f"DS {MINUS}{_lost(INT8['feature-ext'], INT8['exact']):.1%} (table 5, UniAD)",
-        "DS of feature-ext minus exact at 10 decisions a second, no more lost than"
-        " that share",
-        lambda e: e.difference(("feature-ext", "fps-10"), ("exact", "fps-10")),
-        _keeps(("exact", "fps-10"), _lost(INT8["feature-ext"], INT8["exact"])),
-    ),
-    PaperQuestion(
-        "Int8 in the whole network costs driving score",
-        f"DS {MINUS}{_lost(INT8['full'], INT8['exact']):.1%} (UniAD)",
-        "DS of full minus exact at 10 decisions a second",
-        lambda e: e.difference(("full", "fps-10"), ("exact", "fps-10")),
-        lambda _: falls,
-    ),
-    PaperQuestion(
-        "Prediction suffers more from int8 than feature extraction",
-        "DS 29.53 against 36.59",
-        "DS of feature-ext minus prediction at 10 decisions a second",
-        lambda e: e.difference(("feature-ext", "fps-10"), ("prediction", "fps-10")),
-    ),
-    PaperQuestion(
-        "Int8 feature extraction saves more time than int8 prediction",
-        "28.3 against 25 FPS",
-        "median latency of prediction minus that of feature-ext",
-        lambda e: e.faster_by("feature-ext", "prediction"),
-    ),
-    PaperQuestion(
-        "A module away and int8 features drive better on a slow device",
-        "DS 36.59 at 28.3 FPS against 30.69 at 2.31",
-        "DS of minus-occ-feature-ext minus float, each at its own latency",
-        lambda e: e.difference(("minus-occ-feature-ext", "device"), DEVICE),
-    ),
-    PaperQuestion(
-        "Int8 feature extraction is worth its energy: EER_AV rises",
-        "EER_AV 28.52 against 28.13 (table 5, UniAD)",
-        "EER_AV of feature-ext minus exact on the slow device, measured joules",
-        lambda e: e.eer_gap("feature-ext", "exact", "device", "measured"),
-    ),
-    PaperQuestion(
-        "Int8 feature extraction is worth its energy, so far as a model tells",
-        "the same",
-        "EER_AV of feature-ext minus exact on the slow device, energy modelled",
-        lambda e: e.eer_gap("feature-ext", "exact", "device", "modelled"),
-    ),
-)
-QUESTIONS = RATE_QUESTIONS + LATENCY_QUESTIONS + MODULE_QUESTIONS + INT8_QUESTIONS
+def findings_table(result: PaperDrives, found: tuple[Finding, ...]) -> Table:
+    """Show every question with its verdict and intervals."""
+    tested = len({each.question.compared for each in found if each.p is not None})
+    asked = PaperQuestions.load(result.study.questions)
+    return Table(
+        f"The paper's findings{result.study.preview}",
+        (
+            *("is it so that", "the paper", "the test", "here", "difference"),
+            *("these types alone", "p, Holm", "asked"),
+        ),
+        tuple(_row(each) for each in found),
+        "The difference, paired by route, stands with its 95 % interval over scenario"
+        " types drawn anew (latencies: over runs); that over these types alone stands"
+        f" beside. Same direction: p, corrected by Holm over {tested} tests, is below"
+        f" {asked.alpha:g}, and the difference on the paper's side of the edge; other"
+        " direction: on the other; not shown: neither. highway-env confirms nothing"
+        " about CARLA."
+        f" {told_of_questions(result, found)}",
+        words=4,
+    )
+
+
+def _row(finding: Finding) -> tuple[Cell, ...]:
+    question, estimate, p = finding.question, finding.found.estimate, finding.p
+    test = estimate.measure.reason or "; ".join((question.test, *finding.found.notes))
+    anew = replace(estimate, low=estimate.anew_low, high=estimate.anew_high)
+    signed = question.column != "times"
+    shown = estimate_cell(anew, signed=signed)
+    if not shown.reason:
+        shown = Cell(f"{shown.text} {anew.measure.unit}", shown.detail)
+    narrow = estimate_cell(estimate, signed=signed).detail
+    return (
+        Cell(question.asks),
+        Cell(question.paper),
+        Cell(test),
+        Cell(finding.verdict.value),
+        shown,
+        Cell(narrow or MISSING),
+        Cell(MISSING if p is None else f"{p:.2g}" if p < 0.995 else "1"),
+        Cell(finding.asked),
+    )

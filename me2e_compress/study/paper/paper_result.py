@@ -11,9 +11,13 @@ from me2e_compress.metrics.route_values import COLUMNS
 from me2e_compress.study.paper import paper_figures
 from me2e_compress.study.paper.accident import plans_before
 from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.study.paper.paper_findings import findings
+from me2e_compress.study.paper.paper_findings import (
+    Finding,
+    findings,
+    findings_table,
+    told_of_questions,
+)
 from me2e_compress.study.paper.paper_tables import all_paper_tables
-from me2e_compress.study.paper.questions import Finding, findings_table
 from me2e_compress.study.report.page import Drawing, Page, Section
 from me2e_compress.study.report.style import styled, svg
 from me2e_compress.study.study_result import StudyResult
@@ -29,7 +33,10 @@ class PaperResult(PaperDrives, StudyResult):
         """Title, and number of drives."""
         study = self.study
         wanted = sum(len(study.driven_under(each)) for each in study.conditions)
-        return f"{self.title}: {len(self.finished)} of {wanted} drives"
+        return (
+            f"{self.title}: {len(self.finished)} of {wanted} drives,"
+            f" {self.distinct} of them distinct"
+        )
 
     @functools.cached_property
     def findings(self) -> tuple[Finding, ...]:
@@ -38,12 +45,11 @@ class PaperResult(PaperDrives, StudyResult):
 
     def tables(self) -> tuple[Table, ...]:
         """Return the findings, then the paper's tables in its order."""
-        preview = self.study.preview
-        return findings_table(self.findings, preview), *all_paper_tables(self)
+        return findings_table(self, self.findings), *all_paper_tables(self)
 
     def lines(self) -> tuple[str, ...]:
-        """Return how many drives there are."""
-        return (self.headline,)
+        """Return how many drives there are, and which questions were asked."""
+        return self.headline, told_of_questions(self, self.findings)
 
     def alerts(self) -> tuple[str, ...]:
         """Return the drives that failed, and why."""
@@ -86,6 +92,7 @@ class PaperResult(PaperDrives, StudyResult):
                 }
                 for drive in self.finished
             ],
+            "questions": told_of_questions(self, self.findings),
             "findings": [each.to_json() for each in self.findings],
             "failures": [
                 {"scheme": e.variant, "condition": e.condition, "reason": e.reason}
@@ -142,7 +149,7 @@ def paper_page(result: PaperResult, command: Sequence[str] = ()) -> Page:
             (each.variant, each.pipeline or each.failure or "as it is", each.sha256)
             for each in result.facts
         ],
-        [(each.verdict.value, f"{each.asked.question}.") for each in result.findings],
+        [(each.verdict.value, f"{each.question.asks}.") for each in result.findings],
     )
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from me2e_compress.errors import Me2eError, StudyError
 from me2e_compress.manager.report import versions
+from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.drives import DriveSetup
@@ -15,6 +16,8 @@ from me2e_compress.study.paper.accident import FILE as ACCIDENT
 from me2e_compress.study.paper.accident import Accident, first_accident, watched
 from me2e_compress.study.paper.paper_drives import FILE, KeptFacts, ModelFacts
 from me2e_compress.study.paper.paper_result import PaperResult
+from me2e_compress.study.paper.questions import FILE as QUESTIONS
+from me2e_compress.study.paper.questions import SHIPPED, PaperQuestions
 from me2e_compress.study.paper.weigh import weigh, weighed
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.study_blocks import StudyBlock
@@ -35,12 +38,16 @@ def drive_blocks(
     facts about other stacks' files, for table 4.
     """
     study, clock = setup.study, setup.clock
+    records = setup.workspace.folder / "records"
+    asked = _asked(study, records)
+    setup = replace(setup, questions=asked.sha256 if asked else "")
     facts = weigh(setup, prepared, others)
     machine = this_machine(clock.load)
     result = PaperResult(
-        study, (), (), (), clock.scale, machine, versions(), facts=facts
+        *(study, (), (), (), clock.scale, machine, versions()),
+        facts=facts,
+        asked=asked,
     )
-    records = setup.workspace.folder / "records"
     for block in study.blocks:
         finished = set(records.glob("*.jsonl"))
         result = _driven(block, setup, prepared, result)
@@ -79,7 +86,27 @@ def read_paper(
         {},
         facts=(*(facts[name] for name in names if name in facts), *weighed_too),
         accident=Accident.load(accident) if accident.is_file() else None,
+        asked=_kept_questions(folder),
     )
+
+
+def _asked(study: Study, records: Path) -> PaperQuestions | None:
+    """Keep a copy of the questions before the first drive, and return it.
+
+    None in a folder whose first drive was made without one: nobody knows what it was
+    made for.
+    """
+    now = study.questions or SHIPPED
+    PaperQuestions.load(now)
+    if not (records.is_dir() or (records.parent / "results").is_dir()):
+        records.mkdir(parents=True)
+        write_bytes(records / QUESTIONS, now.read_bytes())
+    return _kept_questions(records)
+
+
+def _kept_questions(records: Path) -> PaperQuestions | None:
+    kept = records / QUESTIONS
+    return PaperQuestions.load(kept) if kept.is_file() else None
 
 
 def _of_these_routes(study: Study, found: Sequence[DriveRecord], folder: Path) -> Study:

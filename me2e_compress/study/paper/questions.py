@@ -1,251 +1,181 @@
-"""The paper's findings as questions, and the tests that answer them here.
+"""The paper's findings as questions, read from a file that is older than the drives."""
 
-No answer is written down: every verdict follows from the drives.
-"""
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, Self
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from enum import StrEnum
-from typing import Any
+from pydantic import ConfigDict, TypeAdapter, with_config
 
-import numpy as np
+from me2e_compress.errors import StudyError
+from me2e_compress.registry import documents
+from me2e_compress.study.cells import MINUS, number
+from me2e_compress.study.study_blocks import check_unique
 
-from me2e_compress.metrics.eer import eer
-from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.metrics.intervals import intervals, mean_estimate
-from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.metrics.route_values import DS, POINTS, RouteColumn
-from me2e_compress.study.cells import estimate_cell
-from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.paper.paper_cells import Energy, measures_by_variant
-from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.workflows.result import Cell, Table
+SHIPPED = Path(__file__).parent / "questions.toml"
+FILE = "questions.toml"
+"""Copy beside the records: the questions as they were before the first drive."""
 
+_STRICT = ConfigDict(strict=True, allow_inf_nan=False, extra="forbid")
 
-class Verdict(StrEnum):
-    """What the interval says about a finding."""
-
-    CONFIRMED = "confirmed"
-    NOT_CONFIRMED = "not confirmed"
-    OPPOSITE = "opposite"
-    NOT_TESTED = "not tested"
+BEFORE = "before its drives"
+PAt = Callable[[float], float]
+"""Two-sided p-value of an edge."""
 
 
-Rule = Callable[[Estimate], Verdict]
-CellName = tuple[str, str]
-
-
-def rises(found: Estimate) -> Verdict:
-    """Judge whether a difference is above zero."""
-    return _beyond(found, 0.0, 0.0)
-
-
-def falls(found: Estimate) -> Verdict:
-    """Judge whether a difference is below zero."""
-    turned = {
-        Verdict.CONFIRMED: Verdict.OPPOSITE,
-        Verdict.OPPOSITE: Verdict.CONFIRMED,
-    }
-    verdict = rises(found)
-    return turned.get(verdict, verdict)
-
-
-def not_lower_by(margin: float) -> Rule:
-    """Return a rule that a difference is not below minus a margin."""
-    return lambda found: _beyond(found, -margin, -margin)
-
-
-def within(margin: float) -> Rule:
-    """Return a rule that a difference is no larger than a margin, up or down."""
-
-    def judge(found: Estimate) -> Verdict:
-        if found.low is None or found.high is None:
-            return Verdict.NOT_CONFIRMED
-        if -margin <= found.low and found.high <= margin:
-            return Verdict.CONFIRMED
-        outside = found.low > margin or found.high < -margin
-        return Verdict.OPPOSITE if outside else Verdict.NOT_CONFIRMED
-
-    return judge
-
-
-def _beyond(found: Estimate, least: float, most: float) -> Verdict:
-    """Judge by the position of the whole interval."""
-    if found.low is not None and found.low > least:
-        return Verdict.CONFIRMED
-    if found.high is not None and found.high < most:
-        return Verdict.OPPOSITE
-    return Verdict.NOT_CONFIRMED
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """The drives of a study, with the statistics that tests need."""
-
-    result: PaperDrives
-
-    @property
-    def seed(self) -> int:
-        """Seed of bootstraps."""
-        return self.result.study.seed
-
-    def drive(self, name: CellName) -> DriveRecord:
-        """Return a drive; one that was not made says why."""
-        return self.result.drive(*name)
-
-    def difference(
-        self, one: CellName, other: CellName, column: RouteColumn = DS
-    ) -> Estimate:
-        """Return the mean of one minus the other over the same routes."""
-        return self.drive(one).minus(self.drive(other), column, self.seed)
-
-    def change_of_change(
-        self, first: CellName, middle: CellName, last: CellName
-    ) -> Estimate:
-        """Return how much more DS changes from first to middle than to last."""
-        drives = [self.drive(name) for name in (first, middle, last)]
-        if why := _missing(drives):
-            return Estimate.missing(POINTS, why)
-        early, halfway, late = (each.values(DS) for each in drives)
-        return ((halfway - early) - (late - halfway)).mean(self.seed)
-
-    def static_share(self, one: CellName, other: CellName) -> Estimate:
-        """Return the increase of the share of collisions with static objects."""
-        drives = self.drive(one), self.drive(other)
-        if why := _missing(drives):
-            return Estimate.missing("ratio", why)
-        counts = np.array([_static_and_all(drive) for drive in drives], np.float64)
-        if not counts[:, :, 1].sum(axis=1).all():
-            return Estimate.missing(
-                "ratio", "a drive without a collision has no shares"
-            )
-
-        def gap(weights: np.ndarray[Any, np.dtype[np.float64]]) -> Any:
-            static, every = (weights @ counts[:, :, at].T for at in (0, 1))
-            shares = static / np.maximum(every, 1e-9)
-            return shares[:, 0] - shares[:, 1]
-
-        value = float(gap(np.ones((1, counts.shape[1])))[0])
-        types = [each.scenario for each in drives[0].routes]
-        here, anew = intervals(gap, types, self.seed, value, (-1.0, 1.0))
-        measure = Measure(value, "ratio")
-        return Estimate(measure, *here, len(types), *anew)
-
-    def eer_gap(self, one: str, other: str, condition: str, energy: Energy) -> Estimate:
-        """Return the difference in EER_AV, scored with all of table 5."""
-        block = next((b for b in self.result.study.blocks if b.name == "table-5"), None)
-        if block is None:
-            return Estimate.missing(POINTS, "the study has no block table-5")
-        variants = measures_by_variant(self.result, block.variants, energy, condition)
-        found = eer(variants)
-        for name in (one, other):
-            if name not in found.routes:
-                score, drive = found.scores.get(name), self.drive((name, condition))
-                why = drive.reason if score is None else score.measure.reason
-                return Estimate.missing(POINTS, why)
-        gaps_by_route = (found.routes[one] - found.routes[other]).tolist()
-        if any(found.left_out.values()):
-            types = [""] * len(gaps_by_route)
-        else:
-            types = [each.scenario for each in self.drive((one, condition)).routes]
-        return mean_estimate(gaps_by_route, types, POINTS, self.seed)
-
-    def faster_by(self, one: str, other: str) -> Estimate:
-        """Return by how many ms the median latency of one is below the other's."""
-        samples = [self.result.fact(name).latency_us for name in (one, other)]
-        if not all(samples):
-            return Estimate.missing("ms", f"no latencies of {one} and {other}")
-        random = np.random.default_rng(self.seed)
-        drawn = [
-            np.median(random.choice(each, (2_000, len(each))), axis=1)
-            for each in samples
-        ]
-        low, high = np.percentile(drawn[1] - drawn[0], (2.5, 97.5)) / 1e3
-        value = float(np.median(samples[1]) - np.median(samples[0])) / 1e3
-        return Estimate(Measure(value, "ms"), float(low), float(high), len(samples[0]))
-
-
-def _missing(drives: Sequence[DriveRecord]) -> str:
-    """Say why the first drive is missing, if one is."""
-    return next((each.reason for each in drives if each.reason), "")
-
-
-def _static_and_all(drive: DriveRecord) -> list[tuple[int, int]]:
-    kinds = [[kind for kind, _ in each.collisions] for each in drive.routes]
-    return [(each.count(InfractionKind.COLLISION_LAYOUT), len(each)) for each in kinds]
-
-
+@with_config(_STRICT)
 @dataclass(frozen=True)
 class PaperQuestion:
     """A question about a finding of the paper, whose answer is yes.
 
-    ``paper`` and ``test`` say in words what the paper found and what is computed here;
-    ``rule`` may read the drives.
+    Attributes:
+        paper: What the paper found, in words.
+        figures: The paper's own numbers, in the unit of the test.
+        of: A drive, ``VARIANT.CONDITION``.
+        minus: The drive that is subtracted from it.
+        bend: Instead of both: three drives; how much more changes from the first to the
+            second than from there to the third.
+        column: What is compared.
+        holds: On which side of the edge the difference lies if the answer is yes;
+            ``within`` is no farther than it from zero.
+        turned: Beyond this on the other side, the direction is the other; None is edge.
+        tail: The slowest decision of ``of`` takes at least so many times its median.
+        untested: Why there is no test.
+        seen: What of it was asked after the drives that are kept here had been seen.
     """
 
-    question: str
+    name: str
+    asks: str
     paper: str
-    test: str
-    compute: Callable[[Evidence], Estimate]
-    rule: Callable[[Evidence], Rule] = lambda evidence: rises
+    figures: tuple[float, ...] = ()
+    of: str = ""
+    minus: str = ""
+    bend: tuple[str, str, str] | None = None
+    column: Literal["DS", "DE", "DC", "static", "EER_AV", "ms", "times"] = "DS"
+    holds: Literal["above", "below", "within"] = "above"
+    edge: float = 0.0
+    turned: float | None = None
+    tail: float | None = None
+    untested: str = ""
+    seen: str = ""
 
-    def answer(self, result: PaperDrives) -> "Finding":
-        """Compute and judge; without an estimate nothing was tested."""
-        evidence = Evidence(result)
-        found, verdict = self.compute(evidence), Verdict.NOT_TESTED
-        if found.value is not None:
-            verdict = self.rule(evidence)(found)
-        return Finding(self, verdict, found)
+    def __post_init__(self) -> None:
+        tests = bool(self.of and self.minus), self.bend is not None, bool(self.untested)
+        unclear = any("." not in each for each in self.drives)
+        if sum(tests) != 1 or bool(self.of) != bool(self.minus) or unclear:
+            raise StudyError(
+                f"question {self.name}: give of and minus, bend, or why it is untested;"
+                " a drive is VARIANT.CONDITION"
+            )
+
+    @property
+    def drives(self) -> tuple[str, ...]:
+        """The drives that answer it."""
+        return self.bend or tuple(filter(None, (self.of, self.minus)))
+
+    @property
+    def compared(self) -> tuple[str, ...]:
+        """What is compared, whatever is claimed of it."""
+        return self.column, *self.drives
+
+    @property
+    def test(self) -> str:
+        """The test in words."""
+        if self.untested:
+            return "none"
+        edge = number(self.edge, "g")
+        claim = f"within ±{edge}" if self.holds == "within" else f"{self.holds} {edge}"
+        if self.bend is not None:
+            a, b, c = self.bend
+            return (
+                f"{self.column}: ({b} {MINUS} {a}) {MINUS} ({c} {MINUS} {b}), {claim}"
+            )
+        sign = "÷" if self.column == "times" else MINUS
+        return f"{self.column}: {self.of} {sign} {self.minus}, {claim}"
+
+    def judge(self, value: float, p_at: PAt, shift: float = 0.0) -> tuple[int, float]:
+        """Return which side the value is on, and the p-value that it is.
+
+        1 is the side of the answer yes, -1 the other, 0 neither. ``shift`` moves the
+        edges away from the value, since so much hangs on something else.
+        """
+        if self.holds == "within":
+            edge = self.edge - shift
+            if abs(value) <= edge:
+                return 1, max(p_at(-edge), p_at(edge))
+            edge = self.edge + shift
+            outside = abs(value) > edge
+            return -outside, p_at(edge if value > 0.0 else -edge) if outside else 1.0
+        up = 1.0 if self.holds == "above" else -1.0
+        edge = self.edge + up * shift
+        if up * (value - edge) > 0.0:
+            return 1, p_at(edge)
+        turned = (self.edge if self.turned is None else self.turned) - up * shift
+        if up * (value - turned) < 0.0:
+            return -1, p_at(turned)
+        return 0, 1.0
 
 
+@with_config(_STRICT)
 @dataclass(frozen=True)
-class Finding:
-    """The answer to a question, and the estimate that it follows from."""
+class PaperQuestions:
+    """A file of questions, and how all of them are decided.
 
-    asked: PaperQuestion
-    verdict: Verdict
-    estimate: Estimate
+    Attributes:
+        step: Points of driving score that one frame of delay more costs.
+        name: Of the file.
+        sha256: Digest of the file.
+    """
 
-    def to_json(self) -> dict[str, Any]:
-        """Return question, verdict, and the estimate or why there is none."""
-        reason = self.estimate.measure.reason
-        return {
-            "question": self.asked.question,
-            "paper": self.asked.paper,
-            "test": self.asked.test,
-            "verdict": self.verdict.value,
-            "estimate": None if reason else self.estimate.to_json(),
-            "reason": reason or None,
-        }
+    interval: Literal["types"]
+    correction: Literal["holm"]
+    alpha: float
+    step: float
+    question: tuple[PaperQuestion, ...]
+    name: str = ""
+    sha256: str = ""
 
+    def __post_init__(self) -> None:
+        check_unique("question", [each.name for each in self.question])
+        if not (0.0 < self.alpha < 1.0 and self.step >= 0.0):
+            raise StudyError(
+                f"alpha {self.alpha:g} and step {self.step:g}: alpha lies between 0 and"
+                " 1, and a step is not negative"
+            )
 
-def findings_table(found: tuple[Finding, ...], preview: str) -> Table:
-    """Show every question with its verdict and interval."""
-    rows = [
-        (
-            Cell(each.asked.question),
-            Cell(each.asked.paper),
-            Cell(each.estimate.measure.reason or each.asked.test),
-            Cell(each.verdict.value),
-            _shown(each.estimate),
+    @classmethod
+    def load(cls, path: Path | None = None) -> "PaperQuestions":
+        """Read a file, or those that ship.
+
+        Raises:
+            StudyError: It is missing or malformed, a key is unknown, or a question has
+                no test.
+        """
+        path = path or SHIPPED
+        with documents.reading(path, StudyError, "not questions"):
+            content = documents.content(path)
+            found = documents.from_toml(content)
+            found["name"] = path.name
+            found["sha256"] = hashlib.sha256(content).hexdigest()
+            try:
+                # JSON has lists for tuples, but no dates
+                return _QUESTIONS.validate_json(json.dumps(found, default=str))
+            except StudyError as error:
+                raise documents.MalformedError(str(error)) from error
+
+    def since(self, question: PaperQuestion, now: Self) -> str:
+        """Say how a question that is asked now stood in these, the earlier ones."""
+        before = next((e for e in self.question if e.name == question.name), None)
+        if before is None:
+            return "added after seeing results"
+        then, rules = (
+            (each.interval, each.correction, each.alpha, each.step)
+            for each in (self, now)
         )
-        for each in found
-    ]
-    tested = sum(each.estimate.value is not None for each in found)
-    return Table(
-        f"The paper's findings{preview}",
-        ("is it so that", "the paper", "the test", "here", "difference"),
-        tuple(rows),
-        "Confirmed: the whole 95 % interval of the difference lies on the paper's"
-        " side; opposite: on the other; not confirmed: it holds both. Differences are"
-        " paired by route. Each interval is stated for itself: of"
-        f" {tested} tests at 95 % about {0.05 * tested:.0f} would miss by chance.",
-        words=4,
-    )
+        same = then == rules and replace(before, seen=question.seen) == question
+        return BEFORE if same else "changed after its drives"
 
 
-def _shown(estimate: Estimate) -> Cell:
-    cell = estimate_cell(estimate, signed=True)
-    if cell.reason:
-        return cell
-    return Cell(f"{cell.text} {estimate.measure.unit}", cell.detail)
+_QUESTIONS = TypeAdapter(PaperQuestions)

@@ -11,10 +11,12 @@ from me2e_compress.graph import WEIGHTED
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.energy.modelled import DEFAULT_PROCESS
 from me2e_compress.runtime.energy.models import measure_energy
+from me2e_compress.runtime.interleaved import record_traces
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.outcome import this_machine
+from me2e_compress.study.paper.evidence import FEWEST_RUNS
 from me2e_compress.study.paper.paper_drives import (
     FILE,
     SCHEMES,
@@ -30,6 +32,8 @@ from me2e_compress.workflows.profile import ProfileOptions, profile
 
 PROFILED = 100
 """Inferences under a profiler, for the figure of modules."""
+RUN_SAMPLES = 50
+"""Inferences a model in one of the separated runs whose medians are compared."""
 
 
 def weighed(folder: Path) -> tuple[ModelFacts, ...]:
@@ -86,6 +90,7 @@ def weigh(
         if each.variant is study.reference and not facts.modules_us:
             facts = replace(facts, modules_us=_by_module(study, each, clock, listener))
         found.append(facts)
+    found = _with_runs(study, prepared, found, clock, listener)
     found = [*_with_joules(study, prepared, found, listener), *others]
     # what is known of other files stays known
     names = [each.variant for each in found]
@@ -110,7 +115,7 @@ def _facts_of(
         return (
             before
             if before.latency_us == latency_us
-            else replace(before, latency_us=latency_us, modules_us={})
+            else replace(before, latency_us=latency_us, modules_us={}, runs_us=())
         )
     # otherwise count the graph anew
     module_map = prepared.variant.module_map
@@ -127,6 +132,40 @@ def _facts_of(
         latency_us,
         modelled_j=None if modelled is None else modelled.modelled_j_per_frame,
     )
+
+
+def _with_runs(
+    study: Study,
+    prepared: Sequence[PreparedVariant],
+    found: Sequence[ModelFacts],
+    clock: Clock,
+    listener: Listener,
+) -> list[ModelFacts]:
+    """Time all models in separated runs, each time with sessions opened anew.
+
+    Models with a trace from a device are not timed here.
+    """
+    models = {
+        each.variant.name: each.model
+        for each in prepared
+        if each.model is not None and not each.variant.trace
+    }
+    known = {each.variant for each in found if len(each.runs_us) >= FEWEST_RUNS}
+    if study.held_out is None or known.issuperset(models):
+        return list(found)
+    runs: dict[str, list[int]] = {name: [] for name in models}
+    for done in range(FEWEST_RUNS):
+        listener.on_progress("runs", done, FEWEST_RUNS, "")
+        traces = record_traces(
+            models,
+            CalibrationSet(study.held_out),
+            samples=RUN_SAMPLES,
+            threads=study.timing.threads,
+            provider=study.provider,
+        )
+        for name, trace in traces.items():
+            runs[name].extend(_scaled([trace.percentile_us(50)], clock.scale))
+    return [replace(e, runs_us=tuple(runs.get(e.variant, e.runs_us))) for e in found]
 
 
 def _with_joules(

@@ -33,8 +33,17 @@ def test_students_t(free: int) -> None:
     assert student_t(free) == pytest.approx(stats.t.ppf(0.975, free), abs=2e-3)
 
 
+def test_windows_of_whole_steps_are_as_sure_as_the_step_is() -> None:
+    found = estimate(windows(*[100.0] * 5), step_s=0.1)
+
+    # windows of 10 s: 2 ms of a step of 100 ms
+    ends = found.j_per_frame / 10.0 * math.sqrt(0.002 * 0.098)
+    half = student_t(3) * ends / math.sqrt(5)
+    assert found.high - found.j_per_frame == pytest.approx(half, rel=1e-6)
+
+
 def test_a_drift_in_a_line_is_no_noise() -> None:
-    found = estimate(windows(98, 99, 100, 101, 102), step_s=0.1)
+    found = estimate(windows(98, 99, 100, 101, 102), step_s=1e-9)
 
     assert found.j_per_frame == pytest.approx(10.0)
     assert found.high - found.low == pytest.approx(0.0, abs=1e-6)
@@ -60,7 +69,7 @@ def test_windows_that_agree_are_no_better_than_the_step() -> None:
 
 def test_pauses_are_taken_off_and_added_to_the_interval() -> None:
     paused = [replace(each, paused_s=0.2) for each in windows(*[100.0] * 5)]
-    found = estimate(paused, step_s=0.1, idle_w=6.0)
+    found = estimate(paused, step_s=1e-9, idle_w=6.0)
 
     assert found.j_per_frame == pytest.approx((100 - 0.2 * 8) / 10)
     assert found.high - found.low == pytest.approx(2 * 0.2 * 2 / 10, rel=1e-6)
