@@ -1,23 +1,23 @@
 """Which method reads int8 ranges best: what ``observers/README.md`` asks of frames.
 
     python -m benchmarks.bench_observers outliers OUT
-    python -m benchmarks.bench_observers plan benchmarks/observers OUT
+    python -m benchmarks.bench_observers scenes benchmarks/observers OUT
 
 ``outliers`` gives TCP and VAD-tiny of the zoo, whose weights are random, outliers of
 trained size, and prints the SQNR of every output on held-out frames under each method.
-``plan`` makes the int8 graphs of the fifteen drives again, by the ``me2e_compress``
-that Python finds, and prints how far each plan moves on the held-out frames.
+``scenes`` prints how far ranges of the driver differ between recordings, and between a
+few scenes and all: the sources of two constants of ``calibration/review.py``.
 """
 
 import argparse
 import dataclasses
-import json
-import subprocess
-import sys
+import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress import graph
@@ -33,6 +33,7 @@ from me2e_compress.passes.base import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.session import Session
 
+FloatArray: TypeAlias = npt.NDArray[np.float32]
 METHODS = ("max-min", "moving-average", "percentile", "mse", "entropy")
 SIZE = np.float32(32)
 """How much larger an outlier channel is: position embeddings of PETR reach 130 where
@@ -212,40 +213,51 @@ def _crests(seen: Statistics) -> str:
     return f"{half:.1f} (median) to {most:.0f}"
 
 
-def plan(folder: Path, out: Path) -> None:
-    """Print the mean displacement of the plan in metres, by method and recording."""
-    import tomllib
+def scenes(folder: Path, out: Path) -> None:
+    """Compare the ranges of recordings, and of a few scenes with those of all."""
+    from me2e_compress.workflows.checks import model_path
+    from me2e_compress.workflows.prepare_int8 import PreparedGraph
 
-    print(f"recording | {' | '.join(METHODS)}\n---|{'---:|' * len(METHODS)}")
+    path = model_path("highway")
+    ready = PreparedGraph.of(path, graph.LoadedModel.load(path).model, None)
+    tensors, recordings = ready.tensors(), list[Statistics]()
     for seed in (10, 11, 12):
-        study = tomllib.loads((folder / f"seed-{seed}.toml").read_text())
-        passes = {each["name"]: each.get("passes") for each in study["variant"]}
-        frames, held_out = (folder / study[key] for key in ("frames", "held_out"))
-        moved = []
-        for method in METHODS:
-            made = out / f"{method}-{seed}.onnx"
-            if not made.is_file():  # calibrated on all frames, as the study's are
-                given = ("--frames", frames, "--measure-frames", 0, "-o", made)
-                text = passes[f"{method}-{seed}"]
-                _command("compress", "highway", "--passes", text, *given)
-            said = _command("compare", "highway", made, held_out, "--json")
-            moved.append(json.loads(said)["plan"]["mean_m"])
-        cells = " | ".join(f"{each:.3f}" for each in moved)
-        print(f"{seed} | {cells}", flush=True)
+        file = out / f"seen-{seed}.npz"
+        if not file.is_file():
+            frames = CalibrationSet(folder / f"frames-{seed}")
+            Calibrator().collect(ready.model, tensors, frames).save(file)
+        recordings.append(Statistics.load(file))
+    for a, b in itertools.combinations(recordings, 2):
+        both = (a.reach > 0) & (b.reach > 0)
+        ratio = np.log(a.reach[both] / b.reach[both])
+        print(f"two recordings: at most {np.exp(np.abs(ratio).max()):.2f} apart")
+    for few in (1, 2, 4, 8):
+        missed = np.concatenate([_missed(each, few) for each in recordings])
+        print(f"{few} scenes: {np.mean(missed > 0.2):.1%} miss a fifth of the range")
 
 
-def _command(*words: object) -> str:
-    line = [sys.executable, "-m", "me2e_compress", *map(str, words)]
-    return subprocess.run(line, check=True, stdout=subprocess.PIPE, text=True).stdout
+def _missed(seen: Statistics, few: int) -> FloatArray:
+    """Return the share of each tensor's range that 50 draws of scenes miss."""
+    cuts = np.searchsorted(seen.frames, seen.scenes[1:])
+    reach = np.stack(
+        [
+            np.abs(each[..., :2]).max(axis=(0, 2))
+            for each in np.split(seen.readings, cuts)
+        ]
+    )
+    generator = np.random.default_rng(SEED)
+    whole = reach.max(axis=0)
+    drawn = [generator.choice(len(reach), few, replace=False) for _ in range(50)]
+    return np.stack([1 - (reach[each].max(0) / whole)[whole > 0] for each in drawn])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     kinds = parser.add_subparsers(required=True)
     first = kinds.add_parser("outliers")
-    second = kinds.add_parser("plan")
+    second = kinds.add_parser("scenes")
     second.add_argument("folder", type=Path)
-    for each, run in ((first, outliers), (second, plan)):
+    for each, run in ((first, outliers), (second, scenes)):
         each.add_argument("out", type=Path)
         each.set_defaults(run=run)
     chosen = vars(parser.parse_args())

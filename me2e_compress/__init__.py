@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.plan import PlanOptions, PlanResult, plan
     from me2e_compress.workflows.profile import ProfileOptions, profile
     from me2e_compress.workflows.profile_result import ProfileResult
+    from me2e_compress.workflows.ranges import RangesResult, ranges
     from me2e_compress.workflows.score import ScoreResult, score
     from me2e_compress.workflows.score_bench2drive import Bench2DriveOptions
     from me2e_compress.workflows.score_eer import EerOptions
@@ -85,6 +86,7 @@ __all__ = [
     "PlanResult",
     "ProfileOptions",
     "ProfileResult",
+    "RangesResult",
     "Report",
     "ScoreResult",
     "SearchOptions",
@@ -108,6 +110,7 @@ __all__ = [
     "measure_sensitivity",
     "plan",
     "profile",
+    "ranges",
     "record_frames",
     "run_study",
     "score",
@@ -150,6 +153,7 @@ _ROOMS = {
     "workflows.plan": ("PlanOptions", "PlanResult", "plan"),
     "workflows.profile": ("ProfileOptions", "profile"),
     "workflows.profile_result": ("ProfileResult",),
+    "workflows.ranges": ("RangesResult", "ranges"),
     "workflows.score": ("ScoreResult", "score"),
     "workflows.score_bench2drive": ("Bench2DriveOptions",),
     "workflows.score_eer": ("EerOptions",),
