@@ -28,6 +28,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.fidelity.compare import OutputFidelity, Reference
 from me2e_compress.graph import rewrite
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.nodes import array_of, sole_reader
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
@@ -154,8 +155,8 @@ def outliers(out: Path) -> None:
         same = min(each.sqnr_db for each in plain.compare(with_them.session).outputs)
         print(f"{name}: {count} tensors with outliers, float the same to {same:.0f} dB")
         for title, graph_, reference in (
-            ("without outliers", model, plain),
             ("with outliers", changed, with_them),
+            ("without outliers", model, plain),
         ):
             losses(f"{name}, {title}", graph_, frames, modules, reference)
 
@@ -164,7 +165,7 @@ def losses(
     title: str,
     model: ir.Model,
     frames: CalibrationSet,
-    modules: graph.modules.ModuleMap,
+    modules: ModuleMap,
     reference: Reference,
 ) -> None:
     """Print the SQNR of every output under each method."""
@@ -189,7 +190,7 @@ def losses(
 
 def _subject(
     name: str, out: Path
-) -> tuple[ir.Model, CalibrationSet, CalibrationSet, graph.modules.ModuleMap]:
+) -> tuple[ir.Model, CalibrationSet, CalibrationSet, ModuleMap]:
     from benchmarks.subjects import SCENE, make
     from me2e_compress.workflows.checks import load_map
     from me2e_compress.workflows.frames import FramesOptions, record_frames

@@ -78,7 +78,7 @@ def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
     return tuple(sorted(found, key=lambda each: each.severity, reverse=True))
 
 
-def compare(
+def review_beside(
     ranges: Ranges, other: Ranges, called: str = "the second"
 ) -> tuple[RangeFinding, ...]:
     """Judge ranges by those of another recording, or of an imported cache.
@@ -100,12 +100,13 @@ def compare(
             f" {next(iter(ranges.tensors))}"
         )
     ratios = ratios_of(ranges, other)
-    off = {name: ratio for name, ratio in ratios.items() if factor(ratio) >= DISAGREE}
+    worst = sorted(ratios, key=lambda name: -factor(ratios[name]))
+    off = {name: ratios[name] for name in worst if factor(ratios[name]) >= DISAGREE}
     found = _named(
         "other range",
         "warning",
         f"tensor {DISAGREE} times wider than in {called} or, below 1, narrower",
-        dict(sorted(off.items(), key=lambda item: -factor(item[1]))),
+        off,
         "One of them saw what the other did not, or in other units: look at both"
         " recordings, and record what happened in either",
     )

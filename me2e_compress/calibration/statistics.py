@@ -185,7 +185,7 @@ def checksum(array: Array) -> int:
         return ALL_ZERO
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         return NOT_FINITE
-    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8)) + 1
+    return zlib.crc32(np.ascontiguousarray(array).data.cast("B")) + 1
 
 
 def no_element(measured: Floats) -> npt.NDArray[np.bool_]:

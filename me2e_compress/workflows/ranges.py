@@ -7,11 +7,11 @@ from me2e_compress.calibration.exchange import read_cache
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.review import (
     RangeFinding,
-    compare,
     factor,
     ratios_of,
     reach_of,
     review,
+    review_beside,
 )
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import documents
@@ -89,11 +89,15 @@ class RangesResult(Result):
         if self.other is not None:
             columns += ["other", "ratio"]
         cells = [
-            [str(row["tensor"]), *(number(row[each], ".4g") for each in columns)]
+            [str(row["tensor"]), *(_written(row[each]) for each in columns)]
             for row in rows
         ]
         heads = {"crest": "range / rms", "other": f"range in {self.other_path}"}
         return table(title, ["tensor", *(heads.get(c, c) for c in columns)], cells)
+
+
+def _written(value: object) -> str:
+    return number(value if isinstance(value, float) else None, ".4g")
 
 
 def ranges(path: str | Path, other: str | Path | None = None) -> RangesResult:
@@ -110,7 +114,7 @@ def ranges(path: str | Path, other: str | Path | None = None) -> RangesResult:
     if other is None:
         return RangesResult(Path(path), mine, None, None, review(mine))
     theirs = _read(Path(other))
-    found = (*review(mine), *compare(mine, theirs, str(other)))
+    found = (*review(mine), *review_beside(mine, theirs, str(other)))
     return RangesResult(Path(path), mine, Path(other), theirs, found)
 
 

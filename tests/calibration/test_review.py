@@ -13,7 +13,7 @@ import pytest
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import IMPORTED, Activity, Ranges
-from me2e_compress.calibration.review import compare, ratios_of, review
+from me2e_compress.calibration.review import ratios_of, review, review_beside
 from me2e_compress.errors import FramesError
 from tests.frames import record
 from tests.nets import conv_attention, image
@@ -153,7 +153,7 @@ def test_ranges_of_another_recording_are_compared_worst_first() -> None:
     bounds = {"a": (-16.0, 0.0), "b": (0.0, 0.25), "c": (0.0, 1.0)}
     other = Ranges(bounds, "max-min", 4, "graph", "others")
 
-    wider, lacks = compare(GOOD, other, "b.json")
+    wider, lacks = review_beside(GOOD, other, "b.json")
 
     assert ratios_of(GOOD, other) == {"a": 0.25, "b": 8.0}
     assert (wider.severity, wider.names, wider.ratios) == (
@@ -168,14 +168,14 @@ def test_a_tensor_that_one_recording_did_not_reach_is_named() -> None:
     other = dataclasses.replace(GOOD, tensors={"a": (0.0, 0.0), "b": (0.0, 2.0)})
 
     for pair, lacks in (((GOOD, other), "b.json"), ((other, GOOD), "the first file")):
-        (found,) = compare(*pair, "b.json")
+        (found,) = review_beside(*pair, "b.json")
         assert str(found).startswith(f"1 tensor zero in {lacks} alone: a.")
         assert found.severity == "warning"
 
 
 def test_ranges_that_differ_little_are_not_named() -> None:
     other = dataclasses.replace(GOOD, tensors={"a": (-1.01, 1.01), "b": (0.0, 7.9)})
-    assert compare(GOOD, other) == ()
+    assert review_beside(GOOD, other) == ()
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ def test_ranges_of_another_graph_are_not_compared(
 ) -> None:
     other = dataclasses.replace(GOOD, **change)  # type: ignore[arg-type]
     with pytest.raises(FramesError, match=said):
-        compare(GOOD, other, "b.json")
+        review_beside(GOOD, other, "b.json")
 
 
 @pytest.mark.parametrize(
