@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from me2e_compress.study import StudyResult, load_study, run_study
     from me2e_compress.study.write import write_study
     from me2e_compress.workflows.build import BuildOptions, EngineResult, build
-    from me2e_compress.workflows.calibrate import CalibrateOptions, calibrate
+    from me2e_compress.workflows.calibrate import calibrate
+    from me2e_compress.workflows.calibrate_options import CalibrateOptions
     from me2e_compress.workflows.calibrate_result import CalibrateResult
     from me2e_compress.workflows.check_model import ModelCheck, check_model
     from me2e_compress.workflows.compare import CompareResult, compare
@@ -138,7 +139,8 @@ _ROOMS = {
     "study": ("StudyResult", "load_study", "run_study"),
     "study.write": ("write_study",),
     "workflows.build": ("BuildOptions", "EngineResult", "build"),
-    "workflows.calibrate": ("CalibrateOptions", "calibrate"),
+    "workflows.calibrate": ("calibrate",),
+    "workflows.calibrate_options": ("CalibrateOptions",),
     "workflows.calibrate_result": ("CalibrateResult",),
     "workflows.check_model": ("ModelCheck", "check_model"),
     "workflows.compare": ("CompareResult", "compare"),

@@ -123,5 +123,5 @@ def _read(path: Path) -> Ranges:
     if not path.is_file():
         raise FramesError(f"{path}: no such ranges file or calibration cache")
     with documents.reading(path, FramesError, "not ranges"):
-        is_json = documents.content(path)[:64].lstrip().startswith((b"{", b"["))
+        is_json = documents.content(path)[:64].lstrip().startswith(b"{")
     return Ranges.load(path) if is_json else read_cache(path)
