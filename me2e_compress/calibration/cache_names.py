@@ -26,14 +26,22 @@ _LEAST = 0.5
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SourceNames:
-    """What the nodes of a source file make, by the names of the nodes."""
+    """What the nodes of a source file make.
+
+    Attributes:
+        made: outputs, by the name of the node.
+        values: the same, by their own name.
+    """
 
     made: Mapping[str, tuple[ir.Value, ...]]
+    values: Mapping[str, ir.Value]
 
     @classmethod
     def of(cls, source: ir.Model) -> "SourceNames":
-        """Note the outputs of every node, before passes run on a copy."""
-        return cls({str(node.name): tuple(node.outputs) for node in source.graph})
+        """Note the outputs of every node; all nodes must have names."""
+        made = {str(node.name): tuple(node.outputs) for node in source.graph}
+        values = {str(each.name): each for outs in made.values() for each in outs}
+        return cls(made, values)
 
     def handed_on(self, origins: Sequence[str]) -> list[ir.Value]:
         """Return what leaves a group of nodes: read by others, or a graph output."""
@@ -56,22 +64,18 @@ def taken_from(
 ) -> tuple[Ranges, list[str], tuple[RangeFinding, ...]]:
     """Take the ranges of ``tensors`` from a cache; return what it lacks, and say so.
 
-    ``model`` is the graph after the passes. A tensor that the cache has not by its own
-    name is looked up by that of a tensor with the same elements: in front of or behind
-    operators that only move them, or what the nodes of the source file handed on that
-    its maker stands for.
+    ``model`` is the graph after the passes. A tensor is looked up by its name if its
+    maker is as it was, else by what the nodes of the source file handed on that the
+    maker stands for; then by that of a tensor with the same elements, in front of or
+    behind operators that only move them.
 
     Raises:
         FramesError: the cache is of another graph: it has less than half of the
             tensors.
     """
     values = {str(v.name): v for v in _values(model)}
-    names = {}
-    for name in tensors:
-        if name in cache.tensors:
-            names[name] = name
-        elif (found := _elsewhere(values[name], cache.tensors, source)) is not None:
-            names[name] = found
+    looked_up = {name: _found(values[name], cache.tensors, source) for name in tensors}
+    names = {name: found for name, found in looked_up.items() if found is not None}
     missing = [name for name in tensors if name not in names]
     if len(names) < _LEAST * len(tensors):
         raise FramesError(
@@ -91,20 +95,17 @@ def _values(model: ir.Model) -> Iterator[ir.Value]:
         yield from node.outputs
 
 
-def _elsewhere(
-    value: ir.Value, known: Container[str], source: SourceNames
-) -> str | None:
+def _found(value: ir.Value, known: Container[str], source: SourceNames) -> str | None:
     """Return the name in a cache of a tensor with the same elements, if there is one.
 
-    Tensors are visited in a fixed order: towards the input first.
+    Tensors are visited in a fixed order: itself, then towards the input first.
     """
     waiting, seen = [value], {value}
     while waiting:
         each = waiting.pop(0)
-        if str(each.name) in known:
-            return str(each.name)
-        if (handed := _origin(each, source)) is not None and handed in known:
-            return handed
+        name = _source_name(each, source)
+        if name is not None and name in known:
+            return name
         near = _moved(each)
         waiting += [other for other in near if other not in seen]
         seen.update(near)
@@ -123,18 +124,31 @@ def _moved(value: ir.Value) -> list[ir.Value]:
     return near
 
 
-def _origin(value: ir.Value, source: SourceNames) -> str | None:
-    """Return the name in the source file of what a node's only output stands for."""
-    node = value.producer()
+def _source_name(value: ir.Value, source: SourceNames) -> str | None:
+    """Return what the source file calls a tensor; None where that is not certain.
+
+    A name alone proves nothing: a convolution that took in a normalization has the name
+    of its own output, and what came out of the normalization.
+    """
+    node, own = value.producer(), str(value.name)
     past = None if node is None else provenance.read(node)
-    if node is None or past is None or len(node.outputs) > 1:
-        return None
+    if node is None or past is None:
+        return own
+    before = source.values.get(own)
+    maker = None if before is None else before.producer()
+    if maker is not None and past.origins == (str(maker.name),):
+        return own if _fit(before, value) else None
+    # a node that stands for several, or was split, or stands for another
     handed = source.handed_on(past.origins)
-    # several tensors leave the group, or another node has a part of it
-    if len(handed) != 1 or _shares(node, past.origins):
+    if len(handed) != 1 or len(node.outputs) > 1 or _shares(node, past.origins):
         return None
-    shapes = static_shape(handed[0]), static_shape(value)
-    return str(handed[0].name) if None in shapes or shapes[0] == shapes[1] else None
+    return str(handed[0].name) if _fit(handed[0], value) else None
+
+
+def _fit(before: ir.Value | None, value: ir.Value) -> bool:
+    """Return whether two tensors may be the same, by their shapes."""
+    shapes = None if before is None else static_shape(before), static_shape(value)
+    return None in shapes or shapes[0] == shapes[1]
 
 
 def _shares(node: ir.Node, origins: Sequence[str]) -> bool:

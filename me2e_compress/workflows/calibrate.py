@@ -27,6 +27,7 @@ from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.stack.part_graph import PartGraph
 from me2e_compress.manager import recipe
 from me2e_compress.passes.fix_shapes import with_sizes
+from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.quantization.plan.overrides import keep_readers, overrides_text
 from me2e_compress.registry import drafts, marks
 from me2e_compress.runtime.atomic import write_bytes
@@ -153,7 +154,11 @@ def _ready(
         frames=part,
         provider=options.provider,
     )
-    names = None if options.imported is None else SourceNames.of(loaded.model)
+    names = None
+    if options.imported is not None:  # the first pass gives every node its name
+        first_pass = (ImportNormalize(),)
+        named = PreparedGraph.of(source, loaded.model, options.module_map, first_pass)
+        names = SourceNames.of(named.model)
     ready = _prepared(source, loaded.model, options.module_map, options)
     return ready, part, first, names
 

@@ -69,9 +69,8 @@ class CalibrateResult(Result):
         first = {name: each.to_json() for name, each in self.first_frames.items()}
         found = self.ranges
         own = {**dataclasses.asdict(found), "dead": found.dead}
-        return {**own, "outliers": found.outliers, "findings": self.findings} | {
-            "first_frames": first
-        }
+        own |= {"outliers": found.outliers, "findings": self.findings}
+        return {**own, "first_frames": first, "overrides": self.overrides}
 
 
 def beside_ranges(ranges: Path, label: str) -> Path:

@@ -3,14 +3,23 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import onnx_ir as ir
 import pytest
 
+from me2e_compress import graph
 from me2e_compress.calibration.cache_names import SourceNames, taken_from
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import IMPORTED, Ranges
+from me2e_compress.calibration.review import factor, ratios_of
 from me2e_compress.errors import FramesError
 from me2e_compress.graph import digest, provenance
 from me2e_compress.graph.provenance import Provenance
+from me2e_compress.passes.import_normalize import ImportNormalize
+from me2e_compress.workflows.prepare_int8 import PreparedGraph
+from me2e_compress.zoo.shipped import WEIGHTS, shipped
+from tests.nets import MODULES, net
 
 CACHE = Path("trt.cache")
 
@@ -33,6 +42,18 @@ def cache(*names: str) -> Ranges:
     return Ranges(bounds, IMPORTED, 0, "", "", calibrator="EntropyCalibration2")
 
 
+CONV_NORM = """
+<ir_version: 9, opset_import: ["" : 17]>
+net (float[1,16,8,8] x, float[16,16,3,3] w, float[16,16,3,3] w2,
+     float[16] s, float[16] b)
+    => (float[1,16,8,8] y) {
+    ["/backbone/Conv"] a = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(x, w)
+    ["/backbone/Norm"] n = BatchNormalization(a, s, b, b, s)
+    ["/backbone/Relu"] r = Relu(n)
+    ["/backbone/Last"] y = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(r, w2)
+}
+"""
+SHAPES = {"w": (16, 16, 3, 3), "w2": (16, 16, 3, 3), "s": (16,), "b": (16,)}
 SOURCE = model(
     '["/c"] c = Abs(x)\n["/s"] s = Neg(c)\n["/r"] r = Relu(s)\n["/y"] y = Exp(r)'
 )
@@ -74,7 +95,7 @@ def test_names_that_stayed_are_taken_as_they_are() -> None:
 def test_a_tensor_that_was_only_moved_has_the_range_of_its_elements(body: str) -> None:
     moved = model(body)
 
-    found, missing, said = take(moved, cache("b", "a"), "v")
+    found, missing, said = take(moved, cache("b", "a"), "v", source=moved)
 
     assert (found.tensors, missing) == ({"v": (-2.0, 2.0)}, [])
     assert said == "1 taken from a tensor of the same elements: v from a"
@@ -102,6 +123,49 @@ def test_nodes_that_hand_on_two_tensors_are_not_guessed_between() -> None:
 
     with pytest.raises(FramesError, match="lacks f"):
         take(made, cache("c", "s", "r"), "f", source=source)
+
+
+def test_a_name_that_a_merged_node_kept_is_not_trusted(tmp_path: Path) -> None:
+    draws = np.random.default_rng(0)
+    model = net(
+        CONV_NORM, {name: draws.random(shape) for name, shape in SHAPES.items()}
+    )
+    source = SourceNames.of(model)
+    ready = PreparedGraph.of(tmp_path / "m.onnx", model, MODULES)
+    merged = ready.model.graph[0]
+    assert [merged.op_type, merged.outputs[0].name] == ["Conv", "a"]
+
+    found, missing, said = taken_from(
+        cache("a", "n", "x"), CACHE, ready.model, ("x", "a"), source
+    )
+
+    assert (found.tensors["a"], missing) == ((-2.0, 2.0), [])
+    assert [str(each) for each in said] == [
+        "1 taken from a tensor of the same elements: a from n"
+    ]
+    with pytest.raises(FramesError, match="lacks a"):  # that of a is before the norm
+        taken_from(cache("a"), CACHE, ready.model, ("a",), source)
+
+
+@pytest.mark.slow
+def test_the_drivers_tensors_get_the_ranges_that_calibration_gives_them() -> None:
+    path = shipped("highway")
+    loaded, frames = graph.load(path), CalibrationSet(WEIGHTS / "highway-frames")
+    ready = PreparedGraph.of(path, loaded, None)
+    first = PreparedGraph.of(path, loaded, None, (ImportNormalize(),)).model
+    made = [value for node in first.graph for value in node.outputs]
+    names = [str(each.name) for each in made if each.dtype == ir.DataType.FLOAT]
+    calibrator, tensors = Calibrator(threads=1), ready.tensors()
+
+    before = calibrator.run(first, [*names, "img"], frames)
+    found, missing, _ = taken_from(
+        before, CACHE, ready.model, tensors, SourceNames.of(first)
+    )
+
+    ours = calibrator.run(ready.model, tensors, frames)
+    ratios = ratios_of(found, ours)
+    assert missing == []
+    assert max(map(factor, ratios.values())) < 1.001
 
 
 def test_half_of_what_one_node_was_is_not_its_result() -> None:
