@@ -61,4 +61,4 @@ def main(folder: Path, models: Path | None) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:3]), *[None] * (3 - len(sys.argv)))  # type: ignore[arg-type]
+    main(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else None)

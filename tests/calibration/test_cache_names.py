@@ -168,6 +168,16 @@ def test_the_drivers_tensors_get_the_ranges_that_calibration_gives_them() -> Non
     assert max(map(factor, ratios.values())) < 1.001
 
 
+def test_a_tensor_of_another_shape_is_another() -> None:
+    source = model('["/c"] c = Abs(x)\n["/y"] y = Exp(c)')
+    made = model('["/c"] c = Concat<axis=0>(x, x)\n["/y"] y = ReduceMax<axes=[0]>(c)')
+    for each in (source, made):
+        graph.infer_shapes(each)
+
+    with pytest.raises(FramesError, match="lacks c"):
+        take(made, cache("c", "y"), "c", source=source)
+
+
 def test_half_of_what_one_node_was_is_not_its_result() -> None:
     made = model('["p"] p = Abs(x)\n["q"] q = Neg(p)\n["/y"] y = Exp(q)')
     for at in (0, 1):
