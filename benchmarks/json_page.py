@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.review import RangeFinding
 from me2e_compress.driving.adapter.port_uses import PortUse
 from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.open_loop import OpenLoop
@@ -41,7 +42,7 @@ NAMED = (
     *(Ranges, PortUse, Fidelity, OpenLoop, Step, Verification, Decision, QuantPlan),
     *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity, Remedy, Rung),
     *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
-    *(Int8Outcome, RuleSummary, WeightsRecord),
+    *(Int8Outcome, RuleSummary, WeightsRecord, RangeFinding),
 )
 """Classes that the forms name; what their fields name is found."""
 HEAD = """\

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from me2e_compress.study import StudyResult, load_study, run_study
     from me2e_compress.study.write import write_study
     from me2e_compress.workflows.build import BuildOptions, EngineResult, build
-    from me2e_compress.workflows.calibrate import CalibrateOptions, calibrate
+    from me2e_compress.workflows.calibrate import calibrate
+    from me2e_compress.workflows.calibrate_options import CalibrateOptions
     from me2e_compress.workflows.calibrate_result import CalibrateResult
     from me2e_compress.workflows.check_model import ModelCheck, check_model
     from me2e_compress.workflows.compare import CompareResult, compare
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.plan import PlanOptions, PlanResult, plan
     from me2e_compress.workflows.profile import ProfileOptions, profile
     from me2e_compress.workflows.profile_result import ProfileResult
+    from me2e_compress.workflows.ranges import RangesResult, ranges
     from me2e_compress.workflows.score import ScoreResult, score
     from me2e_compress.workflows.score_bench2drive import Bench2DriveOptions
     from me2e_compress.workflows.score_eer import EerOptions
@@ -85,6 +87,7 @@ __all__ = [
     "PlanResult",
     "ProfileOptions",
     "ProfileResult",
+    "RangesResult",
     "Report",
     "ScoreResult",
     "SearchOptions",
@@ -108,6 +111,7 @@ __all__ = [
     "measure_sensitivity",
     "plan",
     "profile",
+    "ranges",
     "record_frames",
     "run_study",
     "score",
@@ -135,7 +139,8 @@ _ROOMS = {
     "study": ("StudyResult", "load_study", "run_study"),
     "study.write": ("write_study",),
     "workflows.build": ("BuildOptions", "EngineResult", "build"),
-    "workflows.calibrate": ("CalibrateOptions", "calibrate"),
+    "workflows.calibrate": ("calibrate",),
+    "workflows.calibrate_options": ("CalibrateOptions",),
     "workflows.calibrate_result": ("CalibrateResult",),
     "workflows.check_model": ("ModelCheck", "check_model"),
     "workflows.compare": ("CompareResult", "compare"),
@@ -150,6 +155,7 @@ _ROOMS = {
     "workflows.plan": ("PlanOptions", "PlanResult", "plan"),
     "workflows.profile": ("ProfileOptions", "profile"),
     "workflows.profile_result": ("ProfileResult",),
+    "workflows.ranges": ("RangesResult", "ranges"),
     "workflows.score": ("ScoreResult", "score"),
     "workflows.score_bench2drive": ("Bench2DriveOptions",),
     "workflows.score_eer": ("EerOptions",),

@@ -1,7 +1,7 @@
 """Calibrate a graph in one streaming pass, in the memory of inference."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -13,7 +13,12 @@ from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.probes import Counts, Extremes, Probe
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
-from me2e_compress.calibration.statistics import BINS, Statistics, no_element
+from me2e_compress.calibration.statistics import (
+    BINS,
+    Statistics,
+    checksum,
+    no_element,
+)
 from me2e_compress.calibration.stream import (
     Readings,
     Recording,
@@ -24,6 +29,7 @@ from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import unsupported
+from me2e_compress.runtime.session import DTYPES
 
 Progress: TypeAlias = Callable[[int, int], None]
 
@@ -90,11 +96,14 @@ class Calibrator:
             tuple(tensors),
             tuple(frames.places),
             np.empty((0, len(tensors), Extremes().width), np.float32),
+            inputs=_ports(model.graph.inputs),
+            outputs=_ports(model.graph.outputs),
+            scenes=tuple(frames.places[at] for at in frames.scenes),
         )
         # Without tensors to measure, nothing is run.
         if not tensors:
             nothing = np.empty((len(frames), 0, Extremes().width), np.float32)
-            return dataclasses.replace(blank, measured=nothing)
+            return dataclasses.replace(blank, measured=nothing, inputs=(), outputs=())
         if reason := unsupported(model, self.provider):
             raise GraphError(
                 f"{reason}; ranges that TensorRT measured are taken by `calibrate"
@@ -132,6 +141,7 @@ class _Job:
             "recording": blank.source,
             "choice of frames": list(blank.frames),
             "list of tensors": list(blank.tensors),
+            "list of inputs and outputs": [*blank.inputs, *blank.outputs],
             "optimization level": settings.optimize,
             "provider": settings.provider.name,
             "kind of statistics": "counts" if passes == 2 else "extremes",
@@ -143,20 +153,27 @@ class _Job:
         # Continue from the checkpoint, if there is one.
         measured = self.begun.results.get("measured", blank.measured)
         counts = self.begun.results.get("counts")
+        ports = len(blank.inputs) + len(blank.outputs)
+        checksums = self.begun.results.get("checksums", np.empty((0, ports)))
         self.seen = dataclasses.replace(
             blank,
             measured=np.asarray(measured, np.float32),
+            checksums=np.asarray(checksums, np.int64),
             counts=None if counts is None else np.array(counts, np.int64),
         )
 
     def extremes(self) -> None:
         """Measure minimum, maximum and mean square of every tensor and frame."""
-        rows = list(self.seen.measured)
+        rows, sums = list(self.seen.measured), self.seen.checksums.tolist()
+        ports = (*self.seen.inputs, *self.seen.outputs)
 
-        def take(readings: Readings, place: int) -> None:
+        def take(readings: Readings, held: Mapping[str, Array], place: int) -> None:
             check_finite(readings, self.seen.tensors, place)
             rows.append(readings)
-            self.seen = dataclasses.replace(self.seen, measured=np.stack(rows))
+            sums.append([checksum(held[name]) for name in ports])
+            self.seen = dataclasses.replace(
+                self.seen, measured=np.stack(rows), checksums=np.array(sums, np.int64)
+            )
 
         self._pass(Extremes(), 0, take)
 
@@ -166,13 +183,16 @@ class _Job:
         total = blank if self.seen.counts is None else self.seen.counts
         self.seen = dataclasses.replace(self.seen, counts=total)
 
-        def take(readings: Readings, place: int) -> None:
+        def take(readings: Readings, _held: Mapping[str, Array], _place: int) -> None:
             np.add(total, readings.astype(np.int64), out=total)
 
         self._pass(Counts(self.seen.exponents), len(self.frames), take)
 
     def _pass(
-        self, probe: Probe, before: int, take: Callable[[Readings, int], None]
+        self,
+        probe: Probe,
+        before: int,
+        take: Callable[[Readings, Mapping[str, Array], int], None],
     ) -> None:
         """Run the rest of a pass; ``before`` frames belong to earlier passes."""
         # Skip what an interrupted run has done.
@@ -190,8 +210,8 @@ class _Job:
         state = self.begun.state if begin else None
         readings = stream(session, self.frames, probe.width, begin, state)
         # Store the progress from time to time.
-        for at, (numbers, after) in enumerate(readings, begin):
-            take(numbers, self.seen.frames[at])
+        for at, (numbers, held, after) in enumerate(readings, begin):
+            take(numbers, held, self.seen.frames[at])
             done = before + at + 1
             if self.checkpoint.due(done, self.total):
                 self.checkpoint.write(CalibrationState(done, self._results(), after))
@@ -199,10 +219,25 @@ class _Job:
                 self.progress(done, self.total)
 
     def _results(self) -> dict[str, Array]:
-        results: dict[str, Array] = {"measured": self.seen.measured}
+        results: dict[str, Array] = {
+            "measured": self.seen.measured,
+            "checksums": self.seen.checksums,
+        }
         if self.seen.counts is not None:
             results["counts"] = self.seen.counts
         return results
+
+
+def _ports(values: Iterable[ir.Value]) -> tuple[str, ...]:
+    """Return the names of inputs or outputs that hold numbers."""
+    numbers = [
+        each
+        for each in values
+        if not each.is_initializer()
+        and isinstance(each.type, ir.TensorType)
+        and each.type.dtype.numpy() in DTYPES.values()
+    ]
+    return tuple(str(each.name) for each in numbers)
 
 
 def check_finite(readings: Readings, tensors: Sequence[str], place: int) -> None:

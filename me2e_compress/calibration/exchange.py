@@ -6,7 +6,7 @@ Both store one number per tensor, so imported ranges are symmetric: [-reach, rea
 import re
 import struct
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -61,14 +61,13 @@ def write_onnxruntime_table(ranges: Ranges, folder: Path) -> None:
             drafts.put(file, folder / file.name)
 
 
-def read_foreign(path: Path, model: str, tensors: tuple[str, ...]) -> Ranges:
+def read_cache(path: Path) -> Ranges:
     """Read a TensorRT cache, or the ``calibration.cache`` of an onnxruntime table.
 
-    Neither names its model: it is accepted for ``model``, the digest of the graph to be
-    quantized, if it has all ``tensors``.
+    Neither names its graph: the digest is empty.
 
     Raises:
-        FramesError: no such file, a malformed line, or a tensor is missing.
+        FramesError: no such file, a malformed line, or no line.
     """
     if not path.is_file():
         raise FramesError(f"{path}: no such calibration cache")
@@ -82,9 +81,10 @@ def read_foreign(path: Path, model: str, tensors: tuple[str, ...]) -> Ranges:
         reach = _parse(path, lines, 1, ": ", _hexadecimal)
     else:
         reach = _parse(path, lines, 0, " ", float)
-    # All required tensors must be in the cache.
-    bounds = _needed(path, reach, tensors)
-    return Ranges(bounds, IMPORTED, 0, model, "", calibrator=head[1] if head else "")
+    if not reach:
+        raise FramesError(f"{path}: a calibration cache without a tensor")
+    bounds = {name: (-each, each) for name, each in reach.items()}
+    return Ranges(bounds, IMPORTED, 0, "", "", calibrator=head[1] if head else "")
 
 
 def _parse(
@@ -107,17 +107,6 @@ def _parse(
 def _hexadecimal(text: str) -> float:
     (scale,) = struct.unpack("!f", bytes.fromhex(text))
     return float(scale) * QUANT_MAX
-
-
-def _needed(
-    path: Path, reach: Mapping[str, float], tensors: tuple[str, ...]
-) -> dict[str, tuple[float, float]]:
-    if missing := [name for name in tensors if name not in reach]:
-        raise FramesError(
-            f"{path}: a cache of another model: it lacks {missing[0]} and"
-            f" {len(missing) - 1} more of {len(tensors)} tensors"
-        )
-    return {name: (-reach[name], reach[name]) for name in tensors}
 
 
 def _entry(low: float, high: float) -> TensorData:

@@ -1,29 +1,41 @@
 """Ranges of tensors, with the graph and frames they were measured on."""
 
 import dataclasses
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 import pydantic
 
 from me2e_compress.calibration.observers import OBSERVERS, Observer
-from me2e_compress.calibration.statistics import Statistics
+from me2e_compress.calibration.observers.base import MaxMin
+from me2e_compress.calibration.statistics import ALL_ZERO, NOT_FINITE, Statistics
 from me2e_compress.display import Displayed, Table, counted, table
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_document
 
 OUTLIER_CREST = 64
-"""Crest factor (largest magnitude over root mean square) from which a tensor is
-reported: its int8 step then exceeds half its root mean square, so that most elements
-round to 0, 1 or 2 steps."""
+"""Crest factor (largest magnitude of the range over root mean square) from which a
+tensor is reported: its int8 step then exceeds half its root mean square, so that most
+elements round to 0, 1 or 2 steps."""
 
 LARGEST = float(np.finfo(np.float32).max)
 """The largest bound of a range: elements are float32."""
 
+_ROUNDED = 1e-3
+"""Relative: a root mean square is written with four digits."""
+
 IMPORTED = "imported"
 """Method of ranges measured by another tool, on unknown frames."""
+
+
+Activity: TypeAlias = Literal["varies", "constant", "zero", "not finite"]
+"""What an input or output did over a recording: its values differed between frames,
+were the same in all, were zero in all, or had a NaN or infinity."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -33,12 +45,14 @@ class Ranges(Displayed):
     Attributes:
         tensors: (low, high) bounds by tensor name.
         method: observer with options: ``max-min``, ``percentile:99.9``.
-        frames: number of frames.
+        frames: number of frames; 0 for imported ranges.
         model: digest of the graph.
         source: fingerprint of the recording.
-        outliers: crest factors; of tensors whose range is due to few elements, see
-            :data:`OUTLIER_CREST`.
         calibrator: TensorRT's; of an imported cache, else empty.
+        rms: root mean square of tensors over all frames; empty where it is not known.
+        scenes: number of scenes; None where it is not known.
+        inputs: what each input of the graph did; empty where it is not known.
+        outputs: what each output of the graph did; empty where it is not known.
     """
 
     tensors: dict[str, tuple[float, float]]
@@ -46,8 +60,11 @@ class Ranges(Displayed):
     frames: int
     model: str
     source: str
-    outliers: dict[str, float] = dataclasses.field(default_factory=dict)
     calibrator: str = ""
+    rms: dict[str, float] = dataclasses.field(default_factory=dict)
+    scenes: int | None = None
+    inputs: dict[str, Activity] = dataclasses.field(default_factory=dict)
+    outputs: dict[str, Activity] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def of(cls, seen: Statistics, method: Observer) -> Self:
@@ -60,7 +77,10 @@ class Ranges(Displayed):
             len(seen.frames),
             seen.model,
             seen.source,
-            _outliers(seen),
+            rms=rms_of(seen),
+            scenes=len(seen.scenes) or None,
+            inputs=_activities(seen, seen.inputs, 0),
+            outputs=_activities(seen, seen.outputs, len(seen.inputs)),
         )
 
     @property
@@ -84,13 +104,31 @@ class Ranges(Displayed):
         """The tensors that were zero in every frame."""
         return tuple(name for name, each in self.tensors.items() if each == (0.0, 0.0))
 
+    @property
+    def crests(self) -> dict[str, float]:
+        """The largest magnitude of each range over its root mean square, if known."""
+        found = {}
+        for name, root in self.rms.items():
+            low, high = self.tensors[name]
+            found[name] = max(-low, high) / root if root else 0.0
+        return found
+
+    @property
+    def outliers(self) -> dict[str, float]:
+        """Crest factors, to three digits, of tensors whose range few elements make."""
+        return {
+            name: float(f"{crest:.3g}")
+            for name, crest in self.crests.items()
+            if crest > OUTLIER_CREST
+        }
+
     def save(self, path: Path) -> None:
         """Write JSON atomically."""
         write_document(path, dataclasses.asdict(self), indent=1)
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what :meth:`save` wrote, and check the bounds."""
+        """Read what :meth:`save` wrote; what contradicts itself is refused."""
         if not path.is_file():
             raise FramesError(f"{path}: no such ranges file")
         with documents.reading(path, FramesError, "not ranges"):
@@ -103,7 +141,31 @@ class Ranges(Displayed):
                     f"{path}: not ranges: {name} has {low:g} to {high:g}; a range is"
                     " two float32 bounds, the lower one first"
                 )
+        if lie := found._contradiction():
+            raise FramesError(f"{path}: not ranges: {lie}")
         return found
+
+    def _contradiction(self) -> str:
+        """Say what of a file cannot be true; empty if nothing is."""
+        imported = self.method == IMPORTED
+        if self.frames < 1 and not imported:
+            return f"{self.method} of {self.frames} frames; give a recording"
+        if self.scenes is not None and not 0 < self.scenes <= self.frames:
+            return f"{self.scenes} scenes in {self.frames} frames"
+        for name, root in self.rms.items():
+            if name not in self.tensors:
+                return f"the root mean square of {name}, which has no range"
+            if not 0 <= root <= LARGEST:  # NaN too
+                return f"{name} has a root mean square of {root:g}"
+            # Only a method that clips leaves elements outside of the range.
+            low, high = self.tensors[name]
+            reach = max(abs(low), abs(high))
+            if self.method == MaxMin.name and root > reach * (1 + _ROUNDED):
+                return (
+                    f"{name} has {low:g} to {high:g}, and a root mean square of"
+                    f" {root:g}; both cannot be of the same elements"
+                )
+        return ""
 
     def hold_for(self, model: str, tensors: tuple[str, ...], method: str) -> bool:
         """Return whether they fit this graph and method and have all these tensors."""
@@ -118,12 +180,13 @@ class Ranges(Displayed):
         tensors: tuple[str, ...],
         method: str,
         source: str | None = None,
+        named: str | Path = "ranges",
     ) -> None:
         """Check that ranges fit this graph, tensor list, method and recording.
 
         ``model`` is the digest of the graph to be quantized, ``source`` the fingerprint
-        of the frames, None if there are none. Imported ranges fit any method and
-        frames.
+        of the frames, None if there are none; the message calls the ranges ``named``.
+        Imported ranges fit any method and frames.
 
         Raises:
             FramesError: something is stale; the message says what to do.
@@ -132,37 +195,50 @@ class Ranges(Displayed):
         again = "calibrate the graph that is being quantized again"
         if self.model != model:
             raise FramesError(
-                f"ranges are stale: of graph {self.model[:12]}, not {model[:12]};"
-                f" {again}"
+                f"{named}: stale: of graph {self.model[:12]}, not {model[:12]}; {again}"
             )
         # Imported ranges pass for any method and recording.
         asked = method
         if not method == self.method == IMPORTED:
             asked = OBSERVERS.text(OBSERVERS.parse(method), defaults=True)
         if self.method not in (asked, IMPORTED):
-            raise FramesError(f"ranges are of method {self.method}, asked for {asked}")
+            raise FramesError(f"{named}: of method {self.method}, asked for {asked}")
         wanted = self.source if source is None else source
         if self.method != IMPORTED and self.source != wanted:
             raise FramesError(
-                f"ranges are stale: of frames {self.source[:12]}, not {wanted[:12]};"
+                f"{named}: stale: of frames {self.source[:12]}, not {wanted[:12]};"
                 f" {again}"
             )
         # The graph may need tensors that were not measured.
         if missing := [name for name in tensors if name not in self.tensors]:
+            if self.method == IMPORTED:
+                again = "give the overrides that stand beside it (--overrides)"
             raise FramesError(
-                f"ranges lack {missing[0]} and {len(missing) - 1} more of"
+                f"{named}: lacks {missing[0]} and {len(missing) - 1} more of"
                 f" {len(tensors)} tensors; {again}"
             )
 
 
-def _outliers(seen: Statistics) -> dict[str, float]:
-    """Return the crest factors above the limit, rounded to three digits."""
+def rms_of(seen: Statistics) -> dict[str, float]:
+    """Return root mean squares, to four digits; a square may be beyond float32."""
     if not seen.tensors:
         return {}
     root = np.sqrt(seen.mean_squares.astype(np.float64).mean(axis=0))
-    crest = seen.reach / np.where(root > 0, root, np.inf)
-    return {
-        name: float(f"{factor:.3g}")
-        for name, factor in zip(seen.tensors, crest.tolist(), strict=True)
-        if factor > OUTLIER_CREST
-    }
+    pairs = zip(seen.tensors, root.tolist(), strict=True)
+    return {name: float(f"{each:.4g}") for name, each in pairs if math.isfinite(each)}
+
+
+def _activities(
+    seen: Statistics, names: Sequence[str], begin: int
+) -> dict[str, Activity]:
+    """Return what inputs or outputs did, from their checksums from column ``begin``."""
+    columns = seen.checksums.T[begin : begin + len(names)]
+    return {name: _activity(each) for name, each in zip(names, columns, strict=True)}
+
+
+def _activity(checksums: npt.NDArray[np.int64]) -> Activity:
+    if (checksums == NOT_FINITE).any():
+        return "not finite"
+    if (checksums != checksums[0]).any():
+        return "varies"
+    return "zero" if checksums[0] == ALL_ZERO else "constant"

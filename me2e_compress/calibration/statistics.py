@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import itertools
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self, TypeAlias
@@ -14,6 +15,7 @@ from me2e_compress.calibration.archives import archive_of, load_arrays
 from me2e_compress.calibration.shares import Share, check_whole
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.runtime.frames import Array
 
 BINS = 2048
 """Bins of a histogram of magnitudes, from 0 to the next power of two: at least 1,024 of
@@ -23,8 +25,14 @@ largest magnitude into 2,048, onnxruntime's percentile each side of zero.)"""
 _SMALLEST = -100
 """Least exponent of a histogram: below, float32 cannot hold bins per unit."""
 
-_KEPT = ("model", "source", "tensors", "frames", "measured", "counts", "share")
+_KEPT = (
+    *("model", "source", "tensors", "frames", "measured", "counts", "share"),
+    *("inputs", "outputs", "checksums", "scenes"),
+)
 """The arrays in a file of statistics."""
+
+ALL_ZERO, NOT_FINITE = 0, -1
+"""Checksums of an array of zeros, and of one with NaN or infinity."""
 
 Floats: TypeAlias = npt.NDArray[np.float32]
 
@@ -41,6 +49,10 @@ class Statistics:
         counts: int64 [tensors, bins] over all frames: how many magnitudes lie in each
             bin of [0, 2^exponent); None without histograms.
         share: which shard of which sample; None if it is not a shard.
+        inputs: names of the graph's inputs.
+        outputs: names of the graph's outputs.
+        checksums: int64 [frames, inputs + outputs]: :func:`checksum` of what each was.
+        scenes: indices of the frames that begin a scene.
     """
 
     model: str
@@ -50,6 +62,12 @@ class Statistics:
     measured: Floats
     counts: npt.NDArray[np.int64] | None = None
     share: Share | None = None
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    checksums: npt.NDArray[np.int64] = dataclasses.field(
+        default_factory=lambda: np.empty((0, 0), np.int64)
+    )
+    scenes: tuple[int, ...] = ()
 
     @functools.cached_property
     def readings(self) -> Floats:
@@ -113,6 +131,10 @@ class Statistics:
             "measured": self.measured,
             "counts": np.empty(0, np.int64) if self.counts is None else self.counts,
             "share": np.array(_listed(self.share), np.int64),
+            "inputs": np.array(self.inputs, np.str_),
+            "outputs": np.array(self.outputs, np.str_),
+            "checksums": self.checksums,
+            "scenes": np.array(self.scenes, np.int64),
         }
         write_bytes(path, archive_of(arrays))
 
@@ -123,11 +145,15 @@ class Statistics:
             raise FramesError(f"{path}: no such statistics file")
         held: dict[str, npt.NDArray[Any]] = load_arrays(path, "saved statistics")
         if missing := [name for name in _KEPT if name not in held]:
-            raise FramesError(f"{path}: not saved statistics (no {missing[0]})")
+            raise FramesError(
+                f"{path}: not saved statistics (no {missing[0]}), or of an earlier"
+                " version: measure this shard again"
+            )
         # Check shapes and values before they are used.
         counts, names, frames = (held[name] for name in ("counts", "tensors", "frames"))
         fits = counts.size == 0 or counts.shape == (names.size, BINS)
-        measured = held["measured"]
+        measured, ports = held["measured"], held["inputs"].size + held["outputs"].size
+        fits &= held["checksums"].shape == (frames.size * bool(ports), ports)
         if measured.shape != (*frames.shape, *names.shape, 3) or not fits:
             raise FramesError(f"{path}: not saved statistics (their shapes differ)")
         finite = np.isfinite(measured[..., :2]).all(-1)
@@ -142,7 +168,24 @@ class Statistics:
             measured,
             counts if counts.size else None,
             _share(held["share"].tolist()),
+            tuple(held["inputs"].tolist()),
+            tuple(held["outputs"].tolist()),
+            held["checksums"],
+            tuple(held["scenes"].tolist()),
         )
+
+
+def checksum(array: Array) -> int:
+    """Return what tells two arrays apart: the CRC-32 of the bytes, plus 1.
+
+    It is :data:`ALL_ZERO` where every element is zero, and :data:`NOT_FINITE` where one
+    is NaN or infinite.
+    """
+    if not array.any():
+        return ALL_ZERO
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        return NOT_FINITE
+    return zlib.crc32(np.ascontiguousarray(array).data.cast("B")) + 1
 
 
 def no_element(measured: Floats) -> npt.NDArray[np.bool_]:
@@ -165,7 +208,7 @@ def merge(parts: Sequence[Statistics]) -> Statistics:
     first = parts[0]
     # Shards must be of one calibration.
     for each in parts[1:]:
-        for what in ("model", "source", "tensors"):
+        for what in ("model", "source", "tensors", "inputs", "outputs"):
             if getattr(each, what) != getattr(first, what):
                 raise FramesError(
                     f"shards do not belong together: {what} of frames"
@@ -180,9 +223,18 @@ def merge(parts: Sequence[Statistics]) -> Statistics:
     frames = tuple(place for place, _, _ in places)
     if doubles := [a for a, b in itertools.pairwise(frames) if a == b]:
         raise FramesError(f"frame {doubles[0]} is in two of the shards")
-    measured = np.stack([part.measured[row] for _, part, row in places])
+    measured, checksums = (
+        np.stack([getattr(part, what)[row] for _, part, row in places])
+        for what in ("measured", "checksums")
+    )
     joint = dataclasses.replace(
-        first, frames=frames, measured=measured, counts=None, share=None
+        first,
+        frames=frames,
+        measured=measured,
+        counts=None,
+        share=None,
+        checksums=checksums,
+        scenes=tuple(sorted({at for part in parts for at in part.scenes})),
     )
     if first.counts is None:
         return joint

@@ -16,7 +16,7 @@ from me2e_compress.errors import GraphError
 from me2e_compress.graph.nodes import makers_of, reads_of
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import Session, replay
+from me2e_compress.runtime.session import DTYPES, Session, replay
 
 READINGS = "me2e_readings"
 """Name of the output that the probes write: float32 [tensors x width of the probe]."""
@@ -62,20 +62,26 @@ def stream(
     width: int,
     begin: int = 0,
     state: Mapping[str, Array] | None = None,
-) -> Iterator[tuple[Readings, dict[str, Array]]]:
-    """Run a model with probes over frames; yield each frame's readings and next state.
+) -> Iterator[tuple[Readings, dict[str, Array], dict[str, Array]]]:
+    """Run a model with probes over frames.
 
-    ``session`` comes from :func:`probed_session`, ``width`` is that of its probe.
-    ``state`` holds the recurrent inputs at frame ``begin`` if no scene starts there.
+    Of each frame it yields the readings, all inputs and outputs by name, and the next
+    state. ``session`` comes from :func:`probed_session`, ``width`` is that of its
+    probe. ``state`` holds the recurrent inputs at frame ``begin`` if no scene starts
+    there.
     """
-    rest = (frames[index] for index in range(begin, len(frames)))
-    wanted = [READINGS, *session.recurrent.values()]
-    for values in replay(session, rest, wanted, state):
+    told = [name for name, port in session.outputs.items() if port.type in DTYPES]
+    wanted = list(dict.fromkeys([*told, *session.recurrent.values()]))
+    state = state or {}
+    for index in range(begin, len(frames)):
+        frame = frames[index]
+        if frame.starts_scene:
+            state = session.first_state(frame.arrays)
+        values = next(replay(session, [frame], wanted, state))
         readings = values[READINGS].astype(np.float32).reshape(-1, width)
-        yield (
-            readings,
-            {name: values[answer] for name, answer in session.recurrent.items()},
-        )
+        held = {**frame.arrays, **state, **values}
+        state = {name: values[answer] for name, answer in session.recurrent.items()}
+        yield readings, held, state
 
 
 def probed_session(

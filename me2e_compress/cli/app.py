@@ -75,6 +75,9 @@ _PANELS = {
             "Measure the ranges of every tensor that any scheme, rule set or target"
             " needs."
         ),
+        "ranges": (
+            "Say which saved ranges deserve a look, and what to record instead."
+        ),
         "compress": (
             "Apply passes to a graph, check each, and write the smaller graph and a"
             " report."

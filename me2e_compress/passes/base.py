@@ -56,6 +56,7 @@ class Context:
                 tensors=tensors,
                 method=method,
                 source=None if self.frames is None else self.frames.fingerprint,
+                named=saved,
             )
             return found
         if self.frames is None:

@@ -8,6 +8,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.review import review
 from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance, rewrite
@@ -224,15 +225,9 @@ def _findings(plan: QuantPlan, ranges: Ranges) -> tuple[str, ...]:
     ]
     return (
         *notes,
-        *_first(list(ranges.dead), "always zero"),
-        *_first(_outliers(ranges), "a few elements make the range"),
+        *map(str, review(ranges)),
         *_first(shared, "scales shared by what a Concat joins"),
     )
-
-
-def _outliers(ranges: Ranges) -> list[str]:
-    worst = sorted(ranges.outliers.items(), key=lambda item: -item[1])
-    return [f"{name} (largest / rms {crest:.0f})" for name, crest in worst]
 
 
 def _first(found: list[str], what: str) -> tuple[str, ...]:

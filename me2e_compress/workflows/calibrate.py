@@ -8,30 +8,40 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.calibration.cache_names import SourceNames, taken_from
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.exchange import (
     TABLE_FILES,
-    read_foreign,
+    read_cache,
     write_onnxruntime_table,
     write_tensorrt_cache,
 )
 from me2e_compress.calibration.observers import OBSERVERS
-from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.ranges import Ranges, rms_of
+from me2e_compress.calibration.review import review
 from me2e_compress.calibration.sample import FrameSubset, draw, shard
 from me2e_compress.calibration.stack_frames import StackFrames, recording_of
 from me2e_compress.calibration.statistics import Statistics, merge
-from me2e_compress.errors import FramesError, RecipeError
+from me2e_compress.errors import FramesError
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.stack.part_graph import PartGraph
 from me2e_compress.manager import recipe
 from me2e_compress.passes.fix_shapes import with_sizes
-from me2e_compress.registry import drafts
-from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.passes.import_normalize import ImportNormalize
+from me2e_compress.quantization.plan.overrides import keep_readers, overrides_text
+from me2e_compress.registry import drafts, marks
+from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.workflows.calibrate_options import (
+    CalibrateOptions,
+    check_sources,
+    checkpoint_beside,
+    overrides_beside,
+    read_files,
+    share_of,
+    written_files,
+)
 from me2e_compress.workflows.calibrate_result import CalibrateResult, beside_ranges
 from me2e_compress.workflows.checks import (
-    MOST_THREADS,
-    Given,
-    check_count,
     check_folder,
     model_path,
     output_path,
@@ -41,64 +51,6 @@ from me2e_compress.workflows.claims import check_ours, writing
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
-
-
-@dataclasses.dataclass(frozen=True)
-class CalibrateOptions:
-    """How ranges are measured, merged or imported.
-
-    Attributes:
-        recipe: a shipped recipe or a TOML file; its passes before int8 are run.
-        method: ``max-min``, ``moving-average:W``, ``percentile:P``, ``mse``,
-            ``entropy``.
-        count: number of frames, drawn in whole scenes.
-        seed: seed of that draw.
-        module_map: preset or TOML file; None finds the preset.
-        shard: ``2/4`` measures only the second of four shards and saves statistics.
-        merge: saved shards to merge, instead of frames.
-        imported: a TensorRT cache or onnxruntime table, instead of frames.
-        tensorrt_cache: write a TensorRT calibration cache too.
-        onnxruntime_table: write onnxruntime's table too, into this folder.
-        threads: threads of onnxruntime; 0 takes all.
-        dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
-        adapter: TOML file that says which outputs are fed back; give it to ``compress``
-            too.
-        provider: what runs the graph.
-        force: replace outputs that we did not write, too.
-
-    Raises:
-        RecipeError: The method, a number or the shard is not valid.
-        FramesError: A shard is asked for a file that only whole ranges can fill.
-    """
-
-    recipe: str | Path = "exact"
-    method: str = "max-min"
-    count: int = 256
-    seed: int = 0
-    module_map: str | Path | None = None
-    shard: str | None = None
-    merge: tuple[str | Path, ...] = ()
-    imported: str | Path | None = None
-    tensorrt_cache: str | Path | None = None
-    onnxruntime_table: str | Path | None = None
-    threads: int = 0
-    dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    adapter: str | Path | None = None
-    provider: Provider = CPU
-    force: bool = False
-
-    def __post_init__(self) -> None:
-        OBSERVERS.parse(self.method)
-        check_count("--seed", self.seed)
-        check_count("--threads", self.threads, most=MOST_THREADS)
-        if self.shard is None:
-            return
-        _fraction(self.shard)
-        if self.tensorrt_cache is not None or self.onnxruntime_table is not None:
-            raise FramesError(
-                "a shard has no ranges yet: leave --tensorrt-cache and"
-                " --onnxruntime-table to --merge"
-            )
 
 
 def calibrate(
@@ -111,13 +63,15 @@ def calibrate(
     """Measure the ranges of every tensor that any scheme, rule set or target needs.
 
     The model is a float ONNX file, the TOML of a stack or the name of one that ships;
-    frames are None to merge shards or to import another tool's ranges. The output is
-    ``RANGES.json``, or ``SHARD.npz`` for a shard. A run that was killed goes on from
-    ``OUTPUT.checkpoint``. A file that runs at first frames alone has ranges of its own
-    beside it, ``RANGES.head.first_frame.json``.
+    frames are None to merge shards, and may be to import another tool's ranges. The
+    output is ``RANGES.json``, or ``SHARD.npz`` for a shard. Tensors that an imported
+    cache lacks are kept in float by ``RANGES.overrides.toml``. A run that was killed
+    goes on from ``OUTPUT.checkpoint``. A file that runs at first frames alone has
+    ranges of its own beside it, ``RANGES.head.first_frame.json``.
 
     Raises:
-        FramesError: There is not exactly one source, or frames do not fit.
+        FramesError: There is no source, or shards beside another, or frames or a cache
+            do not fit.
         PreconditionError: The graph is quantized already, or nothing can become int8.
         GraphError: The model does not exist, or an output would harm an input.
         RecipeError: The recipe does not exist.
@@ -125,12 +79,15 @@ def calibrate(
     """
     options = options or CalibrateOptions()
     source, output = model_path(model), output_path(output)
-    _check_sources(frames, options)
-    outputs, inputs = _outputs(output, options), _inputs(source, frames, options)
+    check_sources(frames, options)
+    outputs, inputs = (
+        written_files(output, options),
+        read_files(source, frames, options),
+    )
     if options.onnxruntime_table is not None:
         check_folder(Path(options.onnxruntime_table), inputs, TABLE_FILES)
     with writing(outputs, inputs, force=options.force):
-        ready, part, first = _ready(source, frames, output, options, listener)
+        ready, part, first, names = _ready(source, frames, output, options, listener)
         gc.collect()  # 150 MB of VAD-tiny as it was read; graphs are cycles
         with drafts.all_or_none():
             of_first = {
@@ -141,7 +98,10 @@ def calibrate(
                 )
                 for label, file in first.items()
             }
-            found = _calibrate(ready, part, output, options, listener)
+            if names is not None:
+                found = _import(ready, names, part, output, options)
+            else:
+                found = _calibrate(ready, part, output, options, listener)
     return dataclasses.replace(found, first_frames=of_first)
 
 
@@ -173,11 +133,18 @@ def _ready(
     output: Path,
     options: CalibrateOptions,
     listener: Listener,
-) -> tuple[PreparedGraph, FrameSubset | None, Mapping[str, PartGraph]]:
-    """Read the graph and its frames, and prepare it for int8."""
+) -> tuple[
+    PreparedGraph, FrameSubset | None, Mapping[str, PartGraph], SourceNames | None
+]:
+    """Read the graph and its frames, and prepare it for int8.
+
+    The last is what its nodes made before the passes, for an import.
+    """
     loaded = read_graph(source, listener, options.adapter)
     first = _first_files(loaded, output, options)
-    # frames are read and the graph is opened before any pass runs
+    # what is read is checked, and the graph is opened, before any pass runs
+    if options.imported is not None:
+        read_cache(Path(options.imported))
     part = None if frames is None else _part(loaded, frames, options)
     try_first(
         loaded.model,
@@ -187,8 +154,13 @@ def _ready(
         frames=part,
         provider=options.provider,
     )
+    names = None
+    if options.imported is not None:  # the first pass gives every node its name
+        first_pass = (ImportNormalize(),)
+        named = PreparedGraph.of(source, loaded.model, options.module_map, first_pass)
+        names = SourceNames.of(named.model)
     ready = _prepared(source, loaded.model, options.module_map, options)
-    return ready, part, first
+    return ready, part, first, names
 
 
 def _prepared(
@@ -210,13 +182,11 @@ def _calibrate(
     listener: Listener,
 ) -> CalibrateResult:
     tensors = ready.tensors()
-    # without frames the ranges come from another tool or from shards
-    if part is None:
-        found = _given(graph.digest(ready.model), tensors, options)
-        return _written(found, output, options)
+    if part is None:  # shards were measured elsewhere
+        return _written(_merged(ready, tensors, options), output, options)
     # a checkpoint lets a run that was killed go on
     method = options.method
-    checkpoint = _checkpoint(output)
+    checkpoint = checkpoint_beside(output)
     calibrator = Calibrator(
         method, options.threads, checkpoint=checkpoint, provider=options.provider
     )
@@ -232,56 +202,54 @@ def _calibrate(
     return _written(Ranges.of(seen, OBSERVERS.parse(method)), output, options)
 
 
-def _check_sources(frames: str | Path | None, options: CalibrateOptions) -> None:
-    given = [each is not None for each in (frames, options.imported)]
-    if sum(given) + bool(options.merge) != 1:
-        raise FramesError(
-            "give recorded frames, or shards (--merge), or another tool's cache"
-            " (--import): one of the three; ranges are never made up"
-        )
-    if options.shard is not None and frames is None:
-        raise FramesError("--shard is for frames, and none are given")
-
-
-def _checkpoint(output: Path) -> Path:
-    return output.with_name(output.name + ".checkpoint")
-
-
-def _outputs(output: Path, options: CalibrateOptions) -> list[Path]:
-    """List the files that are written; an onnxruntime table is a folder of three."""
-    files = [output, _checkpoint(output)]
-    if options.tensorrt_cache is not None:
-        files.append(Path(options.tensorrt_cache))
-    if options.onnxruntime_table is not None:
-        folder = Path(options.onnxruntime_table)
-        if folder.is_dir():
-            files += (folder / name for name in TABLE_FILES)
-    return files
-
-
-def _inputs(
-    source: Path, frames: str | Path | None, options: CalibrateOptions
-) -> tuple[Given, ...]:
-    named = (options.recipe, options.module_map, options.imported, options.adapter)
-    return (source, frames, *named, *options.merge)
-
-
 def _part(
     loaded: graph.LoadedModel, folder: str | Path, options: CalibrateOptions
 ) -> FrameSubset:
     """Draw frames that fit the model, or one shard of them."""
     recording = recording_of(loaded, folder, options.provider)
     drawn = draw(recording, options.count, options.seed)
-    return drawn if options.shard is None else shard(drawn, *_fraction(options.shard))
+    return drawn if options.shard is None else shard(drawn, *share_of(options.shard))
 
 
-def _given(digest: str, tensors: tuple[str, ...], options: CalibrateOptions) -> Ranges:
-    if options.imported is not None:
-        return read_foreign(Path(options.imported), digest, tensors)
+def _merged(
+    ready: PreparedGraph, tensors: tuple[str, ...], options: CalibrateOptions
+) -> Ranges:
     seen = merge([Statistics.load(Path(path)) for path in options.merge])
     found = Ranges.of(seen, OBSERVERS.parse(options.method))
-    found.check(model=digest, tensors=tensors, method=options.method)
+    digest = graph.digest(ready.model)
+    found.check(
+        model=digest, tensors=tensors, method=options.method, named=options.merge[0]
+    )
     return found
+
+
+def _import(
+    ready: PreparedGraph,
+    names: SourceNames,
+    part: FrameSubset | None,
+    output: Path,
+    options: CalibrateOptions,
+) -> CalibrateResult:
+    """Take another tool's ranges; keep in float what has none."""
+    path = Path(str(options.imported))
+    found, missing, said = taken_from(
+        read_cache(path), path, ready.model, ready.tensors(), names
+    )
+    # two frames show the size of every tensor; the second has a state
+    if part is not None:
+        few = dataclasses.replace(part, places=part.places[:2])
+        calibrator = Calibrator(threads=options.threads, provider=options.provider)
+        seen = calibrator.collect(ready.model, tuple(found.tensors), few)
+        found = dataclasses.replace(found, rms=rms_of(seen))
+    made = _written(found, output, options)
+    overrides = overrides_beside(output) if missing else None
+    if overrides is not None:
+        floats = (keep_readers(name, f"not in {path.name}") for name in missing)
+        text = marks.IN_TOML + overrides_text(floats)
+        write_bytes(overrides, text.encode())
+    return dataclasses.replace(
+        made, findings=(*said, *made.findings), overrides=overrides
+    )
 
 
 def _written(found: Ranges, output: Path, options: CalibrateOptions) -> CalibrateResult:
@@ -290,11 +258,4 @@ def _written(found: Ranges, output: Path, options: CalibrateOptions) -> Calibrat
         write_tensorrt_cache(found, Path(options.tensorrt_cache))
     if options.onnxruntime_table is not None:
         write_onnxruntime_table(found, Path(options.onnxruntime_table))
-    return CalibrateResult(output, found.frames, found)
-
-
-def _fraction(text: str) -> tuple[int, int]:
-    number, slash, count = text.partition("/")
-    if not slash or not (number.isdecimal() and count.isdecimal()):
-        raise RecipeError(f"--shard is {text!r}; write 2/4 for the second of four")
-    return int(number), int(count)
+    return CalibrateResult(output, found.frames, found, findings=review(found))

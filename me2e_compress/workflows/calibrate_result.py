@@ -5,10 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.review import RangeFinding
 from me2e_compress.workflows.result import Result, counted
-
-_SHOWN = 5
-"""Number of tensors of a kind that are listed."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -16,6 +14,8 @@ class CalibrateResult(Result):
     """The range of every tensor; or a shard's statistics, with `ranges` of None.
 
     Of a stack, `first_frames` has those of each file for first frames, by label.
+    `findings` say what of the ranges deserves a look. `overrides` is the file that
+    keeps in float what an imported cache has no range for; None where it has all.
     """
 
     output: Path
@@ -25,6 +25,8 @@ class CalibrateResult(Result):
     first_frames: Mapping[str, "CalibrateResult"] = dataclasses.field(
         default_factory=dict
     )
+    findings: tuple[RangeFinding, ...] = ()
+    overrides: Path | None = None
 
     @property
     def headline(self) -> str:
@@ -39,16 +41,18 @@ class CalibrateResult(Result):
 
     def lines(self) -> tuple[str, ...]:
         """Return the headline, and the ranges that deserve a look."""
-        if self.ranges is None:
-            return (self.headline,)
-        worst = sorted(self.ranges.outliers.items(), key=lambda item: -item[1])
-        outliers = [f"{name} (largest / rms {crest:.0f})" for name, crest in worst]
-        return (
-            *(line for each in self.first_frames.values() for line in each.lines()),
-            self.headline,
-            *_first(list(self.ranges.dead), "always zero"),
-            *_first(outliers, "a few elements make the range"),
-        )
+        first = (line for each in self.first_frames.values() for line in each.lines())
+        return (*first, self.headline, *self._said("note"))
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return what is wrong with the ranges for all that is known."""
+        first = (line for each in self.first_frames.values() for line in each.alerts())
+        how = f"compress --ranges {self.output} --overrides {self.overrides}"
+        also = () if self.overrides is None else (f"These floats: {how}",)
+        return (*first, *self._said("warning"), *also)
+
+    def _said(self, severity: str) -> tuple[str, ...]:
+        return tuple(str(each) for each in self.findings if each.severity == severity)
 
     def records(self) -> list[dict[str, object]]:
         """Return one row per tensor."""
@@ -63,17 +67,12 @@ class CalibrateResult(Result):
         if self.ranges is None:
             return {"shard": self.shard, "frames": self.frames}
         first = {name: each.to_json() for name, each in self.first_frames.items()}
-        own = {**dataclasses.asdict(self.ranges), "dead": self.ranges.dead}
-        return {**own, "first_frames": first}
+        found = self.ranges
+        own = {**dataclasses.asdict(found), "dead": found.dead}
+        own |= {"outliers": found.outliers, "findings": self.findings}
+        return {**own, "first_frames": first, "overrides": self.overrides}
 
 
 def beside_ranges(ranges: Path, label: str) -> Path:
     """Return where the ranges of a file for first frames stand."""
     return ranges.with_name(f"{ranges.stem}.{label}.json")
-
-
-def _first(names: list[str], what: str) -> tuple[str, ...]:
-    if not names:
-        return ()
-    more = f"; and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return (f"{len(names)} {what}: {'; '.join(names[:_SHOWN])}{more}",)

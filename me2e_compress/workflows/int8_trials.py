@@ -153,7 +153,9 @@ def _ranges(
     if options.ranges is not None:
         ranges = Ranges.load(Path(options.ranges))
         digest = graph.digest(ready.model)
-        ranges.check(model=digest, tensors=tensors, method=ranges.method)
+        ranges.check(
+            model=digest, tensors=tensors, method=ranges.method, named=options.ranges
+        )
         return ranges
     return Calibrator(threads=options.threads, provider=options.provider).run(
         ready.model,

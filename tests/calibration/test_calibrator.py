@@ -138,10 +138,10 @@ def test_saved_ranges_come_back(ranges: Ranges, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"model": "other"}, "stale: of graph other"),
-        ({"source": "other"}, "stale: of frames other"),
-        ({"method": "mse"}, "of method mse, asked for max-min"),
-        ({"tensors": {}}, "lack a and 0 more of 1"),
+        ({"model": "other"}, "r.json: stale: of graph other"),
+        ({"source": "other"}, "r.json: stale: of frames other"),
+        ({"method": "mse"}, "r.json: of method mse, asked for max-min"),
+        ({"tensors": {}}, "r.json: lacks a and 0 more of 1"),
     ],
 )
 def test_stale_ranges_are_refused(
@@ -151,7 +151,11 @@ def test_stale_ranges_are_refused(
 
     with pytest.raises(FramesError, match=message):
         stale.check(
-            model=ranges.model, tensors=("a",), method="max-min", source=ranges.source
+            model=ranges.model,
+            tensors=("a",),
+            method="max-min",
+            source=ranges.source,
+            named="r.json",
         )
 
 

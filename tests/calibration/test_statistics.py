@@ -28,6 +28,8 @@ def same(a: Statistics, b: Statistics) -> bool:
     return (
         (a.model, a.source, a.tensors, a.frames)
         == (b.model, b.source, b.tensors, b.frames)
+        and (a.inputs, a.outputs, a.scenes) == (b.inputs, b.outputs, b.scenes)
+        and np.array_equal(a.checksums, b.checksums)
         and np.array_equal(a.measured, b.measured)
         and np.array_equal(a.counted(), b.counted())
     )

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from me2e_compress import graph
 from me2e_compress.quantization.plan import KeptFloat, load_plan, plan_of, save_plan
 from me2e_compress.registry.marks import IN_JSON
 from tests.command import Cli
+from tests.docs.pages import ROOT
 from tests.frames import record
 from tests.nets import conv_attention, image, net
 
@@ -109,6 +111,101 @@ def test_another_tools_cache_comes_and_goes(cli: Cli, folder: Path) -> None:
         cli.done(f"{line} dense.onnx frames --ranges back.json {MAP} -o r.toml")
 
 
+@pytest.fixture
+def cache(cli: Cli, folder: Path) -> list[str]:
+    """A TensorRT cache ``c`` of the dense model; its lines."""
+    cli.done(f"{RANGES} --tensorrt-cache c -o r.json")
+    return (folder / "c").read_text().splitlines()
+
+
+def test_a_cache_of_tensorrt_10_becomes_an_explicit_graph(
+    cli: Cli, tmp_path: Path
+) -> None:
+    write_net(tmp_path)
+    cli.done(f"calibrate m.onnx frames {MAP} --tensorrt-cache c -o r.json")
+    head, *scales = (tmp_path / "c").read_text().splitlines()
+    kept = [line for line in scales if not line.startswith("p: ")]
+    (tmp_path / "c").write_text("\n".join([head, *kept]))
+
+    said = cli.done(f"calibrate m.onnx --import c {MAP} -o back.json").words
+    assert "1 tensor not in c: p. What reads them stays float" in said
+    assert "--overrides back.overrides.toml" in said
+
+    how = f"compress m.onnx --scheme full --rules paper {MAP} --ranges back.json"
+    refused = cli.refused(f"{how} -o int8.onnx")
+    assert "back.json: lacks p and 0 more of" in refused
+    assert "give the overrides that stand beside it" in refused
+    cli.done(f"{how} --overrides back.overrides.toml -o int8.onnx")
+
+    made = graph.load(tmp_path / "int8.onnx").graph
+    nodes = [each for each in made if each.op_type == "QuantizeLinear"]
+    steps = {float(each.inputs[1].const_value.numpy()) for each in nodes}  # type: ignore[union-attr]
+    told = {struct.unpack("!f", bytes.fromhex(each[-8:]))[0] for each in kept}
+    assert steps
+    assert steps <= told
+    assert "p" not in [each.inputs[0].name for each in nodes if each.inputs[0]]
+
+
+def test_the_commands_of_the_page_lead_from_a_cache_to_int8(
+    cli: Cli, tmp_path: Path
+) -> None:
+    write_net(tmp_path)
+    cli.done(f"calibrate m.onnx frames {MAP} --tensorrt-cache trt10.cache -o r.json")
+    (tmp_path / "m.onnx").rename(tmp_path / "vad.onnx")
+    page = (ROOT / "docs" / "quantization.md").read_text(encoding="utf-8")
+    lines = (
+        page.partition("### From a TensorRT 10 cache")[2].split("```")[1].split("\n")
+    )
+    more = {"calibrate": MAP, "compress": f"{MAP} --rules paper"}
+
+    for line in filter(None, lines):
+        words = line.removeprefix("me2e-compress ")
+        cli.done(f"{words} {more.get(words.split()[0], '')}")
+
+    assert "QuantizeLinear" in [n.op_type for n in graph.load("vad.int8.onnx").graph]
+
+
+@pytest.mark.parametrize(
+    ("factor", "kind"), [(5e7, "rounds to zero"), (1e-3, "clipped")]
+)
+def test_scales_of_a_cache_are_held_against_two_frames(
+    cli: Cli, folder: Path, cache: list[str], factor: float, kind: str
+) -> None:
+    name, _, text = cache[1].rpartition(": ")
+    (scale,) = struct.unpack("!f", bytes.fromhex(text))
+    cache[1] = f"{name}: {struct.pack('!f', scale * factor).hex()}"
+    (folder / "c").write_text("\n".join(cache))
+
+    unseen = cli.document(f"calibrate dense.onnx --import c {MAP} -o back.json")
+    seen = cli.document(f"calibrate dense.onnx scenes --import c {MAP} -o back.json")
+    later = cli.document("ranges back.json")
+    beside = cli.document("ranges r.json c")
+
+    assert unseen["findings"] == []
+    for found in (seen, later):
+        (finding,) = found["findings"]
+        assert (finding["kind"], finding["names"]) == (kind, [name])
+        assert found["status"] == "warning"
+    (finding,) = (e for e in beside["findings"] if e["kind"] == "other range")
+    assert finding["names"] == [name]
+    assert finding["ratios"] == [pytest.approx(1 / factor, rel=1e-3)]
+
+
+def test_ranges_are_shown_worst_first(cli: Cli, folder: Path) -> None:
+    cli.done(f"{RANGES} -o all.json")
+    cli.done(f"{RANGES} -n 2 -o few.json")
+
+    said = cli.done("ranges few.json all.json").words
+    assert "few.json: " in said
+    assert "2 frames in 1 scene. Frames of one scene look alike" in said
+    rows = cli.document("ranges few.json all.json")["tensors"]
+    off = [max(each["ratio"], 1 / each["ratio"]) for each in rows]
+    assert off == sorted(off, reverse=True)
+    assert {each["tensor"] for each in rows} == {
+        *json.loads((folder / "few.json").read_text())["tensors"]
+    }
+
+
 def test_fewer_frames_are_drawn_by_seed(cli: Cli, folder: Path) -> None:
     found = list[bytes]()
     for seed in (0, 0, 1, 2, 3):
@@ -125,13 +222,18 @@ def test_programs_get_json(cli: Cli, shard: str) -> None:
     cli.document(f"{RANGES} {shard} -o r.npz")
 
 
-def test_a_graph_that_is_lowered_takes_saved_ranges(cli: Cli, tmp_path: Path) -> None:
-    graph.save(conv_attention(), tmp_path / "m.onnx")
-    record(tmp_path / "frames", [image(seed) for seed in range(2)], (0,))
-    (tmp_path / "map.toml").write_text(
+def write_net(folder: Path) -> None:
+    """Write a graph of several tensors, its map and two frames."""
+    graph.save(conv_attention(), folder / "m.onnx")
+    record(folder / "frames", [image(seed) for seed in range(2)], (0,))
+    (folder / "map.toml").write_text(
         '[modules.backbone]\nrole = "feature"\npatterns = ["backbone"]\n'
         '[modules.head]\nrole = "prediction"\npatterns = ["head"]\n'
     )
+
+
+def test_a_graph_that_is_lowered_takes_saved_ranges(cli: Cli, tmp_path: Path) -> None:
+    write_net(tmp_path)
     (tmp_path / "lower.toml").write_text('[[pass]]\nname = "lower-int8"\n')
     cli.done(f"compress m.onnx --scheme full --frames frames {MAP} -o int8.onnx")
 

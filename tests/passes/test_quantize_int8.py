@@ -184,7 +184,7 @@ def test_ranges_of_another_graph_are_refused(
     path = tmp_path / "r.json"
     Calibrator().run(conv_attention(seed=1), TENSORS, frames).save(path)
 
-    with pytest.raises(FramesError, match="ranges are stale: of graph"):
+    with pytest.raises(FramesError, match=r"r\.json: stale: of graph"):
         QuantizeInt8(rules="paper", ranges=path).run(conv_attention(), Context(MODULES))
 
 

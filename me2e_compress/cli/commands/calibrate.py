@@ -9,10 +9,11 @@ from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import calibrate as workflow
+from me2e_compress.workflows.calibrate_options import CalibrateOptions
 from me2e_compress.workflows.checks import sizes
 
 Frames = Annotated[
-    Path | None, typer.Argument(help="the recorded FRAMES; none for --import")
+    Path | None, typer.Argument(help="the recorded FRAMES; --import needs none")
 ]
 Output = Annotated[
     Path, typer.Option("-o", "--output", help="the ranges as JSON; of a shard .npz")
@@ -52,7 +53,7 @@ def calibrate(
     A run that was killed goes on from OUTPUT.checkpoint; compress takes what is
     measured by --ranges.
     """
-    options = workflow.CalibrateOptions(
+    options = CalibrateOptions(
         recipe=recipe, method=method, count=count, seed=seed, module_map=module_map,
         shard=shard, merge=tuple(merge or ()), imported=imported, threads=threads,
         force=force, adapter=adapter,

@@ -95,6 +95,11 @@ def keep_float(name: str, reason: str) -> Override:
     return Override(dtype=FLOAT, nodes=name.translate(_GLOB), reason=reason)
 
 
+def keep_readers(tensor: str, reason: str) -> Override:
+    """Return the override that keeps all readers of a tensor in float."""
+    return Override(dtype=FLOAT, reads=tensor.translate(_GLOB), reason=reason)
+
+
 def overrides_text(overrides: Iterable[Override]) -> str:
     """Write overrides as the TOML that ``--overrides`` reads."""
     entries = []

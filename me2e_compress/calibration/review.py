@@ -1,0 +1,250 @@
+"""What of measured or imported ranges deserves a look, and what to record instead."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from typing import Literal
+
+from me2e_compress.calibration.ranges import OUTLIER_CREST, Activity, Ranges
+from me2e_compress.display import counted
+from me2e_compress.errors import FramesError
+
+ROUNDS_AWAY = 254
+"""Crest factor from which half an int8 step (range / 254) exceeds the root mean square,
+so that most elements round to zero."""
+
+DISAGREE = 4
+"""Ratio of two ranges of one tensor from which it is named: the wider one costs 12 dB,
+two of seven bits. Between three recordings of 256 frames of other routes, no tensor of
+the driver ``highway`` differs by more than 1.61 (benchmarks/bench_observers.py)."""
+
+FEW_SCENES = 8
+"""Fewest scenes of a recording that nothing is said of. On the driver ``highway``, 4 of
+16 scenes miss more than a fifth of the range of 9 % of the tensors, 8 of 3 %, one of
+35 % (benchmarks/bench_observers.py)."""
+
+_SHOWN = 5
+"""Number of tensors that a line lists."""
+
+Kind = Literal[
+    "rounds to zero", "few elements", "clipped", "dead tensor", "unfed input",
+    "constant input", "dead output", "not finite", "few scenes", "other range",
+    "only in one", "renamed", "not in cache",
+]  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class RangeFinding:
+    """Something about ranges that deserves a look.
+
+    Attributes:
+        kind: what it is.
+        severity: a ``warning`` is wrong for all that is known, a ``note`` may be meant.
+        said: what it is, in words.
+        names: tensors, inputs or outputs, the worst first.
+        ratios: how far off each is; empty where nothing is compared.
+        advice: what to record or do instead.
+    """
+
+    kind: Kind
+    severity: Literal["warning", "note"]
+    said: str
+    names: tuple[str, ...] = ()
+    ratios: tuple[float, ...] = ()
+    advice: str = ""
+
+    def __str__(self) -> str:
+        """Write one line, with the worst names."""
+        shown = list(self.names[:_SHOWN])
+        if self.ratios:
+            pairs = zip(shown, self.ratios, strict=False)
+            shown = [f"{name} ({ratio:.3g})" for name, ratio in pairs]
+        more = len(self.names) - len(shown)
+        names = "; ".join(shown) + (f"; and {more} more" if more > 0 else "")
+        return ": ".join(filter(None, [self.said, names])) + (
+            f". {self.advice}" if self.advice else ""
+        )
+
+
+def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
+    """Judge ranges by what they say themselves; warnings first."""
+    found = [*_scales(ranges), *_inputs(ranges), *_outputs(ranges)]
+    if ranges.scenes is not None and ranges.scenes < FEW_SCENES:
+        said = f"{counted(ranges.frames, 'frame')} in {counted(ranges.scenes, 'scene')}"
+        advice = (
+            f"Frames of one scene look alike: record {FEW_SCENES} scenes or more, on"
+            " other routes, in other traffic and light"
+        )
+        found.append(RangeFinding("few scenes", "note", said, advice=advice))
+    return tuple(sorted(found, key=lambda each: each.severity, reverse=True))
+
+
+def review_beside(
+    ranges: Ranges, other: Ranges, called: str = "the second"
+) -> tuple[RangeFinding, ...]:
+    """Judge ranges by those of another recording, or of an imported cache.
+
+    ``other`` is ``called`` so in messages.
+
+    Raises:
+        FramesError: they are of another graph, or have no tensor in common.
+    """
+    if ranges.model and other.model and ranges.model != other.model:
+        raise FramesError(
+            f"{called}: of graph {other.model[:12]}, the first of {ranges.model[:12]}:"
+            " ranges of two graphs cannot be compared"
+        )
+    if ranges.tensors and not any(name in other.tensors for name in ranges.tensors):
+        raise FramesError(
+            f"{called}: of another graph: it has none of"
+            f" {counted(len(ranges.tensors), 'tensor')}, such as"
+            f" {next(iter(ranges.tensors))}"
+        )
+    ratios = ratios_of(ranges, other)
+    worst = sorted(ratios, key=lambda name: -factor(ratios[name]))
+    off = {name: ratios[name] for name in worst if factor(ratios[name]) >= DISAGREE}
+    found = _named(
+        "other range",
+        "warning",
+        f"tensor {DISAGREE} times wider than in {called} or, below 1, narrower",
+        off,
+        "One of them saw what the other did not, or in other units: look at both"
+        " recordings, and record what happened in either",
+    )
+    return (*found, *_only_in_one(ranges, other, called))
+
+
+def ratios_of(ranges: Ranges, other: Ranges) -> dict[str, float]:
+    """Return how many times wider each range is that is not zero in either."""
+    found = {}
+    for name, bounds in ranges.tensors.items():
+        mine, theirs = reach_of(bounds), reach_of(other.tensors.get(name, (0.0, 0.0)))
+        if mine and theirs:
+            found[name] = mine / theirs
+    return found
+
+
+def reach_of(bounds: tuple[float, float]) -> float:
+    """Return the largest magnitude of a range."""
+    return max(abs(bounds[0]), abs(bounds[1]))
+
+
+def factor(ratio: float) -> float:
+    """Return how far off a ratio is, whichever way."""
+    return max(ratio, 1 / ratio)
+
+
+def _scales(ranges: Ranges) -> Iterable[RangeFinding]:
+    """Hold the range of each tensor against its own root mean square."""
+    crests = sorted(ranges.crests.items(), key=lambda item: -item[1])
+    yield from _named(
+        "rounds to zero",
+        "warning",
+        f"range of {ROUNDS_AWAY} or more times the root mean square, where most"
+        " elements round to zero",
+        {name: crest for name, crest in crests if crest >= ROUNDS_AWAY},
+        "Look for a frame in other units or with a wrong number type; else clip by"
+        " --method, or keep the readers float",
+    )
+    yield from _named(
+        "few elements",
+        "note",
+        f"range of over {OUTLIER_CREST} times the root mean square, which a few"
+        " elements make",
+        {name: crest for name, crest in crests if OUTLIER_CREST < crest < ROUNDS_AWAY},
+    )
+    yield from _named(
+        "clipped",
+        "warning",
+        "range below the root mean square, which cuts most of the signal",
+        {name: crest for name, crest in reversed(crests) if 0 < crest < 1},
+        "These ranges are of other frames or units, or the method clips too much:"
+        " calibrate again, by max-min",
+    )
+    yield from _named(
+        "dead tensor",
+        "note",
+        "tensor always zero",
+        dict.fromkeys(ranges.dead),
+        "Nothing is known of them: record frames in which they are used (agents in"
+        " view, a state that is fed, other commands)",
+    )
+
+
+def _inputs(ranges: Ranges) -> Iterable[RangeFinding]:
+    """Name the inputs that never changed, unless there is one frame only."""
+    yield from _named(
+        "unfed input",
+        "warning",
+        "input zero in every frame",
+        _those(ranges.inputs, "zero"),
+        "A state or history of zeros gives ranges that no second frame fits: record"
+        " scenes of frames in a row, and let `inspect` show what is fed back"
+        " (--adapter)",
+    )
+    if ranges.frames > 1:
+        yield from _named(
+            "constant input",
+            "note",
+            "input the same in every frame",
+            _those(ranges.inputs, "constant"),
+            "The ranges hold for these values alone: record other commands and speeds;"
+            " camera matrices of one vehicle fit that vehicle only",
+        )
+
+
+def _outputs(ranges: Ranges) -> Iterable[RangeFinding]:
+    yield from _named(
+        "not finite",
+        "warning",
+        "output with NaN or infinity",
+        _those(ranges.outputs, "not finite"),
+        "Find the frame by `compare M.onnx M.onnx FRAMES`, and leave it out",
+    )
+    still = _those(ranges.outputs, "zero")
+    if ranges.frames > 1:
+        still |= _those(ranges.outputs, "constant")
+    yield from _named(
+        "dead output",
+        "warning",
+        "output the same in every frame",
+        still,
+        "What makes them was not exercised: record frames in which they answer",
+    )
+
+
+def _only_in_one(ranges: Ranges, other: Ranges, called: str) -> Iterable[RangeFinding]:
+    """Name the tensors that are zero, or missing, in one of two files."""
+    sides = ((ranges, other, called), (other, ranges, "the first file"))
+    for here, there, lacks in sides:
+        zero = [name for name in there.dead if name in here.tensors]
+        zero = [name for name in zero if reach_of(here.tensors[name])]
+        missing = [name for name in here.tensors if name not in there.tensors]
+        yield from _named(
+            "dead tensor",
+            "warning",
+            f"tensor zero in {lacks} alone",
+            dict.fromkeys(zero),
+            "Its recording did not reach them",
+        )
+        yield from _named(
+            "only in one", "note", f"tensor not in {lacks}", dict.fromkeys(missing)
+        )
+
+
+def _those(activities: Mapping[str, Activity], kind: Activity) -> dict[str, None]:
+    return dict.fromkeys(name for name, did in activities.items() if did == kind)
+
+
+def _named(
+    kind: Kind,
+    severity: Literal["warning", "note"],
+    said: str,
+    found: Mapping[str, float | None],
+    advice: str = "",
+) -> Iterable[RangeFinding]:
+    """Yield one finding about several names, or none; ``said`` begins with a noun."""
+    if found:
+        noun, rest = said.split(" ", 1)
+        ratios = tuple(each for each in found.values() if each is not None)
+        line = f"{counted(len(found), noun)} {rest}"
+        yield RangeFinding(kind, severity, line, tuple(found), ratios, advice)

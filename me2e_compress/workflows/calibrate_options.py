@@ -1,0 +1,122 @@
+"""How ranges are measured, merged or imported, and the files that this takes."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+from me2e_compress.calibration.exchange import TABLE_FILES
+from me2e_compress.calibration.observers import OBSERVERS
+from me2e_compress.errors import FramesError, RecipeError
+from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.workflows.checks import MOST_THREADS, Given, check_count
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibrateOptions:
+    """How ranges are measured, merged or imported.
+
+    Attributes:
+        recipe: a shipped recipe or a TOML file; its passes before int8 are run.
+        method: ``max-min``, ``moving-average:W``, ``percentile:P``, ``mse``,
+            ``entropy``.
+        count: number of frames, drawn in whole scenes.
+        seed: seed of that draw.
+        module_map: preset or TOML file; None finds the preset.
+        shard: ``2/4`` measures only the second of four shards and saves statistics.
+        merge: saved shards to merge, instead of frames.
+        imported: a TensorRT cache or onnxruntime table, instead of frames; frames given
+            too only judge its scales.
+        tensorrt_cache: write a TensorRT calibration cache too.
+        onnxruntime_table: write onnxruntime's table too, into this folder.
+        threads: threads of onnxruntime; 0 takes all.
+        dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
+        adapter: TOML file that says which outputs are fed back; give it to ``compress``
+            too.
+        provider: what runs the graph.
+        force: replace outputs that we did not write, too.
+
+    Raises:
+        RecipeError: The method, a number or the shard is not valid.
+        FramesError: A shard is asked for a file that only whole ranges can fill.
+    """
+
+    recipe: str | Path = "exact"
+    method: str = "max-min"
+    count: int = 256
+    seed: int = 0
+    module_map: str | Path | None = None
+    shard: str | None = None
+    merge: tuple[str | Path, ...] = ()
+    imported: str | Path | None = None
+    tensorrt_cache: str | Path | None = None
+    onnxruntime_table: str | Path | None = None
+    threads: int = 0
+    dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    adapter: str | Path | None = None
+    provider: Provider = CPU
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        OBSERVERS.parse(self.method)
+        check_count("--seed", self.seed)
+        check_count("--threads", self.threads, most=MOST_THREADS)
+        if self.shard is None:
+            return
+        share_of(self.shard)
+        if self.tensorrt_cache is not None or self.onnxruntime_table is not None:
+            raise FramesError(
+                "a shard has no ranges yet: leave --tensorrt-cache and"
+                " --onnxruntime-table to --merge"
+            )
+
+
+def check_sources(frames: str | Path | None, options: CalibrateOptions) -> None:
+    """Refuse no source, or shards beside another one."""
+    measured = frames is not None or options.imported is not None
+    if measured == bool(options.merge):
+        raise FramesError(
+            "give recorded frames, or shards (--merge), or another tool's cache"
+            " (--import, frames then judge its scales); ranges are never made up"
+        )
+    if options.shard is not None and (frames is None or options.imported is not None):
+        raise FramesError("--shard is for frames, and none are given")
+
+
+def checkpoint_beside(output: Path) -> Path:
+    """Return where the progress of a calibration stands."""
+    return output.with_name(output.name + ".checkpoint")
+
+
+def overrides_beside(output: Path) -> Path:
+    """Return where the overrides stand of what an imported cache lacks."""
+    return output.with_name(f"{output.stem}.overrides.toml")
+
+
+def written_files(output: Path, options: CalibrateOptions) -> list[Path]:
+    """List the files that are written; an onnxruntime table is a folder of three."""
+    files = [output, checkpoint_beside(output)]
+    if options.imported is not None:
+        files.append(overrides_beside(output))
+    if options.tensorrt_cache is not None:
+        files.append(Path(options.tensorrt_cache))
+    if options.onnxruntime_table is not None:
+        folder = Path(options.onnxruntime_table)
+        if folder.is_dir():
+            files += (folder / name for name in TABLE_FILES)
+    return files
+
+
+def read_files(
+    source: Path, frames: str | Path | None, options: CalibrateOptions
+) -> tuple[Given, ...]:
+    """List the files and folders that are read."""
+    named = (options.recipe, options.module_map, options.imported, options.adapter)
+    return (source, frames, *named, *options.merge)
+
+
+def share_of(text: str) -> tuple[int, int]:
+    """Parse which shard of how many: ``2/4``."""
+    number, slash, count = text.partition("/")
+    if not slash or not (number.isdecimal() and count.isdecimal()):
+        raise RecipeError(f"--shard is {text!r}; write 2/4 for the second of four")
+    return int(number), int(count)

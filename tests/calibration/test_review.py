@@ -1,0 +1,243 @@
+"""What of ranges deserves a look, and files that contradict themselves."""
+
+import dataclasses
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.ranges import IMPORTED, Activity, Ranges
+from me2e_compress.calibration.review import ratios_of, review, review_beside
+from me2e_compress.errors import FramesError
+from tests.frames import record
+from tests.nets import conv_attention, image
+
+GOOD = Ranges(
+    {"a": (-1.0, 4.0), "b": (0.0, 2.0)},
+    "max-min",
+    16,
+    "graph",
+    "frames",
+    rms={"a": 1.0, "b": 0.5},
+    scenes=8,
+    inputs={"img": "varies"},
+    outputs={"plan": "varies"},
+)
+
+
+def lines(ranges: Ranges) -> list[tuple[str, str]]:
+    return [(each.severity, str(each)) for each in review(ranges)]
+
+
+def test_nothing_is_said_of_good_ranges() -> None:
+    assert lines(GOOD) == []
+
+
+@pytest.mark.parametrize(
+    ("rms", "severity", "said"),
+    [
+        (4 / 254, "warning", r"1 range of 254 or more .*: a \(254\)\. Look for"),
+        (4 / 253, "note", r"1 range of over 64 times .*: a \(253\)"),
+        (4 / 64, None, ""),
+        (4.001, "warning", r"1 range below the root mean square.*: a \(1\)\."),
+        (4, None, ""),
+    ],
+)
+def test_a_range_is_held_against_the_tensor_itself(
+    rms: float, severity: str | None, said: str
+) -> None:
+    found = lines(dataclasses.replace(GOOD, method="mse", rms={"a": rms}))
+
+    assert [each for each, _ in found] == ([severity] if severity else [])
+    assert re.search(said, "".join(line for _, line in found))
+
+
+def test_the_worst_are_named_first_and_the_rest_counted() -> None:
+    names = [f"t{at}" for at in range(7)]
+    bounds = {name: (0.0, 1000.0 * (at + 1)) for at, name in enumerate(names)}
+    wild = dataclasses.replace(GOOD, tensors=bounds, rms=dict.fromkeys(names, 1.0))
+
+    ((_, said),) = lines(wild)
+
+    assert said.startswith("7 ranges of 254")
+    assert ": t6 (7e+03); t5 (6e+03); t4 (5e+03); t3 (4e+03); t2 (3e+03); and 2" in said
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"tensors": {"a": (0.0, 0.0)}, "rms": {}}, "1 tensor always zero: a. Nothing"),
+        ({"inputs": {"prev_bev": "zero"}}, "1 input zero in every frame: prev_bev. A"),
+        ({"inputs": {"command": "constant"}}, "1 input the same in every frame: comm"),
+        ({"outputs": {"plan": "zero"}}, "1 output the same in every frame: plan. What"),
+        ({"outputs": {"plan": "constant"}}, "1 output the same in every frame: plan"),
+        ({"outputs": {"plan": "not finite"}}, "1 output with NaN or infinity: plan"),
+        ({"scenes": 7}, "16 frames in 7 scenes. Frames of one scene look alike: rec"),
+    ],
+)
+def test_what_was_not_seen_is_told(change: Mapping[str, object], said: str) -> None:
+    (found,) = review(dataclasses.replace(GOOD, **change))  # type: ignore[arg-type]
+
+    assert str(found).startswith(said)
+    assert found.advice or found.kind == "few elements"
+
+
+def test_one_frame_does_not_say_what_changes() -> None:
+    one = dataclasses.replace(
+        GOOD, frames=1, scenes=8, inputs={"img": "constant"}, outputs={"p": "constant"}
+    )
+    assert lines(one) == []
+
+
+def recorded(folder: Path, images: list[int], scenes: tuple[int, ...]) -> Ranges:
+    frames = [image(seed) for seed in images]
+    recording = CalibrationSet(record(folder, frames, scenes))
+    return Calibrator(threads=1).run(conv_attention(), ["a", "seen"], recording)
+
+
+@pytest.mark.parametrize(
+    ("images", "scenes", "inputs", "outputs"),
+    [
+        ([1, 2, 3], (0,), {"image": "varies", "memory": "varies"}, "varies"),
+        ([1, 2, 3], (0, 1, 2), {"image": "varies", "memory": "zero"}, "varies"),
+        ([1, 1, 1], (0, 1, 2), {"image": "constant", "memory": "zero"}, "constant"),
+        ([1, 1, 1], (0, 2), {"image": "constant", "memory": "varies"}, "varies"),
+    ],
+)
+def test_calibration_tells_what_inputs_and_outputs_did(
+    tmp_path: Path,
+    images: list[int],
+    scenes: tuple[int, ...],
+    inputs: dict[str, Activity],
+    outputs: Activity,
+) -> None:
+    found = recorded(tmp_path, images, scenes)
+
+    assert found.inputs == inputs
+    assert found.outputs == {"y": outputs, "memory_out": outputs}
+    assert (found.frames, found.scenes) == (3, len(scenes))
+
+
+def test_an_output_that_no_tensor_shows_to_be_infinite_is_found(tmp_path: Path) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "m (float[2] x) => (float[2] y, float[2] z) { y = Log(x)\n z = Abs(x) }"
+    )
+    frames = [{"x": np.array(each, np.float32)} for each in ([1, 2], [0, 3])]
+
+    found = Calibrator(threads=1).run(
+        model, ["x"], CalibrationSet(record(tmp_path, frames))
+    )
+
+    assert found.outputs == {"y": "not finite", "z": "varies"}
+
+
+def test_the_root_mean_square_is_over_all_frames(tmp_path: Path) -> None:
+    found = recorded(tmp_path, [1, 2], (0,))
+
+    seen = [image(seed)["image"] for seed in (1, 2)]
+    whole = Calibrator(threads=1).run(
+        conv_attention(), ["image"], CalibrationSet(tmp_path)
+    )
+    assert whole.rms["image"] == pytest.approx(np.sqrt(np.mean(np.square(seen))), 1e-3)
+    assert found.crests["a"] == max(map(abs, found.tensors["a"])) / found.rms["a"]
+
+
+def test_ranges_of_another_recording_are_compared_worst_first() -> None:
+    bounds = {"a": (-16.0, 0.0), "b": (0.0, 0.25), "c": (0.0, 1.0)}
+    other = Ranges(bounds, "max-min", 4, "graph", "others")
+
+    wider, lacks = review_beside(GOOD, other, "b.json")
+
+    assert ratios_of(GOOD, other) == {"a": 0.25, "b": 8.0}
+    assert (wider.severity, wider.names, wider.ratios) == (
+        *("warning", ("b", "a")),
+        (8.0, 0.25),
+    )
+    assert str(wider).startswith("2 tensors 4 times wider than in b.json or, below 1,")
+    assert str(lacks) == "1 tensor not in the first file: c"
+
+
+def test_a_tensor_that_one_recording_did_not_reach_is_named() -> None:
+    other = dataclasses.replace(GOOD, tensors={"a": (0.0, 0.0), "b": (0.0, 2.0)})
+
+    for pair, lacks in (((GOOD, other), "b.json"), ((other, GOOD), "the first file")):
+        (found,) = review_beside(*pair, "b.json")
+        assert str(found).startswith(f"1 tensor zero in {lacks} alone: a.")
+        assert found.severity == "warning"
+
+
+def test_ranges_that_differ_little_are_not_named() -> None:
+    other = dataclasses.replace(GOOD, tensors={"a": (-1.01, 1.01), "b": (0.0, 7.9)})
+    assert review_beside(GOOD, other) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"model": "another graph"}, "b.json: of graph another grap, the first of gra"),
+        ({"model": "", "tensors": {"x": (0, 1)}}, "b.json: of another graph: .* such"),
+    ],
+)
+def test_ranges_of_another_graph_are_not_compared(
+    change: Mapping[str, object], said: str
+) -> None:
+    other = dataclasses.replace(GOOD, **change)  # type: ignore[arg-type]
+    with pytest.raises(FramesError, match=said):
+        review_beside(GOOD, other, "b.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"frames": 0}, "max-min of 0 frames; give a recording"),
+        ({"frames": -3, "scenes": None}, "max-min of -3 frames"),
+        ({"scenes": 17}, "17 scenes in 16 frames"),
+        ({"scenes": 0}, "0 scenes in 16 frames"),
+        ({"rms": {"x": 1.0}}, "the root mean square of x, which has no range"),
+        ({"rms": {"a": -1.0}}, "a has a root mean square of -1"),
+        ({"rms": {"b": 2.01}}, "b has 0 to 2, and a root mean square of 2.01; both"),
+        ({"tensors": {"a": (-1e-9, 1e-9)}, "rms": {"a": 1.0}}, "a has -1e-09 to 1e-09"),
+        ({"inputs": {"img": "moves"}}, "inputs.img"),
+    ],
+)
+def test_a_file_that_contradicts_itself_is_refused(
+    tmp_path: Path, change: Mapping[str, object], said: str
+) -> None:
+    path = tmp_path / "r.json"
+    dataclasses.replace(GOOD, **change).save(path)  # type: ignore[arg-type]
+
+    with pytest.raises(FramesError, match=rf"r\.json: not ranges: {said}"):
+        Ranges.load(path)
+
+
+@pytest.mark.parametrize("method", ["mse", IMPORTED])
+def test_ranges_that_clip_may_lie_below_the_root_mean_square(
+    tmp_path: Path, method: str
+) -> None:
+    clipped = dataclasses.replace(
+        GOOD, method=method, frames=16 * (method == "mse"), rms={"a": 5.0}, scenes=None
+    )
+    clipped.save(tmp_path / "r.json")
+
+    assert Ranges.load(tmp_path / "r.json") == clipped
+
+
+def test_a_file_of_an_earlier_version_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "r.json"
+    GOOD.save(path)
+    held = json.loads(path.read_text())
+    for key in ("rms", "scenes", "inputs", "outputs"):
+        del held[key]
+    path.write_text(json.dumps({**held, "outliers": {"a": 110.0}}))
+
+    found = Ranges.load(path)
+
+    assert (found.tensors, found.rms, found.scenes) == (GOOD.tensors, {}, None)
+    assert review(found) == ()
