@@ -217,6 +217,12 @@ def check_number(option: str, value: float | None, *, zero: bool = False) -> Non
     )
 
 
+def check_share(option: str, value: float) -> None:
+    """Refuse a share that is not 0 to 1."""
+    if not 0 <= value <= 1:
+        raise RecipeError(f"{option} is {value:g}: it is a share, 0 to 1")
+
+
 def check_count(
     option: str, value: int, least: int = 0, most: int | None = None
 ) -> None:

@@ -12,6 +12,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.stack_frames import StackFrames
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import SQNR_FLOOR_DB, Floor
+from me2e_compress.fidelity.liveness import ALIVE
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager import recipe as recipes
@@ -25,6 +26,7 @@ from me2e_compress.workflows.calibrate_result import beside_ranges
 from me2e_compress.workflows.checks import (
     check_count,
     check_number,
+    check_share,
     load_map,
     model_path,
     output_path,
@@ -69,6 +71,8 @@ class CompressOptions:
         measure_frames: most frames that are kept out of calibration, to measure lossy
             passes on; 0 measures nothing and calibrates on all.
         floor: SQNR in dB below which an output is warned of.
+        alive: least share of an output's movement that is left, between frames and
+            when one input is exchanged; 0 does not ask.
         allow_empty: write the graph although nothing in it became int8.
         smaller: add no weights to remove nodes: fewer bytes instead of fewer nodes.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
@@ -88,8 +92,9 @@ class CompressOptions:
     seed: int = 0
     verify_frames: int = 2
     unproven: bool = False
-    measure_frames: int = 4
+    measure_frames: int = 8
     floor: float = SQNR_FLOOR_DB
+    alive: float = ALIVE
     allow_empty: bool = False
     smaller: bool = False
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -102,6 +107,7 @@ class CompressOptions:
         check_count("--verify-frames", self.verify_frames)
         check_count("--measure-frames", self.measure_frames)
         check_number("--floor", self.floor, zero=True)
+        check_share("--alive", self.alive)
 
     def passes(self, recipe: Recipe | None) -> tuple[Pass, ...]:
         """Build the passes of a recipe, with these options' int8.
@@ -271,7 +277,8 @@ class Compression:
         # measure what lossy passes cost, on the frames kept for it
         if report.lossy and frames.measured is not None:
             first(report.model, self.output.name)
-        loss = measure_loss(report, context, frames, Floor(options.floor), listener)
+        floor, alive = Floor(options.floor), options.alive
+        loss = measure_loss(report, context, frames, floor, alive, listener)
         seconds = process_time() - start
         return write_result(report, loaded, self.output, int8, loss, seconds)
 
