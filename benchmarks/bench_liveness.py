@@ -2,7 +2,7 @@
 
     python -m benchmarks.bench_liveness [FOLDER] [--seeds 0,1,2] [--only faults]
 
-Records the shipped driver three times (4 scenes of 4 frames), then holds against it
+Records the shipped driver three times (2 scenes of 4 frames), then holds against it
 every shipped recipe that fits it, where nothing is dead, and its int8 graph with one
 fault after the other, each of which kills something. Prints what the verdict names, and
 the least share of the movement that any healthy output keeps.
@@ -10,10 +10,12 @@ the least share of the movement that any healthy output keeps.
 
 import argparse
 import dataclasses
+import hashlib
 import json
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
@@ -22,12 +24,12 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.fidelity.compare import Reference
 from me2e_compress.fidelity.liveness import LivenessTally
-from me2e_compress.fidelity.output_liveness import Liveness, inputs_cut
+from me2e_compress.fidelity.output_liveness import Liveness
 from me2e_compress.graph.nodes import array_of
 from me2e_compress.graph.recurrence import RECURRENT
 from me2e_compress.manager import recipe
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.session import Session
+from me2e_compress.runtime.session import Session, detached
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.zoo.shipped import shipped
@@ -51,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         folder = options.folder or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         frames = [recorded(folder / f"frames-{seed}", seed) for seed in seeds]
-        session = Session(shipped(STACK), threads=1)
+        session = Remembering(shipped(STACK), threads=1)
         references = [Reference.of(session, each) for each in frames]
         if "recipes" in options.only:
             _healthy(folder, references)
@@ -59,10 +61,24 @@ def main(argv: Sequence[str] | None = None) -> None:
             _faulty(compressed(folder, "full"), references)
 
 
+class Remembering(Session):
+    """A session that runs nothing twice: all candidates are asked the same."""
+
+    answers: ClassVar[dict[bytes, dict[str, np.ndarray]]] = {}
+
+    def run(self, feeds, outputs=None, *, first=False):
+        arrays = (np.asarray(feeds[name]).tobytes() for name in sorted(feeds))
+        key = hashlib.blake2b(b"".join(arrays)).digest()
+        if key not in self.answers:
+            self.answers[key] = detached(super().run(feeds, first=first))
+        held = self.answers[key]
+        return held if outputs is None else {name: held[name] for name in outputs}
+
+
 def recorded(folder: Path, seed: int) -> list[Frame]:
     """Record a drive; its command changes from frame to frame, as few drives do."""
     if not folder.exists():
-        record_frames(STACK, folder, FramesOptions(16, seed, 4))
+        record_frames(STACK, folder, FramesOptions(8, seed, 4))
     return [
         dataclasses.replace(
             frame,
@@ -82,48 +98,49 @@ def compressed(folder: Path, name: str) -> Path:
 
 
 def measured(
-    reference: Reference, model: ir.Model, cut: Mapping[str, set[str]]
+    reference: Reference, model: ir.Model, *, ablated: bool = False
 ) -> Liveness:
     session = Session(model, threads=1)
     tally = LivenessTally(reference.session, session)
     reference.compare(session, watch=tally.add)
-    return tally.result(model=model, cut=cut)
+    return tally.result(model=model, ablated=ablated)
 
 
 def _healthy(folder: Path, references: Sequence[Reference]) -> None:
-    source = graph.load(shipped(STACK))
     for name in RECIPES:
-        model, least, dead = graph.load(compressed(folder, name)), 1.0, []
-        cut = inputs_cut(source, model) if name.startswith("minus") else {}
+        model, dead = graph.load(compressed(folder, name)), list[str]()
+        least = [(1.0, "", "")]
         for reference in references:
-            found = measured(reference, model, cut)
+            found = measured(reference, model, ablated=name.startswith("minus"))
             dead += found.faults
-            shares = [
-                share
+            least += [
+                (share, each.output, part)
                 for each in found.outputs
-                for share in (each.moves, *each.answers.values())
-                if share is not None and each.verdict != "not judged"
+                for part, share in (("moves", each.moves), *each.answers.items())
+                if share is not None and part not in each.cut
             ]
-            least = min(least, *shares)
+        share, output, part = min(least)
         said = "; ".join(dead) or "nothing is dead"
-        print(f"{name:22} least share {least:6.3f}  {said}", flush=True)
+        print(f"{name:20} {share:6.3f} {output}, {part}  {said}", flush=True)
 
 
 def _faulty(path: Path, references: Sequence[Reference]) -> None:
-    named = 0
+    named = True
     for name, (output, verdict, what, fault) in FAULTS.items():
         model = graph.load(path)
         fault(model)
-        right = 0
+        right, asked, said = 0, 0, ""
         for reference in references:
-            found = measured(reference, model, {})
-            right += any(
-                line.startswith(f"{output} is {verdict}") and what in line
-                for line in found.faults
-            )
-        named += right == len(references)
-        print(f"{name:26} {right}/{len(references)}  {found.faults[:1]}", flush=True)
-    print(f"{named} of {len(FAULTS)} faults named in every recording")
+            found = measured(reference, model)
+            # what the float graph does not answer either cannot be lost
+            answers = {each.output: each.answers for each in found.outputs}
+            asked += answers.get(output, {}).get(what, 1.0) is not None
+            start = f"{output} is {verdict}"
+            lines = [e for e in found.faults if e.startswith(start) and what in e]
+            right, said = right + len(lines), next(iter(lines), said)
+        named &= right == asked > 0
+        print(f"{name:24} {right} of {asked}  {said}", flush=True)
+    print("every fault is named" if named else "NOT every fault is named")
 
 
 def _scaled(factor: float) -> Callable[[ir.Model], None]:
@@ -235,10 +252,10 @@ FAULTS = {
     "plan fixed": ("plan", "constant", "0.00%", _held("plan")),
     "camera 0 blind": ("plan", "deaf", "camera 0 of img", _blinded([0])),
     "camera 3 blind": ("plan", "deaf", "camera 3 of img", _blinded([3])),
-    "all cameras blind": ("plan", "deaf", "camera 5 of img", _blinded(range(6))),
+    "all cameras blind": ("boxes", "deaf", "camera 5 of img", _blinded(range(6))),
     "command fixed": ("plan", "deaf", "command", _fixed("command", ZERO)),
     "can_bus fixed": ("plan", "deaf", "can_bus", _fixed("can_bus", BEV[0, 0, :18])),
-    "timestamp fixed": ("prev_bev_out", "deaf", "timestamp", _fixed("timestamp", ZERO)),
+    "timestamp fixed": ("prev_bev_out", "constant", "", _fixed("timestamp", ZERO)),
     "history not read": ("prev_bev_out", "deaf", "prev_bev", _fixed("prev_bev", BEV)),
     "history not fed": ("prev_bev", "not fed", "", _unfed),
 }

@@ -6,7 +6,7 @@ frame to frame, and how far when one input alone is exchanged for another frame'
 """
 
 import dataclasses
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable
 from functools import partial
 from typing import Self, TypeAlias
 
@@ -15,6 +15,7 @@ import onnx_ir as ir
 
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.fidelity.compare import compare
+from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.fidelity.output_liveness import (
     Liveness,
     Movement,
@@ -26,9 +27,6 @@ from me2e_compress.fidelity.output_liveness import (
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import detached
-
-ALIVE = 0.01
-"""Least movement, as a share of the first graph's, of an output that is not dead."""
 
 LEAST_SIDE = 16
 """Least rows and columns of a camera's picture."""
@@ -102,7 +100,7 @@ class _Moment:
 
 @dataclasses.dataclass(frozen=True)
 class _Donor:
-    """What takes the place of a part, in each graph; `distance` 0 is no difference."""
+    """What takes the place of a part, in each graph; `near` is of the same scene."""
 
     near: bool
     distance: float
@@ -116,7 +114,7 @@ class _Donor:
             for each, side in ((base, 0), (other, 0), (other, 1))
         )
         distance = gap(held, given[0])
-        return cls(distance > 0 and base.scene == other.scene, distance, tuple(given))
+        return cls(base.scene == other.scene, distance, tuple(given))
 
 
 class LivenessTally:
@@ -125,14 +123,15 @@ class LivenessTally:
     The frame whose inputs are exchanged is the first that continues a scene, since it
     has a history; where there is none, the first. Each part is taken from the frame
     where it differs most, of the same scene if it changes there: one more inference of
-    each graph for every part that ever changes.
+    each graph for every part that ever changes. Where an output seems deaf to it, it is
+    taken from a second frame too: a graph that picks may have jumped but once.
     """
 
     def __init__(self, a: AnySession, b: AnySession) -> None:
         self._sessions = a, b
         names = [name for name in a.outputs if name in b.outputs]
         self._movements = {name: Movement() for name in names}
-        self._donors = dict[Part, _Donor]()
+        self._donors = dict[Part, list[_Donor]]()
         self._last: _Moment | None = None
         self._base: _Moment | None = None
         self._scene = self._frames = 0
@@ -154,44 +153,45 @@ class LivenessTally:
         if base is None or (base.frame.starts_scene and not frame.starts_scene):
             base, moment = moment, last or moment
             self._base, self._donors = base, self._parts(base)
-        for part, known in self._donors.items():
+        for part, donors in self._donors.items():
             found = _Donor.of(part, base, moment)
-            if (found.near, found.distance) > (known.near, known.distance):
-                self._donors[part] = found
+            if found.distance > 0:
+                donors.append(found)
+                donors.sort(key=lambda each: (each.near, each.distance), reverse=True)
+                del donors[2:]
 
     def result(
         self,
         alive: float = ALIVE,
         model: ir.Model | None = None,
-        cut: Mapping[str, Collection[str]] | None = None,
+        *,
+        ablated: bool = False,
     ) -> Liveness:
         """Exchange every part and judge every output.
 
         Args:
             alive: share of the first graph's movement below which an output is dead.
             model: the second graph, to look for what makes an output rest.
-            cut: by output, the inputs that an ablation took from it.
+            ablated: whether modules were removed from it: who is deaf is meant to be.
         """
         base, (first, second) = self._base, self._sessions
         if base is None or self._frames < 2:
             return Liveness((), alive, reason="one frame alone: nothing moves")
-        answers, unjudged = self._exchange(base)
+        answers, unjudged = self._exchange(base, alive)
         found = []
         for name, movement in self._movements.items():
-            taken = {*(cut or {}).get(name, ())}
-            gone = tuple(str(part) for part in answers[name] if part.input in taken)
-            shares = {str(part): share for part, share in answers[name].items()}
             why = partial(cause_of, model, name, base.feeds(1), second.provider)
-            found.append(movement.judged(name, shares, gone, alive, why))
+            found.append(
+                movement.judged(name, answers[name], alive, why, ablated=ablated)
+            )
         held = [name for name in first.recurrent if name in second.inputs]
         not_fed = [name for name in held if name not in second.recurrent]
         return Liveness(tuple(found), alive, base.frame.index, unjudged, tuple(not_fed))
 
-    def _parts(self, base: _Moment) -> dict[Part, _Donor]:
-        """List what can be exchanged of a frame, each with what it is itself."""
+    def _parts(self, base: _Moment) -> dict[Part, list[_Donor]]:
+        """List what can be exchanged of a frame, so far with nothing."""
         fed = base.feeds(0).items()
-        parts = (part for name, array in fed for part in parts_of(name, array))
-        return {part: _Donor.of(part, base, base) for part in parts}
+        return {part: [] for name, array in fed for part in parts_of(name, array)}
 
     def _state(self, side: int, frame: Frame) -> dict[str, Array]:
         """Return what a graph remembers at a frame, as replays feed it."""
@@ -202,25 +202,40 @@ class LivenessTally:
         return {name: held[answer] for name, answer in session.recurrent.items()}
 
     def _exchange(
-        self, base: _Moment
-    ) -> tuple[dict[str, dict[Part, float | None]], dict[str, str]]:
+        self, base: _Moment, alive: float
+    ) -> tuple[dict[str, dict[str, float | None]], dict[str, str]]:
         """Return how outputs answer each part, and why some parts tell nothing."""
-        answers: dict[str, dict[Part, float | None]] = {n: {} for n in self._movements}
+        answers: dict[str, dict[str, float | None]] = {n: {} for n in self._movements}
         unjudged = dict[str, str]()
-        for part, donor in self._donors.items():
-            if donor.distance == 0:
-                unjudged[str(part)] = "the same in all frames"
-                continue
-            try:
-                changed = [self._exchanged(side, base, part, donor) for side in (0, 1)]
-            except (GraphError, FramesError) as error:
-                unjudged[str(part)] = str(error)
-                continue
-            for name, shares in answers.items():
-                before = [side[name] for side in base.answers]
-                moved = [gap(x, y[name]) for x, y in zip(before, changed, strict=True)]
-                shares[part] = share_of(moved, length(before[0]))
+        for part, donors in self._donors.items():
+            told = str(part)
+            if not donors:
+                unjudged[told] = "the same in all frames"
+            for donor in donors:
+                try:
+                    found = self._shares(base, part, donor)
+                except (GraphError, FramesError) as error:
+                    unjudged[told] = str(error)
+                    break
+                for name, share in found.items():
+                    known = (answers[name].get(told), share)
+                    both = [each for each in known if each is not None]
+                    answers[name][told] = max(both, default=None)
+                if all(e[told] is None or e[told] >= alive for e in answers.values()):
+                    break
         return answers, unjudged
+
+    def _shares(
+        self, base: _Moment, part: Part, donor: _Donor
+    ) -> dict[str, float | None]:
+        """Return how every output answers a part of another frame."""
+        changed = [self._exchanged(side, base, part, donor) for side in (0, 1)]
+        found = dict[str, float | None]()
+        for name in self._movements:
+            before = [side[name] for side in base.answers]
+            moved = [gap(x, y[name]) for x, y in zip(before, changed, strict=True)]
+            found[name] = share_of(moved, length(before[0]))
+        return found
 
     def _exchanged(
         self, side: int, base: _Moment, part: Part, donor: _Donor

@@ -9,14 +9,14 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.display import Table, number, table
-from me2e_compress.graph.nodes import array_of, input_at, makers_of, reads_of
+from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.graph.nodes import array_of, input_at, reads_of
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
 
 SUSPECT = 0.1
-"""Below this share the int8 values before an output are looked at; what works keeps
-more (`python -m benchmarks.bench_liveness`)."""
+"""Below this share the int8 values before an output are looked at."""
 
 ROUNDING = 1e-4
 """Movement, over the length of the output, that may be rounding alone: two runtimes are
@@ -42,7 +42,7 @@ class OutputLiveness:
         moves: movement from frame to frame, as a share of the first graph's; None where
             that rests itself.
         answers: likewise where an input or camera is exchanged, by its name.
-        cut: those that an ablation took from it.
+        cut: those that it does not answer since modules were removed.
         at_end: share of elements at the largest magnitude.
         reason: why it is not judged, or what the verdict rests on.
     """
@@ -104,7 +104,8 @@ class Liveness:
             )
         for each in self.outputs:
             if each.cut:
-                yield f"{each.output} reads no {', '.join(each.cut)} since an ablation"
+                cut = ", ".join(each.cut)
+                yield f"since an ablation {each.output} does not answer {cut}"
         unjudged = {
             each.output: each.reason
             for each in self.outputs
@@ -158,36 +159,38 @@ class Movement:
         self,
         name: str,
         answers: Mapping[str, float | None],
-        cut: tuple[str, ...],
         alive: float,
         cause: Callable[[], Cause],
+        *,
+        ablated: bool,
     ) -> OutputLiveness:
         """Give the verdict; `cause` looks for what makes an output rest."""
         moves = share_of(self.moved, self.length)
         known = {"the next frame": moves, **answers}
-        shares = {k: v for k, v in known.items() if v is not None and k not in cut}
-        verdict, reason = "alive", ""
+        shares = {k: v for k, v in known.items() if v is not None}
+        deaf = [k for k, v in shares.items() if v < alive and k in answers]
+        cut = tuple(deaf) if ablated else ()
+        verdict: Verdict
         if self.discrete:
             verdict, reason = "not judged", "whole numbers"
         elif not shares:
             verdict, reason = "not judged", "it rests in the first graph too"
         else:
             found = cause() if min(shares.values()) < SUSPECT else Cause()
-            verdict, reason = self._verdict(moves, shares, alive, found)
+            low = {each: shares[each] for each in deaf if each not in cut}
+            verdict, reason = self._verdict(moves, low, alive, found)
         ends = self.at_end[1] / max(self.elements, 1)
         return OutputLiveness(name, verdict, moves, answers, cut, ends, reason)
 
     def _verdict(
         self,
         moves: float | None,
-        shares: Mapping[str, float],
+        low: Mapping[str, float],
         alive: float,
         cause: Cause,
     ) -> tuple[Verdict, str]:
         before, ends = (count / max(self.elements, 1) for count in self.at_end)
-        deaf = [
-            f"{name} ({share:.2%})" for name, share in shares.items() if share < alive
-        ]
+        deaf = [f"{name} ({share:.2%})" for name, share in low.items()]
         said = "" if moves is None else f"it moves {moves:.2%} as far as before"
         why = "; ".join(filter(None, [said, cause.words]))
         if cause.saturated:
@@ -214,9 +217,9 @@ def length(values: Array) -> float:
     return float(np.linalg.norm(np.asarray(values, np.float64).reshape(-1)))
 
 
-def share_of(moved: Sequence[float], length: float) -> float | None:
+def share_of(moved: Sequence[float], size: float) -> float | None:
     """Return the second movement as a share of the first; None if that is rounding."""
-    if not ROUNDING * length < moved[0] < math.inf:
+    if not ROUNDING * size < moved[0] < math.inf:
         return None
     return moved[1] / moved[0]
 
@@ -228,27 +231,41 @@ def cause_of(
     nodes = [] if model is None else _quantizers(model, output)
     if model is None or not nodes:
         return Cause()
+    # run the graph once with what those nodes read as outputs
     probed = model.clone()
     wanted = {str(node.inputs[0].name) for node in nodes if node.inputs[0]}
-    made = (value for node in probed.graph for value in node.outputs)
+    made = [value for node in probed.graph for value in node.outputs]
     kept = {value.name for value in probed.graph.outputs}
     probed.graph.outputs.extend(v for v in made if v.name in wanted - kept)
-    found = Session(probed, release=True, provider=provider).run(feeds, sorted(wanted))
-    for node in nodes:
-        read, scale = node.inputs[0], array_of(node.inputs[1])
-        stored = array_of(input_at(node, 2))
-        zeros = np.zeros(1, np.uint8) if stored is None else stored.reshape(-1)
-        if read is None or scale is None or scale.size != 1 or zeros.dtype.kind == "V":
-            continue
-        limits, zero = np.iinfo(zeros.dtype), int(zeros[0])
-        steps = np.asarray(found[str(read.name)], np.float64) / float(scale.item())
-        off = (steps + zero > limits.max + 0.5) | (steps + zero < limits.min - 0.5)
-        if off.mean() >= MOST_CUT:
-            words = f"{node.name} cuts {off.mean():.0%} of what it reads"
-            return Cause(f"{words}: its scale is too small", True)
-        if np.abs(steps).max(initial=0.0) <= 0.5:
-            words = f"{node.name} rounds all that it reads to zero"
-            return Cause(f"{words}: its scale is too large")
+    try:
+        session = Session(probed, release=True, provider=provider)
+        names = sorted(wanted & {str(value.name) for value in made})
+        found = {**feeds, **session.run(feeds, names)}
+    except (FramesError, GraphError):
+        return Cause()
+    causes = (
+        _cause(node, found[str(node.inputs[0].name)])
+        for node in nodes
+        if node.inputs[0] is not None
+    )
+    return max(causes, key=lambda each: (each.saturated, each.words), default=Cause())
+
+
+def _cause(node: ir.Node, read: Array) -> Cause:
+    """Hold the scale of a QuantizeLinear against what it reads."""
+    scale, stored = array_of(node.inputs[1]), array_of(input_at(node, 2))
+    zeros = np.zeros(1, np.uint8) if stored is None else stored.reshape(-1)
+    if scale is None or scale.size != 1 or zeros.dtype.kind not in "iu":
+        return Cause()
+    limits, zero = np.iinfo(zeros.dtype), int(zeros[0])
+    steps = np.asarray(read, np.float64) / float(scale.item())
+    off = (steps + zero > limits.max + 0.5) | (steps + zero < limits.min - 0.5)
+    if off.mean() >= MOST_CUT:
+        words = f"{node.name} cuts {off.mean():.0%} of what it reads"
+        return Cause(f"{words}: its scale is too small", True)
+    if np.abs(read).max(initial=0.0) > 0 and np.abs(steps).max() <= 0.5:
+        words = f"{node.name} rounds all that it reads to zero"
+        return Cause(f"{words}: its scale is too large")
     return Cause()
 
 
@@ -262,23 +279,3 @@ def _quantizers(model: ir.Model, output: str) -> list[ir.Node]:
             seen[node] = None
             waiting += () if node.op_type == "QuantizeLinear" else reads_of(node)
     return [node for node in seen if node.op_type == "QuantizeLinear"]
-
-
-def inputs_cut(before: ir.Model, after: ir.Model) -> dict[str, set[str]]:
-    """Return, by output, the inputs that only the first of two graphs reads for it."""
-    now = _inputs_read(after)
-    was = _inputs_read(before)
-    return {name: was[name] - now[name] for name in was if name in now}
-
-
-def _inputs_read(model: ir.Model) -> dict[str, set[str]]:
-    outputs = {str(value.name): value for value in model.graph.outputs}
-    return {
-        name: {
-            str(read.name)
-            for node in makers_of([value])
-            for read in reads_of(node)
-            if read.is_graph_input()
-        }
-        for name, value in outputs.items()
-    }

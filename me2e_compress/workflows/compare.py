@@ -9,16 +9,17 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.fidelity.compare import Fidelity, common_adapter
 from me2e_compress.fidelity.compare import compare as measure
-from me2e_compress.fidelity.liveness import ALIVE, LivenessTally
+from me2e_compress.fidelity.floor import ALIVE
+from me2e_compress.fidelity.liveness import LivenessTally
 from me2e_compress.fidelity.matched_sets import SetFidelity
 from me2e_compress.fidelity.open_loop import OpenLoop, OpenLoopTally
-from me2e_compress.fidelity.output_liveness import Liveness, inputs_cut
+from me2e_compress.fidelity.output_liveness import Liveness
 from me2e_compress.graph import LoadedModel, provenance
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack_session import open_session
-from me2e_compress.workflows.checks import adapted, check_share, model_path
+from me2e_compress.workflows.checks import adapted, check_number, model_path
 from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, counted, table
@@ -154,7 +155,7 @@ def compare(
         ProviderError: The provider is not available.
         EvaluationError: The graphs share no output, or one is not finite.
     """
-    check_share("--alive", alive)
+    check_number("--alive", alive, zero=True, most=1.0)
     paths = model_path(reference), model_path(candidate)
     recording = CalibrationSet(Path(frames))
     said, models = dict[Path, dict[str, str]](), list[ir.Model]()
@@ -196,10 +197,9 @@ def compare(
     fidelity = measure(left, right, map(reported, recording), watch)
     found = CompareResult(*paths, fidelity)
     if lively is not None:
-        cut = inputs_cut(models[0], models[-1]) if _is_ablated(models[-1]) else {}
-        found = dataclasses.replace(
-            found, liveness=lively.result(alive, models[-1], cut)
-        )
+        model = models[-1]
+        told = lively.result(alive, model, ablated=_is_ablated(model))
+        found = dataclasses.replace(found, liveness=told)
     driven = reason if tally is None else OpenLoop.of(tally)
     if isinstance(driven, str):
         return dataclasses.replace(found, open_loop_reason=driven)

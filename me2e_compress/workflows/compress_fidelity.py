@@ -17,7 +17,7 @@ from me2e_compress.errors import EvaluationError, FramesError, GraphError, Me2eE
 from me2e_compress.fidelity.compare import Fidelity, Reference
 from me2e_compress.fidelity.floor import Floor, Rounding
 from me2e_compress.fidelity.liveness import LivenessTally
-from me2e_compress.fidelity.output_liveness import Liveness, inputs_cut
+from me2e_compress.fidelity.output_liveness import Liveness
 from me2e_compress.graph import LoadedModel
 from me2e_compress.manager import Report
 from me2e_compress.manager.report import LossyPass
@@ -90,12 +90,10 @@ def measure_loss(
     context: Context,
     frames: SplitFrames,
     floor: Floor,
-    alive: float,
     listener: Listener,
 ) -> MeasuredLoss | None:
     """Compare the graph with that before the first lossy pass; None if all are exact.
 
-    An output whose share of the movement is below `alive` is dead; 0 does not ask.
     Below the floor, the outputs that choose between near-equal candidates are set
     aside, and the nodes of the int8 plan are searched for the cause of the loss.
     """
@@ -106,7 +104,7 @@ def measure_loss(
     start = process_time()
     listener.on_progress("fidelity", 0, 1, "")
     # a graph that does not run or compare is a finding, not a failure
-    measurement = _Measurement(report, context, frames.measured, floor, alive, listener)
+    measurement = _Measurement(report, context, frames.measured, floor, listener)
     found = MeasuredLoss(None, frames.kind, floor)
     try:
         found = measurement.judge(found)
@@ -123,14 +121,13 @@ class _Measurement:
     context: Context
     frames: Frames
     floor: Floor
-    alive: float
     listener: Listener
 
     def judge(self, found: MeasuredLoss) -> MeasuredLoss:
         """Measure; below the floor, find out which outputs, passes and nodes."""
         before = self.report.lossy[0].before
         reference = self._reference(self.report.lossy[0])
-        fidelity, liveness = self._answers(reference, before)
+        fidelity, liveness = self._answers(reference)
         found = dataclasses.replace(found, fidelity=fidelity, liveness=liveness)
         low = [each.output for each in self.floor.shortfalls(fidelity)]
         if not low:
@@ -144,21 +141,18 @@ class _Measurement:
         )
         return self._blame(found, reference) if below else found
 
-    def _answers(
-        self, reference: Reference, before: ir.Model
-    ) -> tuple[Fidelity, Liveness | None]:
+    def _answers(self, reference: Reference) -> tuple[Fidelity, Liveness | None]:
         """Compare the result with the graph before, and how both answer their inputs.
 
-        What a lossy pass other than a quantizer cut is meant to be cut.
+        What lossy passes other than a quantizer cut, they are meant to cut.
         """
         session, model = self._session(self.report.model), self.report.model
-        if not self.alive:
+        if not self.floor.alive:
             return reference.compare(session), None
         tally = LivenessTally(reference.session, session)
         fidelity = reference.compare(session, watch=tally.add)
         ablated = not all(each.applied.quantizes for each in self.report.lossy)
-        cut = inputs_cut(before, model) if ablated else {}
-        return fidelity, tally.result(self.alive, model, cut)
+        return fidelity, tally.result(self.floor.alive, model, ablated=ablated)
 
     def _blame(self, found: MeasuredLoss, reference: Reference) -> MeasuredLoss:
         """Name the passes, and where int8 is to blame, the nodes."""

@@ -136,23 +136,23 @@ class MeasuredLoss:
     def _rounded(self, found: Fidelity, rounding: Rounding) -> Iterator[str]:
         """Say what rounding one input does to the graph before; nothing in silence."""
         plan = "" if found.plan is None else found.plan_output
-        for name, value in rounding.values.items():
-            low = shown(value, "m" if name == plan else "dB")
+        for choice in dict.fromkeys(map(rounding.choices.get, rounding.values)):
+            low = ", ".join(
+                f"{name} ({shown(value, 'm' if name == plan else 'dB')})"
+                for name, value in rounding.values.items()
+                if rounding.choices.get(name) == choice
+            )
             alone = (
-                f"the graph itself, uncompressed, falls to {low} when only"
+                f"{low}: so low falls the graph itself, uncompressed, when only"
                 f" {rounding.input} is rounded to int8"
             )
-            if name in rounding.choices:
-                yield (
-                    f"not judged: {name}: {alone}; it picks between near-equal"
-                    f" candidates at {rounding.choices[name]}, and the road tells what"
-                    " that means"
-                )
-            else:
-                yield (
-                    f"{name} is judged, although {alone}: nothing picks on the way, so"
-                    " that int8 is too coarse for it"
-                )
+            yield (
+                f"not judged: {alone}; it picks between near-equal candidates at"
+                f" {choice}, and the road tells what that means"
+                if choice
+                else f"judged, though int8 may be too coarse for it: {alone}, and"
+                " nothing picks on the way"
+            )
 
     def _cure(self, remedy: Remedy) -> Iterator[str]:
         found = remedy.fidelity

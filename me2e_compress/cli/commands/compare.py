@@ -6,7 +6,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
-from me2e_compress.fidelity.liveness import ALIVE
+from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import compare as workflow
 

@@ -8,8 +8,7 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.errors import RecipeError
-from me2e_compress.fidelity.floor import SQNR_FLOOR_DB
-from me2e_compress.fidelity.liveness import ALIVE
+from me2e_compress.fidelity.floor import ALIVE, SQNR_FLOOR_DB
 from me2e_compress.manager import recipe
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import compress as workflow
