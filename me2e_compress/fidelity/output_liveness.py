@@ -240,14 +240,13 @@ def cause_of(
     try:
         session = Session(probed, release=True, provider=provider)
         names = sorted(wanted & {str(value.name) for value in made})
-        found = {**feeds, **session.run(feeds, names)}
+        found = {**feeds, **(session.run(feeds, names) if names else {})}
     except (FramesError, GraphError):
         return Cause()
-    causes = (
-        _cause(node, found[str(node.inputs[0].name)])
-        for node in nodes
-        if node.inputs[0] is not None
-    )
+    reads = {
+        node: found.get(str(node.inputs[0].name)) for node in nodes if node.inputs[0]
+    }
+    causes = (_cause(node, read) for node, read in reads.items() if read is not None)
     return max(causes, key=lambda each: (each.saturated, each.words), default=Cause())
 
 

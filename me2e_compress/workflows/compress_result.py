@@ -100,7 +100,7 @@ class CompressResult(Result):
         )
         empty = "" if self.int8 is None else self.int8.empty
         lost = () if self.loss is None else self.loss.alerts()
-        return (*filter(None, [empty]), *lost, *first)
+        return (*lost, *filter(None, [empty]), *first)
 
     def verdict(self) -> Iterator[str]:
         """Yield what became int8, what is proven, and how far the outputs moved."""
