@@ -18,6 +18,7 @@ from me2e_compress.calibration.review import RangeFinding
 from me2e_compress.driving.adapter.port_uses import PortUse
 from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.open_loop import OpenLoop
+from me2e_compress.fidelity.output_liveness import Liveness
 from me2e_compress.manager import Step, Verification
 from me2e_compress.quantization.plan import Decision, QuantPlan
 from me2e_compress.registry.entries import Entry
@@ -39,7 +40,17 @@ from me2e_compress.zoo.weights_record import WeightsRecord
 PAGE = Path(__file__).parents[1] / "docs" / "json.md"
 FORMS = Path(__file__).with_name("json_forms.txt")
 NAMED = (
-    *(Ranges, PortUse, Fidelity, OpenLoop, Step, Verification, Decision, QuantPlan),
+    *(
+        Ranges,
+        PortUse,
+        Fidelity,
+        OpenLoop,
+        Liveness,
+        Step,
+        Verification,
+        Decision,
+        QuantPlan,
+    ),
     *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity, Remedy, Rung),
     *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
     *(Int8Outcome, RuleSummary, WeightsRecord, RangeFinding),

@@ -98,6 +98,10 @@ Routes = Annotated[str, typer.Option(help=f"{ROUTES}; or a file of routes")]
 Budget = Annotated[
     float, typer.Option("--budget-ms", help="what a decision may take; 20 Hz: 50")
 ]
+Alive = Annotated[
+    float,
+    typer.Option(help="least share of an output's movement that is left; 0: not asked"),
+]
 Import = Annotated[
     Path | None, typer.Option("--import", help="what another tool measured")
 ]

@@ -29,12 +29,23 @@ class OutputFidelity:
         error: largest difference over largest magnitude; infinite where a is zero and
             b is not.
         discrete: whole numbers or booleans; their SQNR says little.
+        least_db: SQNR of the worst frame; None like `most_db`, if that is the only one.
+        most_db: SQNR of the best frame.
     """
 
     name: str
     sqnr_db: float
     error: float
     discrete: bool = False
+    least_db: float | None = None
+    most_db: float | None = None
+
+    @property
+    def by_frame(self) -> str:
+        """The SQNR from the worst frame to the best, dB; empty for one frame."""
+        if self.least_db is None or self.most_db is None:
+            return ""
+        return f"{self.least_db:z.1f} to {self.most_db:z.1f}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,14 +98,19 @@ class Reference:
         answers = tuple(detached(each) for each in replay(session, frames))
         return cls(session, frames, answers)
 
-    def compare(self, other: AnySession, frames: Frames | None = None) -> Fidelity:
+    def compare(
+        self,
+        other: AnySession,
+        frames: Frames | None = None,
+        watch: Watch | None = None,
+    ) -> Fidelity:
         """Compare another model with it, as :func:`compare` does.
 
         ``frames`` replaces the recording for the other model; to see what other frames
         change, pass the reference model itself.
         """
         shown = self.frames if frames is None else frames
-        return _compare(self.session, iter(self.answers), other, shown)
+        return _compare(self.session, iter(self.answers), other, shown, watch)
 
 
 def compare(
@@ -103,7 +119,7 @@ def compare(
     """Run two models over the same frames, each with its own recurrent state.
 
     All arithmetic is float64. One frame is in memory at a time. ``a`` is the reference;
-    ``watch`` is shown the outputs of both on every frame.
+    ``watch`` is shown the outputs of both on every frame, states included.
 
     Raises:
         EvaluationError: no common output, no frame, or an output that changes its shape
@@ -135,7 +151,8 @@ def _compare(
     count = 0
     # frame by frame, with one frame in memory
     there, along = itertools.tee(frames)
-    runs = zip(answers, replay(b, there, shared), along, strict=True)
+    wanted = list(dict.fromkeys([*shared, *b.recurrent.values()]))
+    runs = zip(answers, replay(b, there, wanted), along, strict=True)
     for left, right, frame in runs:
         for name, tally in tallies.items():
             tally.add(left[name], right[name], count)
@@ -192,6 +209,7 @@ class _Tally:
     def __init__(self, name: str) -> None:
         self.name = name
         self.signal = self.noise = self.gap = self.reach = 0.0
+        self.frames_db = list[float]()
         self.discrete = False
 
     def add(self, a: Array, b: Array, frame: int) -> None:
@@ -206,18 +224,22 @@ class _Tally:
             return
         # sums for the SQNR, largest values for the error
         gap = np.abs(x - y)
-        self.signal += float(np.vdot(x, x))
-        self.noise += float(np.vdot(gap, gap))
+        signal, noise = float(np.vdot(x, x)), float(np.vdot(gap, gap))
+        self.frames_db.append(_decibels(signal, noise))
+        self.signal += signal
+        self.noise += noise
         self.reach = max(self.reach, float(np.abs(x).max()))
         self.gap = max(self.gap, float(gap.max()))
 
     def result(self) -> OutputFidelity:
-        if self.noise == 0:
-            return OutputFidelity(self.name, math.inf, 0.0, self.discrete)
-        if self.signal == 0:
-            return OutputFidelity(self.name, -math.inf, math.inf, self.discrete)
-        sqnr = 10 * math.log10(self.signal / self.noise)
-        return OutputFidelity(self.name, sqnr, self.gap / self.reach, self.discrete)
+        error = self.gap / self.reach if self.reach else math.inf if self.gap else 0.0
+        sqnr, apart = _decibels(self.signal, self.noise), len(self.frames_db) > 1
+        least, most = (
+            min(self.frames_db, default=sqnr),
+            max(self.frames_db, default=sqnr),
+        )
+        spread = (least, most) if apart else (None, None)
+        return OutputFidelity(self.name, sqnr, error, self.discrete, *spread)
 
     def _wide(self, value: Array, which: str, frame: int) -> Float64:
         wide = np.asarray(value, np.float64)
@@ -227,3 +249,9 @@ class _Tally:
                 f"output {self.name} of the {which} model is {kind} at frame {frame}"
             )
         return wide
+
+
+def _decibels(signal: float, noise: float) -> float:
+    if noise == 0:
+        return math.inf
+    return 10 * math.log10(signal / noise) if signal else -math.inf

@@ -2,11 +2,20 @@
 
 import dataclasses
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
+from typing import Self
 
 import numpy as np
+import onnx_ir as ir
 
 from me2e_compress.fidelity.compare import Fidelity, Reference
+from me2e_compress.graph.nodes import (
+    FLOATS,
+    makers_of,
+    nodes_in,
+    nodes_inside,
+    reads_of,
+)
 from me2e_compress.runtime.frames import Frame, Frames
 
 SQNR_FLOOR_DB = 20.0
@@ -14,6 +23,10 @@ SQNR_FLOOR_DB = 20.0
 
 PLAN_FLOOR_M = 0.5
 """A car 1.9 m wide in the middle of a lane of 3.5 m still keeps 0.3 m to its lines."""
+
+ALIVE = 0.01
+"""Least movement, as a share of the uncompressed graph's, of an output that is not
+dead; int8 that works keeps more than a tenth (benchmarks/bench_liveness.py)."""
 
 MOST_EXCESS = 1e6
 """Excess of an output that should be zero and is not."""
@@ -48,10 +61,13 @@ class Floor:
         sqnr_db: least SQNR of outputs, dB; not of discrete ones, of the plan
             only where its displacement was not measured.
         plan_m: most mean displacement of the waypoints, metres.
+        alive: least share of an output's movement, between frames and when one input is
+            exchanged; 0 does not ask.
     """
 
     sqnr_db: float = SQNR_FLOOR_DB
     plan_m: float = PLAN_FLOOR_M
+    alive: float = ALIVE
 
     def excess(self, found: Fidelity, output: str) -> float:
         """Return an output's noise over what is allowed: above 1 is too much.
@@ -88,28 +104,91 @@ def shown(value: float, unit: str) -> str:
     return f"{value:z.1f} dB" if unit == "dB" else f"{value:.2f} {unit}"
 
 
-def unsteady_outputs(reference: Reference, floor: Floor) -> dict[str, float]:
-    """Find the outputs that fall below the floor although nothing was compressed.
+@dataclasses.dataclass(frozen=True)
+class Rounding:
+    """What rounding one input to int8 does to the graph that nothing was done to.
 
-    The model runs on its frames again, their largest float input (usually the images)
-    rounded to int8, which is a smaller change than int8 anywhere in the graph. An
-    output that this puts below the floor chooses between candidates that are nearly
-    equal; its SQNR counts the choices and says little of the graph. Returns the SQNR by
-    output, dB; for the plan the displacement, metres.
+    An output that this puts below the floor is *unsteady* if something on the way from
+    the input chooses: it picks between candidates that are nearly equal, and its SQNR
+    counts the picks and says little of the graph. Where nothing chooses, int8 is simply
+    too coarse for it.
+
+    Attributes:
+        input: the largest float input, usually the images; states excepted.
+        values: SQNR of the outputs that fall below the floor, dB; metres of a plan.
+        choices: the node that chooses, by unsteady output.
     """
-    session = reference.session
-    rounded = reference.compare(
-        session, _Rounded(reference.frames, tuple(session.recurrent))
-    )
-    return {each.output: each.value for each in floor.shortfalls(rounded)}
+
+    input: str
+    values: Mapping[str, float]
+    choices: Mapping[str, str]
+
+    @classmethod
+    def of(cls, reference: Reference, model: ir.Model, floor: Floor) -> Self:
+        """Run a graph on its frames again, the input rounded; `model` is that graph."""
+        session, first = reference.session, next(iter(reference.frames))
+        sizes = {
+            name: values.size
+            for name, values in first.arrays.items()
+            if values.dtype.kind == "f" and name not in session.recurrent
+        }
+        name = max(sizes, key=lambda each: sizes[each], default="")
+        if not name:
+            return cls("", {}, {})
+        rounded = reference.compare(session, _Rounded(reference.frames, name))
+        low = {each.output: each.value for each in floor.shortfalls(rounded)}
+        choices = {each: choice_between(model, name, each) for each in low}
+        return cls(name, low, {k: v for k, v in choices.items() if v})
+
+    def among(self, outputs: Collection[str]) -> Self:
+        """Return what it says of some outputs."""
+        values, choices = (
+            {name: held[name] for name in held if name in outputs}
+            for held in (self.values, self.choices)
+        )
+        return dataclasses.replace(self, values=values, choices=choices)
+
+
+CHOICES = frozenset(
+    {
+        *("ArgMax", "ArgMin", "Ceil", "Equal", "Floor", "Greater", "GreaterOrEqual"),
+        *("Hardmax", "Less", "LessOrEqual", "NonMaxSuppression", "NonZero", "Round"),
+        *("Sign", "TopK", "Unique"),
+    }
+)
+"""Operators whose result jumps; a Cast of floats to integers does, too."""
+
+
+def choice_between(model: ir.Model, source: str, output: str) -> str:
+    """Name the last node between an input and an output that chooses; empty if none."""
+    reached = {value for value in model.graph.inputs if value.name == source}
+    behind = makers_of(v for v in model.graph.outputs if v.name == output)
+    found = ""
+    for node in model.graph:
+        if node not in behind or reached.isdisjoint(reads_of(node)):
+            continue
+        reached.update(node.outputs)
+        function = model.functions.get(node.op_identifier())
+        inner = nodes_inside(node) if function is None else nodes_in(function)
+        if any(map(_chooses, (node, *inner))):
+            found = f"{node.name} ({node.op_type})"
+    return found
+
+
+def _chooses(node: ir.Node) -> bool:
+    if node.op_type == "Cast":
+        kinds = [v.dtype for v in (*node.inputs, *node.outputs) if v is not None]
+        return kinds[0] in FLOATS and kinds[-1] not in FLOATS
+    nearest = node.attributes.get_string("mode", "") == "nearest"
+    return node.op_type in CHOICES or (node.op_type == "GridSample" and nearest)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Rounded:
-    """Frames whose largest float input, states excepted, is rounded to int8's grid."""
+    """Frames of which one input is rounded to int8's grid."""
 
     frames: Frames
-    states: tuple[str, ...]
+    name: str
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -118,18 +197,8 @@ class _Rounded:
         return map(self._round, self.frames)
 
     def _round(self, frame: Frame) -> Frame:
-        sizes = {
-            name: values.size
-            for name, values in frame.arrays.items()
-            if values.dtype.kind == "f" and name not in self.states
-        }
-        if not sizes:
-            return frame
-        return _rounded(frame, max(sizes, key=lambda name: sizes[name]))
-
-
-def _rounded(frame: Frame, name: str) -> Frame:
-    values = np.asarray(frame.arrays[name], np.float64)
-    step = float(np.abs(values).max(initial=0.0)) / STEPS or 1.0
-    grid = (np.rint(values / step) * step).astype(frame.arrays[name].dtype)
-    return dataclasses.replace(frame, arrays={**frame.arrays, name: grid})
+        given = frame.arrays[self.name]
+        values = np.asarray(given, np.float64)
+        step = float(np.abs(values).max(initial=0.0)) / STEPS or 1.0
+        grid = (np.rint(values / step) * step).astype(given.dtype)
+        return dataclasses.replace(frame, arrays={**frame.arrays, self.name: grid})

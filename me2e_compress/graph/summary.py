@@ -226,6 +226,7 @@ class Size:
 
     Attributes:
         nodes: in subgraphs, too; and in every call of a function.
+        graph_nodes: the same without the bodies of functions: a call is one node.
         weight_bytes: bytes of all initializers.
         macs: multiply-accumulates, those known: where others are
             unknown, a lower bound, and None instead of 0.
@@ -234,9 +235,17 @@ class Size:
     """
 
     nodes: int
+    graph_nodes: int
     weight_bytes: int
     macs: int | None
     unknown_macs_nodes: int
+
+    @property
+    def counted_nodes(self) -> str:
+        """The nodes of the graph, and with the bodies of functions where it has any."""
+        if self.graph_nodes == self.nodes:
+            return f"{self.nodes}"
+        return f"{self.graph_nodes} ({self.nodes} with bodies)"
 
 
 def size(model: ir.Model) -> Size:
@@ -244,6 +253,7 @@ def size(model: ir.Model) -> Size:
     found, unknown = total_macs(map(macs_counter(model), nodes_in(model.graph)))
     return Size(
         nodes=node_count(model),
+        graph_nodes=sum(1 for _ in nodes_in(model.graph)),
         weight_bytes=weight_bytes(model),
         macs=found,
         unknown_macs_nodes=unknown,

@@ -162,8 +162,8 @@ class Report(Displayed):
         """Count the passes, and the nodes before and after."""
         if not self.steps:
             return "no passes"
-        first, last = self.steps[0].before, self.steps[-1].after
-        return f"{len(self.steps)} passes, {first.nodes} → {last.nodes} nodes"
+        nodes = self.steps[0].before.counted_nodes, self.steps[-1].after.counted_nodes
+        return f"{len(self.steps)} passes, {' → '.join(nodes)} nodes"
 
     def tables(self) -> tuple[Table, ...]:
         """Return pass by pass what changed, and how exact passes were checked."""
@@ -217,7 +217,7 @@ def steps_table(steps: Sequence[Step]) -> Table:
             (
                 step.name,
                 str(step.changes),
-                f"{step.before.nodes} → {step.after.nodes}",
+                f"{step.before.counted_nodes} → {step.after.counted_nodes}",
                 f"{megabytes(step.before.weight_bytes)} →"
                 f" {megabytes(step.after.weight_bytes)}",
                 giga(step.after.macs, step.after.unknown_macs_nodes),

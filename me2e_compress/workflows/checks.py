@@ -206,14 +206,16 @@ def _weights(given: Path) -> Iterator[Path]:
                 yield Path(value.const_value.path)
 
 
-def check_number(option: str, value: float | None, *, zero: bool = False) -> None:
+def check_number(
+    option: str, value: float | None, *, zero: bool = False, most: float = LARGEST
+) -> None:
     """Refuse anything but None, a finite number above 0, or 0 if `zero` is set."""
-    if value is None or 0 < value <= LARGEST or (zero and value == 0):
+    if value is None or 0 < value <= most or (zero and value == 0):
         return
     least = "0 or above" if zero else "above 0"
-    most = f", {LARGEST:g} at most" if math.isfinite(value) and value > 0 else ""
+    above = f", {most:g} at most" if math.isfinite(value) and value > 0 else ""
     raise RecipeError(
-        f"{option} is {value:g}: it must be a finite number {least}{most}"
+        f"{option} is {value:g}: it must be a finite number {least}{above}"
     )
 
 

@@ -3,20 +3,26 @@
 import dataclasses
 from pathlib import Path
 
+import onnx_ir as ir
+
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import GraphError
+from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.fidelity.compare import Fidelity, common_adapter
 from me2e_compress.fidelity.compare import compare as measure
+from me2e_compress.fidelity.floor import ALIVE
+from me2e_compress.fidelity.liveness import LivenessTally
 from me2e_compress.fidelity.matched_sets import SetFidelity
 from me2e_compress.fidelity.open_loop import OpenLoop, OpenLoopTally
-from me2e_compress.graph import LoadedModel
-from me2e_compress.runtime.frames import Frame
+from me2e_compress.fidelity.output_liveness import Liveness
+from me2e_compress.graph import LoadedModel, provenance
+from me2e_compress.passes.ablate_modules import AblateModules
+from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack_session import open_session
-from me2e_compress.workflows.checks import adapted, model_path
+from me2e_compress.workflows.checks import adapted, check_number, model_path
 from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, counted, table
+from me2e_compress.workflows.result import Result, Status, Table, counted, table
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -24,7 +30,7 @@ class CompareResult(Result):
     """How close a graph stays to another.
 
     `open_loop` holds both plans against the recorded future; where that is None, not
-    measured, `open_loop_reason` says why.
+    measured, `open_loop_reason` says why. `liveness` is None if it was not asked for.
     """
 
     reference: Path
@@ -32,6 +38,26 @@ class CompareResult(Result):
     fidelity: Fidelity
     open_loop: OpenLoop | None = None
     open_loop_reason: str = ""
+    liveness: Liveness | None = None
+
+    @property
+    def status(self) -> Status:
+        """``refused`` if an output of the second graph is dead."""
+        return "refused" if self.alerts() else "ok"
+
+    def check(self) -> None:
+        """Raise EvaluationError if an output of the second graph is dead."""
+        if dead := self.alerts():
+            raise EvaluationError(f"{self.candidate}: {'; '.join(dead)}")
+
+    def lines(self) -> tuple[str, ...]:
+        """Return how far the plan moved, and which outputs answer their inputs."""
+        alive = () if self.liveness is None else self.liveness.lines()
+        return (self.headline, *alive)
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return the outputs that are dead, and states that are not fed."""
+        return () if self.liveness is None else self.liveness.faults
 
     @property
     def headline(self) -> str:
@@ -48,7 +74,7 @@ class CompareResult(Result):
         return f"{said}; the same candidate on {found.same_choice:.1%} of them"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return the SQNR of outputs, matched agents, and plans against the future."""
+        """Return outputs, how they answer, agents, and plans against the future."""
         found = self.fidelity
         rows = [
             *((o.name, f"{o.sqnr_db:.1f}", f"{o.error:.1e}") for o in found.outputs),
@@ -58,20 +84,29 @@ class CompareResult(Result):
         outputs = table(title, ("output", "SQNR dB", "max|a-b|/max|a|"), rows)
         agents = () if found.agents is None else (_agents(found.agents),)
         driven = () if self.open_loop is None else (self.open_loop.table(),)
-        return (outputs, *agents, *driven)
+        alive = self.liveness is not None and self.liveness.outputs
+        lively = (self.liveness.table(),) if self.liveness and alive else ()
+        return (outputs, *lively, *agents, *driven)
 
     def records(self) -> list[dict[str, object]]:
         """Return one row per output."""
         return [dataclasses.asdict(each) for each in self.fidelity.outputs]
 
     def to_json(self) -> object:
-        """Return the fidelity, and both plans against the recorded future."""
+        """Return the fidelity, liveness, and both plans against the recorded future."""
+        alive = None if self.liveness is None else dataclasses.asdict(self.liveness)
         driven = None if self.open_loop is None else dataclasses.asdict(self.open_loop)
         return {
             **dataclasses.asdict(self.fidelity),
             "open_loop": driven,
             "open_loop_reason": self.open_loop_reason,
+            "liveness": alive,
         }
+
+
+def _is_ablated(model: ir.Model) -> bool:
+    made = (node.metadata_props.get(provenance.PASSES, "") for node in model.graph)
+    return any(AblateModules.name in passes for passes in made)
 
 
 def _agents(found: SetFidelity) -> Table:
@@ -97,6 +132,7 @@ def compare(
     listener: Listener = SILENT,
     *,
     as_it_stands: bool = False,
+    alive: float = ALIVE,
     provider: Provider = CPU,
     adapter: str | Path | None = None,
 ) -> CompareResult:
@@ -106,8 +142,11 @@ def compare(
     Where the frames tell what was really driven, L2 and collisions of both plans are
     measured too. `as_it_stands` runs the first graph without onnxruntime's
     optimizations and the second with all of them: comparing a graph with itself shows
-    what they change. The adapter's TOML says which output is the plan and which are fed
-    back, in both graphs; None leaves it to their metadata.
+    what they change. An output is dead that moves less than a share `alive` of the
+    first graph's, between frames or when one input is exchanged; 0 does not ask, which
+    saves an inference of each graph for every input. The adapter's TOML says which
+    output is the plan and which are fed back, in both graphs; None leaves it to their
+    metadata.
 
     Raises:
         GraphError: A model does not exist or run, or nothing picks one of a plan's
@@ -116,13 +155,15 @@ def compare(
         ProviderError: The provider is not available.
         EvaluationError: The graphs share no output, or one is not finite.
     """
+    check_number("--alive", alive, zero=True, most=1.0)
     paths = model_path(reference), model_path(candidate)
     recording = CalibrationSet(Path(frames))
-    said = dict[Path, dict[str, str]]()
+    said, models = dict[Path, dict[str, str]](), list[ir.Model]()
     # each graph must take the frames, and open in another process first
     for path in dict.fromkeys(paths):
         loaded = LoadedModel.load(path)
         said[path] = adapted(loaded.model, adapter)
+        models.append(loaded.model)
         recording.check(loaded.model)
         try_model(loaded, listener, provider, recording)
     total = len(recording)
@@ -146,9 +187,20 @@ def compare(
         raise GraphError(f"{paths[0]}: {error}") from error
     # plans are judged against the recorded future where one is known
     tally = None if read is None else OpenLoopTally(read)
-    watch = None if tally is None else tally.add
+    lively = LivenessTally(left, right) if alive else None
+    watching = [each.add for each in (tally, lively) if each is not None]
+
+    def watch(a: dict[str, Array], b: dict[str, Array], frame: Frame) -> None:
+        for add in watching:
+            add(a, b, frame)
+
     fidelity = measure(left, right, map(reported, recording), watch)
+    found = CompareResult(*paths, fidelity)
+    if lively is not None:
+        model = models[-1]
+        told = lively.result(alive, model, ablated=_is_ablated(model))
+        found = dataclasses.replace(found, liveness=told)
     driven = reason if tally is None else OpenLoop.of(tally)
     if isinstance(driven, str):
-        return CompareResult(*paths, fidelity, None, driven)
-    return CompareResult(*paths, fidelity, driven)
+        return dataclasses.replace(found, open_loop_reason=driven)
+    return dataclasses.replace(found, open_loop=driven)

@@ -11,7 +11,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.stack_frames import StackFrames
 from me2e_compress.errors import PreconditionError, RecipeError
-from me2e_compress.fidelity.floor import SQNR_FLOOR_DB, Floor
+from me2e_compress.fidelity.floor import ALIVE, SQNR_FLOOR_DB, Floor
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager import recipe as recipes
@@ -70,6 +70,7 @@ class CompressOptions:
         measure_frames: most frames that are kept out of calibration, to measure lossy
             passes on; 0 measures nothing and calibrates on all.
         floor: SQNR in dB below which an output is warned of.
+        alive: share of an output's movement below which it is dead; 0 does not ask.
         allow_empty: write the graph although nothing in it became int8.
         smaller: add no weights to remove nodes: fewer bytes instead of fewer nodes.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
@@ -89,8 +90,9 @@ class CompressOptions:
     seed: int = 0
     verify_frames: int = 2
     unproven: bool = False
-    measure_frames: int = 4
+    measure_frames: int = 8
     floor: float = SQNR_FLOOR_DB
+    alive: float = ALIVE
     allow_empty: bool = False
     smaller: bool = False
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -103,6 +105,7 @@ class CompressOptions:
         check_count("--verify-frames", self.verify_frames)
         check_count("--measure-frames", self.measure_frames)
         check_number("--floor", self.floor, zero=True)
+        check_number("--alive", self.alive, zero=True, most=1.0)
 
     def passes(self, recipe: Recipe | None) -> tuple[Pass, ...]:
         """Build the passes of a recipe, with these options' int8.
@@ -174,16 +177,14 @@ def compress(
     """Apply passes to a graph, check each, and write the smaller graph and a report.
 
     The model is an ONNX file, which is not changed, the TOML of a stack, or the name of
-    a model that ships. A stack becomes a folder, with a TOML of the same name and the
-    parts' files. Without frames exact passes are checked on seeded inputs; a model that
-    ships has its own frames.
+    a model that ships. A stack becomes a folder of its files and a TOML. Without frames
+    exact passes are checked on seeded inputs; a model that ships has its own frames.
 
     Raises:
         GraphError: The model does not exist, or the output would harm an input.
         RecipeError: There is nothing to do, or options do not fit the passes.
         FramesError: The frames do not fit the model.
-        PreconditionError: Nothing became int8 although a pass quantizes, or exact
-            passes are not proven; nothing is written.
+        PreconditionError: Nothing became int8, or exact passes are not proven.
         ProviderError: The provider is not available.
         Me2eError: A pass refused the graph or failed.
     """
@@ -259,17 +260,16 @@ class Compression:
         # apply the passes, and refuse a result that is unproven or not int8
         context = Context(modules, frames.calibration, options.seed, options.provider)
         checked, samples = options.verify_frames, frames.samples
-        manager = PassManager(
-            passes, checked, self.reproducers, samples, first, answers
-        )
-        report = manager.run(model, context, partial(listener.on_progress, "passes"))
+        work = PassManager(passes, checked, self.reproducers, samples, first, answers)
+        report = work.run(model, context, partial(listener.on_progress, "passes"))
         _refuse_unproven(report, options)
         int8 = Int8Outcome.of(report, context)
         _refuse_empty(int8, options, listener)
         # measure what lossy passes cost, on the frames kept for it
         if report.lossy and frames.measured is not None:
             first(report.model, self.output.name)
-        loss = measure_loss(report, context, frames, Floor(options.floor), listener)
+        floor = Floor(options.floor, alive=options.alive)
+        loss = measure_loss(report, context, frames, floor, listener)
         linted = lint_written(report.model, passes, self.output, options.target)
         seconds = process_time() - start
         return write_result(report, loaded, self.output, int8, loss, seconds, linted)

@@ -15,7 +15,9 @@ from me2e_compress.calibration.stack_frames import recording_of
 from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import EvaluationError, FramesError, GraphError, Me2eError
 from me2e_compress.fidelity.compare import Fidelity, Reference
-from me2e_compress.fidelity.floor import Floor, unsteady_outputs
+from me2e_compress.fidelity.floor import Floor, Rounding
+from me2e_compress.fidelity.liveness import LivenessTally
+from me2e_compress.fidelity.output_liveness import Liveness
 from me2e_compress.graph import LoadedModel
 from me2e_compress.manager import Report
 from me2e_compress.manager.report import LossyPass
@@ -123,18 +125,34 @@ class _Measurement:
 
     def judge(self, found: MeasuredLoss) -> MeasuredLoss:
         """Measure; below the floor, find out which outputs, passes and nodes."""
+        before = self.report.lossy[0].before
         reference = self._reference(self.report.lossy[0])
-        fidelity = self._compare(reference)
-        found = dataclasses.replace(found, fidelity=fidelity)
+        fidelity, liveness = self._answers(reference)
+        found = dataclasses.replace(found, fidelity=fidelity, liveness=liveness)
         low = [each.output for each in self.floor.shortfalls(fidelity)]
         if not low:
             return found
         # outputs that choose between near-equal candidates are not judged
-        choosing = unsteady_outputs(reference, self.floor)
-        unsteady = {name: value for name, value in choosing.items() if name in low}
+        rounding = Rounding.of(reference, before, self.floor).among(low)
+        unsteady = {name: rounding.values[name] for name in rounding.choices}
         below = self.floor.shortfalls(fidelity, unsteady)
-        found = dataclasses.replace(found, unsteady=unsteady, shortfalls=below)
+        found = dataclasses.replace(
+            found, unsteady=unsteady, rounding=rounding, shortfalls=below
+        )
         return self._blame(found, reference) if below else found
+
+    def _answers(self, reference: Reference) -> tuple[Fidelity, Liveness | None]:
+        """Compare the result with the graph before, and how both answer their inputs.
+
+        What lossy passes other than a quantizer cut, they are meant to cut.
+        """
+        session, model = self._session(self.report.model), self.report.model
+        if not self.floor.alive:
+            return reference.compare(session), None
+        tally = LivenessTally(reference.session, session)
+        fidelity = reference.compare(session, watch=tally.add)
+        ablated = not all(each.applied.quantizes for each in self.report.lossy)
+        return fidelity, tally.result(self.floor.alive, model, ablated=ablated)
 
     def _blame(self, found: MeasuredLoss, reference: Reference) -> MeasuredLoss:
         """Name the passes, and where int8 is to blame, the nodes."""

@@ -103,7 +103,7 @@ class CompressResult(Result):
         )
         empty = "" if self.int8 is None else self.int8.empty
         lost = () if self.loss is None else self.loss.alerts()
-        return (*filter(None, [empty]), *lost, *self._linted(), *first)
+        return (*lost, *filter(None, [empty]), *self._linted(), *first)
 
     def _linted(self) -> Iterator[str]:
         """Yield what the target refuses, computes otherwise, or is reported to."""

@@ -127,7 +127,8 @@ def test_the_report_holds_the_measurement_and_the_remedy(
     assert told["fidelity"]["on"] == "kept out of calibration"
     assert told["fidelity"]["fidelity"]["frames"] == 2
     assert told["fidelity"]["remedy"]["nodes"][0]["name"] == GUILTY
-    assert told["fidelity"]["floor"] == {"sqnr_db": 20.0, "plan_m": 0.5}
+    floor = {"sqnr_db": 20.0, "plan_m": 0.5, "alive": 0.01}
+    assert told["fidelity"]["floor"] == floor
     assert told["verdict"] == [*found.lines()[:-2], *found.alerts()]
     (note,) = [n for n in told["steps"][-1]["notes"] if "calibrated" in n]
     assert note.endswith("calibrated on 6 frames")
@@ -151,7 +152,36 @@ def test_one_frame_is_calibrated_and_measured_on_and_that_is_said(
 
     assert command(*once) == 0
 
-    assert "calibrated on as well: there is no other" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "calibrated on as well: there is no other" in said
+    assert "this verdict rests on 1 frame: record 12 or more" in said
+    assert "liveness: not measured (one frame alone" in said
+
+
+def test_an_output_that_int8_freezes_is_an_alert(
+    command: Command, cameras: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Saved ranges a million times too large: the plan is the same in every frame."""
+    calibrate = ("calibrate", "in.onnx", "frames", "-o", "ranges.json")
+    assert command(*calibrate, "--map", "map.toml") == 0
+    ranges = json.loads((cameras / "ranges.json").read_text())
+    ranges["tensors"] = {
+        name: [1e6 * bound for bound in bounds]
+        for name, bounds in ranges["tensors"].items()
+    }
+    (cameras / "ranges.json").write_text(json.dumps(ranges))
+    capsys.readouterr()
+
+    assert command(*PAPER, "--ranges", "ranges.json", "--floor", 0) == 0
+
+    said = capsys.readouterr().out
+    assert "\nplan is constant: it moves 0.00% as far as before" in said
+    assert "lidar2img_QuantizeLinear rounds all that it reads to zero" in said
+
+    again = (*PAPER, "--ranges", "ranges.json", "--floor", 0, "--alive", 0)
+    assert command(*again, "--force") == 0
+
+    assert "plan is constant" not in capsys.readouterr().out
 
 
 def test_without_measuring_all_frames_are_calibrated_on(cameras: Path) -> None:

@@ -8,7 +8,7 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.errors import RecipeError
-from me2e_compress.fidelity.floor import SQNR_FLOOR_DB
+from me2e_compress.fidelity.floor import ALIVE, SQNR_FLOOR_DB
 from me2e_compress.manager import recipe
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import compress as workflow
@@ -50,8 +50,9 @@ def compress(
     seed: given.Seed = 0,
     verify_frames: Verify = 2,
     unproven: Unproven = False,
-    measure_frames: Measure = 4,
+    measure_frames: Measure = 8,
     floor: Floor = SQNR_FLOOR_DB,
+    alive: given.Alive = ALIVE,
     allow_empty: AllowEmpty = False,
     smaller: Smaller = False,
     set_dim: given.SetDim = None,
@@ -70,9 +71,9 @@ def compress(
     options = workflow.CompressOptions(
         scheme=scheme, rules=rules, target=target, overrides=overrides, ranges=ranges,
         method=method, module_map=module_map, seed=seed, verify_frames=verify_frames,
-        measure_frames=measure_frames, floor=floor, allow_empty=allow_empty,
+        measure_frames=measure_frames, floor=floor, alive=alive, smaller=smaller,
         weight_only_gemv=weight_only_gemv, force=force, dims=sizes(set_dim or ()),
-        adapter=adapter, unproven=unproven, smaller=smaller,
+        adapter=adapter, unproven=unproven, allow_empty=allow_empty,
         provider=provider_named(provider, plugins or ()),
     )  # fmt: skip
     with listening() as listener:

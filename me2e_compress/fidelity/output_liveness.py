@@ -1,0 +1,280 @@
+"""What is said of outputs that no longer answer their inputs, and what may be why."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Literal, TypeAlias
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.display import Table, number, table
+from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.graph.nodes import array_of, input_at, reads_of
+from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.providers import Provider
+from me2e_compress.runtime.session import Session
+
+SUSPECT = 0.1
+"""Below this share the int8 values before an output are looked at."""
+
+ROUNDING = 1e-4
+"""Movement, over the length of the output, that may be rounding alone: two runtimes are
+3e-5 to 6e-5 apart in float32 on UniAD-tiny (docs/uniad.md)."""
+
+END = 0.99
+"""Elements of so much of the largest magnitude are at the end: -127 and -128 are."""
+
+MOST_CUT = 0.5
+"""Share of elements at one end from which an output, or what an int8 value is made of,
+is saturated; max-min ranges cut none, and percentiles one in a thousand."""
+
+Verdict: TypeAlias = Literal[
+    "alive", "constant", "frozen", "saturated", "deaf", "not judged"
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class OutputLiveness:
+    """How one output answers.
+
+    Attributes:
+        moves: movement from frame to frame, as a share of the first graph's; None where
+            that rests itself.
+        answers: likewise where an input or camera is exchanged, by its name.
+        cut: those that it does not answer since modules were removed.
+        at_end: share of elements at the largest magnitude.
+        reason: why it is not judged, or what the verdict rests on.
+    """
+
+    output: str
+    verdict: Verdict
+    moves: float | None
+    answers: Mapping[str, float | None]
+    cut: tuple[str, ...]
+    at_end: float
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.output} is {self.verdict}: {self.reason}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Liveness:
+    """Which outputs of a graph still answer its inputs.
+
+    Attributes:
+        alive: share of the first graph's movement below which an output is dead.
+        frame: index of the frame whose inputs were exchanged.
+        unjudged: inputs that tell nothing, and why.
+        not_fed: recurrent inputs that the second graph has and is not fed back.
+        reason: why nothing was measured; empty otherwise.
+    """
+
+    outputs: tuple[OutputLiveness, ...]
+    alive: float
+    frame: int = 0
+    unjudged: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    not_fed: tuple[str, ...] = ()
+    reason: str = ""
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """A sentence for each dead output, and for each state that is not fed."""
+        fine = "alive", "not judged"
+        dead = [str(each) for each in self.outputs if each.verdict not in fine]
+        return (*dead, *(f"{name} is not fed back any more" for name in self.not_fed))
+
+    def lines(self) -> Iterator[str]:
+        """Yield what answers, what an ablation cut, and what is not judged."""
+        if self.reason:
+            yield f"liveness: not measured ({self.reason})"
+            return
+        least = [
+            (share, each.output, name)
+            for each in self.outputs
+            for name, share in (("the next frame", each.moves), *each.answers.items())
+            if share is not None and name not in each.cut
+        ]
+        if least and not self.faults:
+            share, output, name = min(least)
+            yield (
+                f"every output is alive (least of all {output}, which answers {name}"
+                f" with {share:.0%} of its movement)"
+            )
+        for each in self.outputs:
+            if each.cut:
+                cut = ", ".join(each.cut)
+                yield f"since an ablation {each.output} does not answer {cut}"
+        unjudged = {
+            each.output: each.reason
+            for each in self.outputs
+            if each.verdict == "not judged"
+        }
+        said = (f"{name} ({why})" for name, why in (unjudged | self.unjudged).items())
+        if listed := ", ".join(said):
+            yield f"liveness not judged: {listed}"
+
+    def table(self) -> Table:
+        """Return a row for each output."""
+        rows = []
+        for each in self.outputs:
+            known = [(v, k) for k, v in each.answers.items() if v is not None]
+            least, name = min(known, default=(None, "-"))
+            shares = number(each.moves, ".2f"), number(least, ".2f")
+            rows.append((each.output, each.verdict, *shares, name))
+        columns = ("output", "it is", "moves", "least answer", "to")
+        note = f"Shares of the first graph's movement: dead below {self.alive:g}."
+        return table("Liveness", columns, rows, note, words=2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cause:
+    """What keeps an output from moving, in words; empty if nothing was found."""
+
+    words: str = ""
+    saturated: bool = False
+
+
+class Movement:
+    """How far one output of both graphs moves, over frames."""
+
+    def __init__(self) -> None:
+        self.moved, self.at_end = [0.0, 0.0], [0, 0]
+        self.length, self.elements, self.discrete = 0.0, 0, False
+
+    def add(self, now: Sequence[Array], before: Sequence[Array] | None) -> None:
+        """Take what both graphs answer to a frame, and to the one before."""
+        self.discrete = now[0].dtype.kind not in "fc"
+        self.length = math.hypot(self.length, length(now[0]))
+        self.elements += now[0].size
+        for side, values in enumerate(now):
+            size = np.abs(np.asarray(values, np.float64))
+            most = float(size.max(initial=0.0))
+            self.at_end[side] += int((size >= END * most).sum()) if most else 0
+            moved = 0.0 if before is None else gap(before[side], values)
+            self.moved[side] = math.hypot(self.moved[side], moved)
+
+    def judged(
+        self,
+        name: str,
+        answers: Mapping[str, float | None],
+        alive: float,
+        cause: Callable[[], Cause],
+        *,
+        ablated: bool,
+    ) -> OutputLiveness:
+        """Give the verdict; `cause` looks for what makes an output rest."""
+        moves = share_of(self.moved, self.length)
+        known = {"the next frame": moves, **answers}
+        shares = {k: v for k, v in known.items() if v is not None}
+        deaf = [k for k, v in shares.items() if v < alive and k in answers]
+        cut = tuple(deaf) if ablated else ()
+        verdict: Verdict
+        if self.discrete:
+            verdict, reason = "not judged", "whole numbers"
+        elif not shares:
+            verdict, reason = "not judged", "it rests in the first graph too"
+        else:
+            found = cause() if min(shares.values()) < SUSPECT else Cause()
+            low = {each: shares[each] for each in deaf if each not in cut}
+            verdict, reason = self._verdict(moves, low, alive, found)
+        ends = self.at_end[1] / max(self.elements, 1)
+        return OutputLiveness(name, verdict, moves, answers, cut, ends, reason)
+
+    def _verdict(
+        self,
+        moves: float | None,
+        low: Mapping[str, float],
+        alive: float,
+        cause: Cause,
+    ) -> tuple[Verdict, str]:
+        before, ends = (count / max(self.elements, 1) for count in self.at_end)
+        deaf = [f"{name} ({share:.2%})" for name, share in low.items()]
+        said = "" if moves is None else f"it moves {moves:.2%} as far as before"
+        why = "; ".join(filter(None, [said, cause.words]))
+        if cause.saturated:
+            return "saturated", why
+        if moves is not None and moves < alive:
+            return "frozen" if moves else "constant", why
+        if ends >= MOST_CUT and before < ends / 2:
+            share = f"{ends:.0%} of it are at its largest value, {before:.0%} before"
+            return "saturated", share
+        if deaf:
+            return "deaf", f"of the movement before it answers {', '.join(deaf)}"
+        return "alive", ""
+
+
+def gap(x: Array, y: Array) -> float:
+    """Return the distance of two arrays; infinite where their shapes differ."""
+    if x.shape != y.shape:
+        return math.inf
+    return length(np.asarray(x, np.float64) - np.asarray(y, np.float64))
+
+
+def length(values: Array) -> float:
+    """Return the Euclidean length of an array."""
+    return float(np.linalg.norm(np.asarray(values, np.float64).reshape(-1)))
+
+
+def share_of(moved: Sequence[float], size: float) -> float | None:
+    """Return the second movement as a share of the first; None if that is rounding."""
+    if not ROUNDING * size < moved[0] < math.inf:
+        return None
+    return moved[1] / moved[0]
+
+
+def cause_of(
+    model: ir.Model | None, output: str, feeds: Mapping[str, Array], provider: Provider
+) -> Cause:
+    """Hold the scales of the last int8 values before an output against one frame."""
+    nodes = [] if model is None else _quantizers(model, output)
+    if model is None or not nodes:
+        return Cause()
+    # run the graph once with what those nodes read as outputs
+    probed = model.clone()
+    wanted = {str(node.inputs[0].name) for node in nodes if node.inputs[0]}
+    made = [value for node in probed.graph for value in node.outputs]
+    kept = {value.name for value in probed.graph.outputs}
+    probed.graph.outputs.extend(v for v in made if v.name in wanted - kept)
+    try:
+        session = Session(probed, release=True, provider=provider)
+        names = sorted(wanted & {str(value.name) for value in made})
+        found = {**feeds, **(session.run(feeds, names) if names else {})}
+    except (FramesError, GraphError):
+        return Cause()
+    reads = {
+        node: found.get(str(node.inputs[0].name)) for node in nodes if node.inputs[0]
+    }
+    causes = (_cause(node, read) for node, read in reads.items() if read is not None)
+    return max(causes, key=lambda each: (each.saturated, each.words), default=Cause())
+
+
+def _cause(node: ir.Node, read: Array) -> Cause:
+    """Hold the scale of a QuantizeLinear against what it reads."""
+    scale, stored = array_of(node.inputs[1]), array_of(input_at(node, 2))
+    zeros = np.zeros(1, np.uint8) if stored is None else stored.reshape(-1)
+    if scale is None or scale.size != 1 or zeros.dtype.kind not in "iu":
+        return Cause()
+    limits, zero = np.iinfo(zeros.dtype), int(zeros[0])
+    steps = np.asarray(read, np.float64) / float(scale.item())
+    off = (steps + zero > limits.max + 0.5) | (steps + zero < limits.min - 0.5)
+    if off.mean() >= MOST_CUT:
+        words = f"{node.name} cuts {off.mean():.0%} of what it reads"
+        return Cause(f"{words}: its scale is too small", True)
+    if np.abs(read).max(initial=0.0) > 0 and np.abs(steps).max() <= 0.5:
+        words = f"{node.name} rounds all that it reads to zero"
+        return Cause(f"{words}: its scale is too large")
+    return Cause()
+
+
+def _quantizers(model: ir.Model, output: str) -> list[ir.Node]:
+    """List the last QuantizeLinear nodes before an output."""
+    waiting = [value for value in model.graph.outputs if value.name == output]
+    seen = dict[ir.Node, None]()
+    while waiting:
+        node = waiting.pop().producer()
+        if node is not None and node not in seen:
+            seen[node] = None
+            waiting += () if node.op_type == "QuantizeLinear" else reads_of(node)
+    return [node for node in seen if node.op_type == "QuantizeLinear"]

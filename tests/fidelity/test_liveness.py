@@ -1,0 +1,329 @@
+"""Outputs that no longer answer their inputs are named, and others are not."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.fidelity.compare import compare
+from me2e_compress.fidelity.liveness import (
+    LivenessTally,
+    Part,
+    measure_liveness,
+    parts_of,
+)
+from me2e_compress.fidelity.output_liveness import Liveness
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.session import Session
+from tests.command import Command, command
+from tests.frames import record
+
+DRIVER = """
+<ir_version: 9, opset_import: ["" : 17]>
+driver (float[1,2,3,16,16] img, float[1,4] can_bus, int64[1] command, float[1,2] prev)
+    => (float[1,2] plan, float[1,2] prev_out, int64[1] label, float[1,2] still)
+<float[1,2] seen = {SEEN}, float[1] turns = {TURNS}, float[1] history = {HISTORY},
+ float[1] gain = {GAIN}, float[1] scale = {SCALE}, int8[1] zero = {0},
+ float[1] high = {CEILING}, float[1,2] rest = {1.0, 2.0},
+ float[3,2] table = {0.0, 1.0, 2.0, 3.0, -4.0, 5.0}> {
+    ["/see"] means = ReduceMean<axes=[2,3,4], keepdims=0>(img)
+    ["/see/Mul"] cameras = Mul(means, seen)
+    ["/turn"] way = Gather(table, command)
+    ["/turn/Mul"] turn = Mul(way, turns)
+    ["/remember"] before = Mul(prev, history)
+    ["/Add"] prev_out = Add(cameras, turn)
+    ["/Sum"] sum = Add(prev_out, before)
+    ["/Gain"] weighed = Mul(sum, gain)
+    ["/Quantize"] q = QuantizeLinear(weighed, scale, zero)
+    ["/Dequantize"] back = DequantizeLinear(q, scale, zero)
+    ["/Min"] plan = Min(back, high)
+    ["/Label"] label = Identity(command)
+    ["/Rest"] still = Identity(rest)
+}
+"""
+HEALTHY = {
+    "SEEN": "1.0, 1.0", "TURNS": "1.0", "HISTORY": "0.5", "GAIN": "1.0",
+    "SCALE": "0.1", "CEILING": "1000000.0",
+}  # fmt: skip
+__all__ = ["command"]
+
+FED = {"prev": "prev_out"}
+"""The state, as the metadata pair it."""
+
+
+def driver(state: Mapping[str, str | None] = FED, **changed: str) -> ir.Model:
+    """A small driver; what is changed are its constants."""
+    text = DRIVER
+    for name, value in (HEALTHY | changed).items():
+        text = text.replace(f"{{{name}}}", f"{{{value}}}")
+    model = ir.from_onnx_text(text)
+    model.metadata_props["me2e.recurrent"] = json.dumps(state)
+    return model
+
+
+def drive(count: int = 4, scenes: tuple[int, ...] = (0,)) -> list[Frame]:
+    """Frames of which all but the CAN bus changes."""
+    random = np.random.default_rng(0)
+    return [
+        Frame(
+            index,
+            index in scenes,
+            {
+                "img": random.random((1, 2, 3, 16, 16), np.float32) * (index + 1),
+                "can_bus": np.ones((1, 4), np.float32),
+                "command": np.array([index % 3]),
+            },
+        )
+        for index in range(count)
+    ]
+
+
+def measured(
+    model: ir.Model, frames: list[Frame] | None = None, *, ablated: bool = False
+) -> Liveness:
+    a, b = Session(driver()), Session(model)
+    tally = LivenessTally(a, b)
+    compare(a, b, drive() if frames is None else frames, tally.add)
+    return tally.result(model=model, ablated=ablated)
+
+
+def verdicts(found: Liveness) -> dict[str, str]:
+    return {each.output: each.verdict for each in found.outputs}
+
+
+@pytest.mark.parametrize("scenes", [(0,), (0, 2), (0, 1, 2, 3)])
+def test_a_graph_in_int8_that_works_is_alive(scenes: tuple[int, ...]) -> None:
+    found = measured(driver(), drive(scenes=scenes))
+
+    assert found.faults == ()
+    assert verdicts(found) == {
+        "plan": "alive", "prev_out": "alive", "label": "not judged",
+        "still": "not judged",
+    }  # fmt: skip
+    assert found.unjudged["can_bus"] == "the same in all frames"
+    *_, said = found.lines()
+    assert "label (whole numbers), still (it rests in the first graph too)" in said
+
+
+DEAF = "deaf: of the movement before it answers"
+LARGE = "; /Quantize rounds all that it reads to zero: its scale is too large"
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"SEEN": "1.0, 0.0"}, f"{DEAF} camera 1 of img (0.00%)"),
+        ({"SEEN": "0.001, 1.0"}, f"{DEAF} camera 0 of img"),
+        ({"TURNS": "0.0"}, f"{DEAF} command (0.00%)"),
+        ({"HISTORY": "0.0"}, f"{DEAF} prev (0.00%)"),
+        ({"SCALE": "5e6"}, f"constant: it moves 0.00% as far as before{LARGE}"),
+        ({"GAIN": "0.005", "SCALE": "0.0005"}, "frozen: it moves 0.50% as far"),
+        ({"CEILING": "-1000.0"}, "constant: it moves 0.00% as far as before"),
+    ],
+)
+def test_what_is_dead_is_named(changed: dict[str, str], said: str) -> None:
+    found = measured(driver(**changed))
+
+    assert found.faults[0].startswith(f"plan is {said}")
+
+
+def test_a_scale_that_is_too_small_is_named_though_the_output_moves() -> None:
+    """Signs still change: it moves more than a hundredth as far."""
+    (fault,) = measured(driver(SCALE="0.002")).faults
+
+    assert fault.startswith("plan is saturated: it moves")
+    assert fault.endswith(
+        "/Quantize cuts 100% of what it reads: its scale is too small"
+    )
+
+
+PICTURE = """
+<ir_version: 9, opset_import: ["" : 17]>
+picture (float[1,8] x) => (float[1,8] y) <float low = {-9.0}, float high = {%s}> {
+    y = Clip(x, low, high)
+}
+"""
+
+
+@pytest.mark.parametrize(("high", "verdict"), [("9.0", "alive"), ("0.2", "saturated")])
+def test_an_output_at_its_largest_value_is_saturated(high: str, verdict: str) -> None:
+    random = np.random.default_rng(0)
+    frames = [
+        Frame(at, not at, {"x": random.uniform(0.1, 1, (1, 8)).astype("f")})
+        for at in range(4)
+    ]
+    a, b = (Session(ir.from_onnx_text(PICTURE % most)) for most in ("9.0", high))
+
+    (found,) = measure_liveness(a, b, frames).outputs
+
+    assert found.verdict == verdict
+
+
+def test_a_state_that_is_not_fed_is_named() -> None:
+    """The recorded state is fed instead; it is that of no frame before."""
+    frames = [
+        dataclasses.replace(each, arrays=each.arrays | {"prev": np.ones((1, 2), "f")})
+        for each in drive()
+    ]
+
+    found = measured(driver(state={"prev": None}), frames)
+
+    assert found.not_fed == ("prev",)
+    assert "prev is not fed back any more" in found.faults
+    assert (
+        "plan is deaf: of the movement before it answers prev (0.00%)" in found.faults
+    )
+
+
+@pytest.mark.parametrize(
+    ("scenes", "frame"), [((0,), 1), ((0, 1, 2), 3), ((0, 1, 2, 3), 0)]
+)
+def test_inputs_are_exchanged_where_there_is_a_history(
+    scenes: tuple[int, ...], frame: int
+) -> None:
+    assert measured(driver(), drive(scenes=scenes)).frame == frame
+
+
+def test_a_state_that_is_never_there_tells_nothing() -> None:
+    found = measured(driver(HISTORY="0.0"), drive(scenes=(0, 1, 2, 3)))
+
+    assert found.unjudged["prev"] == "the same in all frames"
+    assert found.faults == ()
+
+
+def test_an_input_that_is_the_same_all_scene_is_taken_from_another_scene() -> None:
+    """Commands change seldom; a cut command is found all the same."""
+    frames = [
+        dataclasses.replace(
+            each, arrays=each.arrays | {"command": np.array([each.index // 2])}
+        )
+        for each in drive(scenes=(0, 2))
+    ]
+
+    assert "answers command (0.00%)" in measured(driver(TURNS="0.0"), frames).faults[0]
+
+
+def test_one_frame_is_not_measured_and_that_is_said() -> None:
+    found = measured(driver(SCALE="5e6"), drive(1))
+
+    assert found.faults == ()
+    assert list(found.lines()) == [
+        "liveness: not measured (one frame alone: nothing moves)"
+    ]
+
+
+def test_each_graph_runs_once_for_each_input(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of four frames and five parts, the CAN bus never changes."""
+    ran, whole = list[int](), Session.run
+
+    def counted(self: Session, *given: Any, **named: Any) -> Any:
+        ran.append(1)
+        return whole(self, *given, **named)
+
+    monkeypatch.setattr(Session, "run", counted)
+    measure_liveness(Session(driver()), Session(driver()), drive())
+
+    assert len(ran) == 2 * 4 + 2 * 4
+
+
+@pytest.mark.parametrize(
+    ("shape", "cameras"),
+    [
+        ((1, 6, 3, 16, 16), 6),
+        ((6, 3, 16, 16), 6),
+        ((1, 2, 16, 16, 3), 2),
+        ((1, 4, 2, 3, 16, 16), 2),
+        ((1, 3, 16, 16), 0),
+        ((1, 6, 4, 4), 0),
+        ((20, 3, 6, 2), 0),
+        ((6, 8, 16, 16), 0),
+        ((18,), 0),
+    ],
+)
+def test_cameras_are_told_by_the_shape(shape: tuple[int, ...], cameras: int) -> None:
+    expected = [Part("x", at) for at in range(cameras)] or [Part("x")]
+
+    assert parts_of("x", np.zeros(shape)) == expected
+
+
+OPEN = """
+<ir_version: 9, opset_import: ["" : 17]>
+picks (float[n] x, int64[1] at) => (float[1] y) { y = Gather(x, at) }
+"""
+
+
+def test_an_input_that_cannot_be_exchanged_alone_is_not_judged() -> None:
+    """The third of two numbers: the graph fails, and the others are still judged."""
+    frames = [
+        Frame(
+            size - 2,
+            size == 2,
+            {"x": np.arange(float(size)).astype("f"), "at": np.array([size - 1])},
+        )
+        for size in (2, 3)
+    ]
+    session = Session(ir.from_onnx_text(OPEN))
+
+    found = measure_liveness(session, session, frames)
+
+    assert "indices element out of data bounds" in found.unjudged["x"]
+    assert found.outputs[0].answers == {"at": 1.0}
+
+
+def test_what_an_ablation_cut_is_said_and_is_no_fault() -> None:
+    found = measured(driver(TURNS="0.0"), ablated=True)
+
+    assert found.faults == ()
+    assert "since an ablation plan does not answer command" in found.lines()
+
+
+def test_what_an_ablation_froze_is_a_fault() -> None:
+    assert measured(driver(SCALE="5e6"), ablated=True).faults
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A graph, one of which the plan is constant, and frames; the current folder."""
+    graph.save(driver(), tmp_path / "a.onnx")
+    graph.save(driver(SCALE="5e6"), tmp_path / "b.onnx")
+    record(tmp_path / "frames", [each.arrays for each in drive()])
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("more", "code"), [((), 1), (("--alive", "0"), 0)])
+def test_compare_exits_with_1_if_an_output_is_dead(
+    more: tuple[str, ...],
+    code: int,
+    command: Command,
+    files: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert command("compare", "a.onnx", "b.onnx", "frames", *more) == code
+
+    said = capsys.readouterr()
+    assert ("b.onnx: plan is constant" in said.err) == bool(code)
+    assert ("Liveness" in said.out) == bool(code)
+
+
+def test_compare_finds_a_graph_alive_beside_itself(
+    command: Command, files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("compare", "a.onnx", "a.onnx", "frames") == 0
+
+    assert "every output is alive" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("share", ["-0.1", "1.5", "nan", "inf"])
+def test_a_share_beyond_0_to_1_is_refused(
+    share: str, command: Command, files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("compare", "a.onnx", "a.onnx", "frames", "--alive", share) == 1
+
+    assert f"--alive is {share}: it must be a finite" in capsys.readouterr().err
