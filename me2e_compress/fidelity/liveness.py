@@ -66,7 +66,8 @@ class Part:
         """Return a view of this part of an input's array."""
         if self.camera is None:
             return array
-        return np.moveaxis(array, -4, 0)[self.camera]
+        view: Array = np.moveaxis(array, -4, 0)[self.camera]
+        return view
 
 
 def parts_of(name: str, array: Array) -> list[Part]:
