@@ -13,7 +13,7 @@ import dataclasses
 import hashlib
 import json
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -25,10 +25,11 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.fidelity.compare import Reference
 from me2e_compress.fidelity.liveness import LivenessTally
 from me2e_compress.fidelity.output_liveness import Liveness
-from me2e_compress.graph.nodes import array_of
+from me2e_compress.graph import rewrite
+from me2e_compress.graph.nodes import producer_of, scalar_of
 from me2e_compress.graph.recurrence import RECURRENT
 from me2e_compress.manager import recipe
-from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session, detached
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.frames import FramesOptions, record_frames
@@ -64,9 +65,15 @@ def main(argv: Sequence[str] | None = None) -> None:
 class Remembering(Session):
     """A session that runs nothing twice: all candidates are asked the same."""
 
-    answers: ClassVar[dict[bytes, dict[str, np.ndarray]]] = {}
+    answers: ClassVar[dict[bytes, dict[str, Array]]] = {}
 
-    def run(self, feeds, outputs=None, *, first=False):
+    def run(
+        self,
+        feeds: Mapping[str, Array],
+        outputs: Sequence[str] | None = None,
+        *,
+        first: bool = False,
+    ) -> dict[str, Array]:
         arrays = (np.asarray(feeds[name]).tobytes() for name in sorted(feeds))
         key = hashlib.blake2b(b"".join(arrays)).digest()
         if key not in self.answers:
@@ -148,22 +155,16 @@ def _scaled(factor: float) -> Callable[[ir.Model], None]:
 
     def fault(model: ir.Model) -> None:
         node = model.graph.node(f"{OCCUPANCY}_QuantizeLinear")
-        scale = array_of(node.inputs[1])
-        new = _constant(model, "faulty_scale", scale * np.float32(factor))
+        scale = scalar_of(node.inputs[1]) or 0.0
+        new = _constant(model, "faulty_scale", factor * scale, "float32")
         for each in (node, *node.outputs[0].consumers()):
             each.replace_input_with(1, new)
 
     return fault
 
 
-def _constant(model: ir.Model, name: str, array: np.ndarray) -> ir.Value:
-    value = ir.Value(name=name, const_value=ir.tensor(array, name=name))
-    value.type, value.shape = (
-        ir.TensorType(value.const_value.dtype),
-        ir.Shape(array.shape),
-    )
-    model.graph.register_initializer(value)
-    return value
+def _constant(model: ir.Model, name: str, value: object, kind: str) -> ir.Value:
+    return rewrite.add_constant(model.graph, np.asarray(value, kind), name)
 
 
 def _pair(factor: float) -> Callable[[ir.Model], None]:
@@ -172,11 +173,11 @@ def _pair(factor: float) -> Callable[[ir.Model], None]:
     def fault(model: ir.Model) -> None:
         source = _value(model, CANDIDATES)
         readers = list(source.uses())
-        scale = _constant(model, "pair_scale", np.float32(40 / 127 * factor))
-        grid = scale, _constant(model, "pair_zero", np.int8(0))
+        scale = _constant(model, "pair_scale", 40 / 127 * factor, "float32")
+        grid = scale, _constant(model, "pair_zero", 0, "int8")
         quantize = ir.node("QuantizeLinear", [source, *grid], name="pair_quantize")
         back = ir.node("DequantizeLinear", [quantize.outputs[0], *grid])
-        model.graph.insert_after(source.producer(), [quantize, back])
+        model.graph.insert_after(_maker(source), [quantize, back])
         _read(readers, back.outputs[0])
 
     return fault
@@ -187,11 +188,11 @@ def _held(name: str) -> Callable[[ir.Model], None]:
 
     def fault(model: ir.Model) -> None:
         source = _value(model, name)
-        fixed = _constant(model, f"{name}_held", np.ones((1, 6, 2), np.float32))
-        none = _constant(model, "none", np.float32(0))
+        fixed = _constant(model, f"{name}_held", np.ones((1, 6, 2)), "float32")
+        none = _constant(model, "none", 0, "float32")
         rest = ir.node("Mul", [source, none])
         held = ir.node("Add", [rest.outputs[0], fixed])
-        model.graph.insert_after(source.producer(), [rest, held])
+        model.graph.insert_after(_maker(source), [rest, held])
         source.name, held.outputs[0].name = f"{name}_lost", name
         held.outputs[0].type, held.outputs[0].shape = source.type, source.shape
         at = [value.name for value in model.graph.outputs].index(f"{name}_lost")
@@ -211,17 +212,25 @@ def _value(model: ir.Model, name: str) -> ir.Value:
     return next(value for value in made if value.name == name)
 
 
+def _maker(value: ir.Value) -> ir.Node:
+    node = producer_of(value)
+    assert node is not None
+    return node
+
+
 def _read(readers: Iterable[tuple[ir.Node, int]], value: ir.Value) -> None:
     for node, at in list(readers):
         node.replace_input_with(at, value)
 
 
-def _fixed(name: str, array: np.ndarray) -> Callable[[ir.Model], None]:
+def _fixed(
+    name: str, array: Array, kind: str = "float32"
+) -> Callable[[ir.Model], None]:
     """Let the readers of an input read a constant."""
 
     def fault(model: ir.Model) -> None:
         source = next(value for value in model.graph.inputs if value.name == name)
-        held = _constant(model, f"{name}_fixed", array.astype(source.dtype.numpy()))
+        held = _constant(model, f"{name}_fixed", array, kind)
         _read(list(source.uses()), held)
 
     return fault
@@ -232,17 +241,17 @@ def _blinded(cameras: Iterable[int]) -> Callable[[ir.Model], None]:
 
     def fault(model: ir.Model) -> None:
         source = next(value for value in model.graph.inputs if value.name == "img")
-        seen = np.ones((1, 6, 1, 1, 1), np.float32)
+        seen = np.ones((1, 6, 1, 1, 1))
         seen[:, list(cameras)] = 0
         readers = list(source.uses())
-        masked = ir.node("Mul", [source, _constant(model, "seen", seen)])
+        masked = ir.node("Mul", [source, _constant(model, "seen", seen, "float32")])
         model.graph.insert_before(readers[0][0], masked)
         _read(readers, masked.outputs[0])
 
     return fault
 
 
-ZERO = np.zeros(1, np.int64)
+ZERO = np.zeros(1)
 BEV = np.zeros((1, 768, 66), np.float32)
 FAULTS = {
     "plan, scale x 5e7": ("plan", "constant", "to zero", _pair(5e7)),
@@ -253,7 +262,7 @@ FAULTS = {
     "camera 0 blind": ("plan", "deaf", "camera 0 of img", _blinded([0])),
     "camera 3 blind": ("plan", "deaf", "camera 3 of img", _blinded([3])),
     "all cameras blind": ("boxes", "deaf", "camera 5 of img", _blinded(range(6))),
-    "command fixed": ("plan", "deaf", "command", _fixed("command", ZERO)),
+    "command fixed": ("plan", "deaf", "command", _fixed("command", ZERO, "int64")),
     "can_bus fixed": ("plan", "deaf", "can_bus", _fixed("can_bus", BEV[0, 0, :18])),
     "timestamp fixed": ("prev_bev_out", "constant", "", _fixed("timestamp", ZERO)),
     "history not read": ("prev_bev_out", "deaf", "prev_bev", _fixed("prev_bev", BEV)),

@@ -142,10 +142,8 @@ class Rounding:
 
     def among(self, outputs: Collection[str]) -> Self:
         """Return what it says of some outputs."""
-        values, choices = (
-            {name: held[name] for name in held if name in outputs}
-            for held in (self.values, self.choices)
-        )
+        values = {name: self.values[name] for name in self.values if name in outputs}
+        choices = {name: each for name, each in self.choices.items() if name in values}
         return dataclasses.replace(self, values=values, choices=choices)
 
 

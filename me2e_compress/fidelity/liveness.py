@@ -62,11 +62,12 @@ class Part:
             return self.input
         return f"camera {self.camera} of {self.input}"
 
-    @property
-    def place(self) -> tuple[object, ...]:
-        """Where it stands in the input's array."""
-        none = slice(None)
-        return (...,) if self.camera is None else (..., self.camera, none, none, none)
+    def of(self, array: Array) -> Array:
+        """Return a view of this part of an input's array."""
+        if self.camera is None:
+            return array
+        view: Array = np.moveaxis(array, -4, 0)[self.camera]
+        return view
 
 
 def parts_of(name: str, array: Array) -> list[Part]:
@@ -110,7 +111,7 @@ class _Donor:
     def of(cls, part: Part, base: _Moment, other: _Moment) -> Self:
         # each graph gets its own state, of the same frame
         held, *given = (
-            each.feeds(side).get(part.input, NOTHING)[part.place]
+            part.of(each.feeds(side).get(part.input, NOTHING))
             for each, side in ((base, 0), (other, 0), (other, 1))
         )
         distance = gap(held, given[0])
@@ -221,7 +222,10 @@ class LivenessTally:
                     known = (answers[name].get(told), share)
                     both = [each for each in known if each is not None]
                     answers[name][told] = max(both, default=None)
-                if all(e[told] is None or e[told] >= alive for e in answers.values()):
+                least = [
+                    share for e in answers.values() if (share := e[told]) is not None
+                ]
+                if min(least, default=alive) >= alive:
                     break
         return answers, unjudged
 
@@ -248,6 +252,6 @@ class LivenessTally:
             feeds[part.input] = donor.values[side]
         else:
             feeds[part.input] = feeds[part.input].copy()
-            feeds[part.input][part.place] = donor.values[side]
+            part.of(feeds[part.input])[...] = donor.values[side]
         names, first = list(self._movements), base.frame.starts_scene
         return detached(session.run(feeds, names, first=first))

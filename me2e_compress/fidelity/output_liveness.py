@@ -111,7 +111,9 @@ class Liveness:
             for each in self.outputs
             if each.verdict == "not judged"
         }
-        said = (f"{name} ({why})" for name, why in (unjudged | self.unjudged).items())
+        said = (
+            f"{name} ({why})" for name, why in {**unjudged, **self.unjudged}.items()
+        )
         if listed := ", ".join(said):
             yield f"liveness not judged: {listed}"
 
@@ -256,7 +258,7 @@ def _cause(node: ir.Node, read: Array) -> Cause:
     zeros = np.zeros(1, np.uint8) if stored is None else stored.reshape(-1)
     if scale is None or scale.size != 1 or zeros.dtype.kind not in "iu":
         return Cause()
-    limits, zero = np.iinfo(zeros.dtype), int(zeros[0])
+    limits, zero = np.iinfo(zeros.dtype.name), int(zeros[0])
     steps = np.asarray(read, np.float64) / float(scale.item())
     off = (steps + zero > limits.max + 0.5) | (steps + zero < limits.min - 0.5)
     if off.mean() >= MOST_CUT:
