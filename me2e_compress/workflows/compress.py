@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from time import process_time
 from typing import TypeAlias
 
 from me2e_compress import graph
@@ -20,6 +19,7 @@ from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RuleSet
+from me2e_compress.runtime.children import cpu_seconds
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.calibrate_result import beside_ranges
 from me2e_compress.workflows.checks import (
@@ -69,6 +69,7 @@ class CompressOptions:
         measure_frames: most frames that are kept out of calibration, to measure lossy
             passes on; 0 measures nothing and calibrates on all.
         floor: SQNR in dB below which an output is warned of.
+        no_remedy: do not search the nodes that put an output below the floor.
         allow_empty: write the graph although nothing in it became int8.
         smaller: add no weights to remove nodes: fewer bytes instead of fewer nodes.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
@@ -90,6 +91,7 @@ class CompressOptions:
     unproven: bool = False
     measure_frames: int = 4
     floor: float = SQNR_FLOOR_DB
+    no_remedy: bool = False
     allow_empty: bool = False
     smaller: bool = False
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -252,7 +254,7 @@ class Compression:
 
         `passes` come from :meth:`CompressOptions.passes`.
         """
-        start, options, listener = process_time(), self.options, self.listener
+        start, options, listener = cpu_seconds(), self.options, self.listener
         source, model = loaded.path, loaded.model
         seen = frames.calibration or frames.samples
         count, provider = options.verify_frames or 1, options.provider
@@ -271,8 +273,9 @@ class Compression:
         # measure what lossy passes cost, on the frames kept for it
         if report.lossy and frames.measured is not None:
             first(report.model, self.output.name)
-        loss = measure_loss(report, context, frames, Floor(options.floor), listener)
-        seconds = process_time() - start
+        floor, search = Floor(options.floor), not options.no_remedy
+        loss = measure_loss(report, context, frames, floor, listener, search)
+        seconds = cpu_seconds() - start
         return write_result(report, loaded, self.output, int8, loss, seconds)
 
 

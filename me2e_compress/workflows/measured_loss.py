@@ -27,6 +27,7 @@ class MeasuredLoss:
         remedy: what would restore the quality; None if nothing was searched, because
             another pass is guilty, or the one that quantizes takes no overrides.
         seconds: CPU time of measuring and searching.
+        search_seconds: CPU time of the search for a remedy.
     """
 
     fidelity: Fidelity | None
@@ -37,6 +38,7 @@ class MeasuredLoss:
     guilty: tuple[str, ...] = ()
     remedy: Remedy | None = None
     seconds: float = 0.0
+    search_seconds: float = 0.0
     incomparable: bool = False
 
     def lines(self) -> Iterator[str]:
@@ -97,7 +99,7 @@ class MeasuredLoss:
     def record(self) -> dict[str, object]:
         """Return what the report says of it: all but the time."""
         names = [each.name for each in dataclasses.fields(self)]
-        names.remove("seconds")
+        names = [each for each in names if each not in ("seconds", "search_seconds")]
         said = {name: getattr(self, name) for name in names}
         if self.remedy is not None:
             overrides = {"overrides": self.remedy.overrides()}

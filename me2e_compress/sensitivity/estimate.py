@@ -1,0 +1,304 @@
+"""Estimate what int8 of every node costs every output, by first-order propagation.
+
+The gradient g of an output, weighted by random signs, meets the local error e of each
+int8 node: E (g e)^2 = |J e|^2 is the power of the noise that e makes at the output. The
+errors of different channels are taken to be independent, so that products are summed
+per channel, then squared. One backward pass so tells of all nodes what would take an
+inference for each. Choices (a TopK, comparisons, integers) count as fixed.
+"""
+
+import dataclasses
+from collections.abc import Collection, Iterator, Mapping, Sequence
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.graph import array_of, producer_of, rewrite, static_shape
+from me2e_compress.graph.nodes import FLOATS
+from me2e_compress.quantization.plan import RESIDUAL, Decision, QuantPlan
+from me2e_compress.runtime.frames import Array, Frame, Frames
+from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.runnable import compiled_or_expanded
+from me2e_compress.runtime.session import Session, replay
+from me2e_compress.sensitivity.gradients import Backward, Tape
+from me2e_compress.targets.base import Grids
+from me2e_compress.targets.weights import QuantizedWeight, weights_of
+
+MOST_HELD = 1_500_000_000
+"""Bytes of a graph's own tensors that may be kept in memory for its gradients."""
+
+NO_PATH = "no output depends on it but by choices or whole numbers"
+
+_TAP, _SIGNS, _NOISE, _SIGNAL = (
+    f"me2e_sensitivity_{name}" for name in ("tap", "signs", "noise", "signal")
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NodeCost:
+    """What int8 of one node costs, with the residual Add that follows it.
+
+    Attributes:
+        output: name of the node's first output, which is unique.
+        noise: noise amplitude by output, relative to its signal; None if not estimated.
+        reason: why it was not.
+    """
+
+    node: str
+    output: str
+    op: str
+    module: str
+    noise: Mapping[str, float] | None
+    reason: str = ""
+
+
+def estimate(
+    model: ir.Model,
+    plan: QuantPlan,
+    grids: Grids,
+    frames: Frames,
+    *,
+    outputs: Collection[str] | None = None,
+    seed: int = 0,
+    threads: int = 0,
+    provider: Provider = CPU,
+) -> tuple[NodeCost, ...]:
+    """Estimate the cost of each int8 node of a plan for each output, in graph order.
+
+    Each frame tells of one output, they take turns: of an output without a frame
+    nothing is known. Those of whole numbers or of open size are left out; ``outputs``
+    None asks for all others.
+    """
+    written = _write(model, plan, grids, outputs)
+    power = np.zeros((len(written.seeds), len(written.readings)))
+    signal = np.zeros(len(written.seeds))
+    if written.readings:
+        session = Session(
+            written.model, threads=threads, frugal=True, release=True, provider=provider
+        )
+        fed = written.fed(frames, np.random.default_rng(seed))
+        for at, values in enumerate(replay(session, fed, [_NOISE, _SIGNAL])):
+            turn = at % len(signal)
+            power[turn] += values[_NOISE]
+            signal[turn] += values[_SIGNAL][turn]
+    return tuple(written.costs(plan, power, signal))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Written:
+    """A graph that gives noise power by reading, and signal power by output.
+
+    ``seeds`` are the inputs for random signs, by output; ``readings`` name the layers
+    that readings belong to, by output, ``missing`` those that lack one.
+    """
+
+    model: ir.Model
+    seeds: Mapping[str, ir.Value]
+    readings: Sequence[str]
+    missing: Mapping[str, str]
+
+    def fed(self, frames: Frames, random: np.random.Generator) -> Iterator[Frame]:
+        """Yield frames with random signs for one output in turn, zeros for others."""
+        for at, frame in enumerate(frames):
+            arrays: dict[str, Array] = dict(frame.arrays)
+            for turn, value in enumerate(self.seeds.values()):
+                shape, kind = static_shape(value) or (), value.dtype
+                signs = np.zeros(shape, None if kind is None else kind.numpy())
+                if turn == at % len(self.seeds):
+                    signs += random.integers(0, 2, shape) * 2 - 1
+                arrays[str(value.name)] = signs
+            yield dataclasses.replace(frame, arrays=arrays)
+
+    def costs(self, plan: QuantPlan, power: Array, signal: Array) -> Iterator[NodeCost]:
+        """Yield what was found of each int8 node; residual Adds follow another's."""
+        for each in plan.placed:
+            if each.rule == RESIDUAL:
+                continue
+            mine = [at for at, name in enumerate(self.readings) if name == each.output]
+            reason = self.missing.get(each.output, "" if mine else NO_PATH)
+            noise = None
+            if not reason:
+                noise = {
+                    name: float(np.sqrt(power[turn, mine].sum() / signal[turn]))
+                    for turn, name in enumerate(self.seeds)
+                    if signal[turn] > 0
+                }
+            yield NodeCost(each.node, each.output, each.op, each.module, noise, reason)
+
+
+def _write(
+    model: ir.Model, plan: QuantPlan, grids: Grids, outputs: Collection[str] | None
+) -> _Written:
+    # every reading of an activation becomes a value of its own, fused nodes bodies
+    sources = _Sources.of(model, plan, grids)
+    main = sources.model.graph
+    reached = sources.reached()
+    ports = [
+        value
+        for value in main.outputs
+        if value in reached and value.dtype in FLOATS and static_shape(value)
+        and (outputs is None or value.name in outputs)
+    ]  # fmt: skip
+    nodes, tape = list(main), Tape(sources.model)
+    signal = [tape.op("ReduceSumSquare", [each], {"keepdims": 0}) for each in ports]
+    # the backward pass; where a gradient is complete it meets the error
+    back, seeds = Backward(tape, reached, MOST_HELD), dict[str, ir.Value]()
+    for value in ports:
+        signs = ir.Value(
+            name=f"{_SIGNS}_{value.name}", shape=value.shape, type=value.type
+        )
+        main.inputs.append(signs)
+        seeds[str(value.name)] = signs
+        back.seed(value, signs)
+    names, powers = list[str](), list[ir.Value]()
+    for node in reversed(nodes):
+        found = back.found.get(node.outputs[0])
+        if found is not None and (layer := sources.layer_of(node)):
+            names.append(layer)
+            powers.append(sources.power(tape, node, found))
+        back.pass_through(node)
+    # one vector of each kind
+    for name, values in ((_NOISE, powers), (_SIGNAL, signal)):
+        if values:
+            flat = [tape.shaped(each, [1]) for each in values]
+            joined = tape.op("Concat", flat, {"axis": 0})
+            joined.name, joined.type = name, ir.TensorType(ir.DataType.FLOAT)
+            main.outputs.append(joined)
+    rewrite.remove_dead(main)
+    return _Written(sources.model, seeds, names, sources.behind(back.missing))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sources:
+    """The places of a float graph where int8 makes errors.
+
+    ``taps`` are the values that int8 nodes read, ``layers`` those that layers with an
+    int8 weight give: each with the first output of the node that is blamed.
+    """
+
+    model: ir.Model
+    taps: Mapping[ir.Value, str]
+    grids: Mapping[ir.Value, tuple[np.float32, int]]
+    layers: Mapping[ir.Value, str]
+    weights: Mapping[str, QuantizedWeight]
+    decisions: Mapping[str, Decision]
+
+    @classmethod
+    def of(cls, model: ir.Model, plan: QuantPlan, grids: Grids) -> "_Sources":
+        """Copy a graph, tap what int8 nodes read, and expand fused nodes."""
+        origin = {str(n.outputs[0].name): n for n in model.graph}
+        copy = model.clone()
+        nodes = {str(n.outputs[0].name): n for n in copy.graph}
+        taps, found = dict[str, str](), dict[str, tuple[np.float32, int]]()
+        for each in plan.placed:
+            node = nodes[each.output]
+            for index in each.activations:
+                value, read = node.inputs[index], origin[each.output].inputs[index]
+                if value is None or read is None:
+                    continue
+                tap = ir.node("Identity", [value])
+                made = tap.outputs[0]
+                made.name = f"{_TAP}_{len(taps)}"
+                made.shape, made.type = value.shape, value.type
+                copy.graph.insert_before(node, tap)
+                node.replace_input_with(index, made)
+                taps[made.name] = blamed(origin[each.output], each)
+                found[made.name] = grids[str(read.name)]
+        made_of, _ = compiled_or_expanded(copy, compiled=False)
+        graph.infer_shapes(made_of)
+        values = {str(v.name): v for node in made_of.graph for v in node.outputs}
+        weights = weights_of(model, plan.placed)
+        return cls(
+            made_of,
+            {values[name]: layer for name, layer in taps.items()},
+            {values[name]: each for name, each in found.items()},
+            {values[name]: name for name in weights},
+            weights,
+            {each.output: each for each in plan.placed},
+        )
+
+    def reached(self) -> set[ir.Value]:
+        """Return every value that depends on an error."""
+        found = {*self.taps, *self.layers}
+        for node in self.model.graph:
+            if not found.isdisjoint(filter(None, node.inputs)):
+                found.update(node.outputs)
+        return found
+
+    def layer_of(self, node: ir.Node) -> str:
+        """Return the layer whose error a node's output shows; empty for most nodes."""
+        value = node.outputs[0]
+        return self.taps.get(value) or self.layers.get(value, "")
+
+    def power(self, t: Tape, node: ir.Node, g: ir.Value) -> ir.Value:
+        """Write the sum of squares of what the channels of an error do."""
+        value = node.outputs[0]
+        rank = len(static_shape(value) or ())
+        if value in self.taps:
+            effect = t.times(g, _rounding(t, node, *self.grids[value]))
+            layer = next(iter(value.consumers()), None)
+            convolved = layer is not None and layer.op_type.startswith("Conv")
+            along = range(2, rank) if convolved else range(max(rank - 2, 0), rank - 1)
+        else:
+            effect = t.times(g, self._of_weight(t, node))
+            channel = 1 if node.op_type.startswith("Conv") else rank - 1
+            along = [at for at in range(rank) if at != channel]
+        total = t.total(effect, [*along], keep=False)
+        return t.op("ReduceSumSquare", [total], {"keepdims": 0})
+
+    def _of_weight(self, t: Tape, node: ir.Node) -> ir.Value:
+        """Write what the rounding of a weight adds to the output of its layer."""
+        name = str(node.outputs[0].name)
+        decision, weight = self.decisions[name], self.weights[name]
+        read = node.inputs[decision.weight or 0]
+        steps = weight.scales
+        if weight.axis is not None:
+            sides = [1] * weight.integers.ndim
+            sides[weight.axis] = -1
+            steps = steps.reshape(sides)
+        near = np.asarray(weight.integers * steps, np.float32)
+        exact = array_of(read)
+        if exact is not None:
+            error = t.constant(near - exact.reshape(near.shape).astype(np.float32))
+        else:
+            flat = t.shaped(read, near.shape)
+            error = t.op("Sub", [t.constant(near), flat])
+        inputs = list(node.inputs[:2])
+        inputs[decision.weight or 0] = error
+        return t.op(node.op_type, inputs, node.attributes)
+
+    def behind(self, missing: Mapping[ir.Value, str]) -> dict[str, str]:
+        """Return the layers whose gradient lacks a part, with the reasons."""
+        reasons, waiting = dict(missing), list(missing)
+        while waiting:
+            value = waiting.pop()
+            node = producer_of(value)
+            for each in () if node is None else node.inputs:
+                if each is not None and each not in reasons:
+                    reasons[each] = reasons[value]
+                    waiting.append(each)
+        return {
+            layer: reasons[value]
+            for where in (self.taps, self.layers)
+            for value, layer in where.items()
+            if value in reasons
+        }
+
+
+def _rounding(t: Tape, tap: ir.Node, step: np.float32, zero: int) -> ir.Value:
+    """Write the difference between a tensor in int8 and the tensor."""
+    value = tap.inputs[0]
+    grid = [t.constant(np.array(step)), t.constant(np.array(zero, np.uint8))]
+    integers = t.op("QuantizeLinear", [value, *grid])
+    return t.op("Sub", [t.op("DequantizeLinear", [integers, *grid]), value])
+
+
+def blamed(node: ir.Node, decision: Decision) -> str:
+    """Return the layer that an error is due to: of a residual Add its convolution."""
+    if decision.rule != RESIDUAL:
+        return decision.output
+    layer = producer_of(node.inputs[1 - decision.activations[0]])
+    if layer is not None and layer.op_type == "BatchNormalization":
+        layer = producer_of(layer.inputs[0])
+    return decision.output if layer is None else str(layer.outputs[0].name)
