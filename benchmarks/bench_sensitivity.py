@@ -1,12 +1,13 @@
 """One-pass sensitivity against one int8 node at a time.
 
     python -m benchmarks.bench_sensitivity OUT [--models highway,tcp,vad-tiny]
-        [--frames 8] [--target tensorrt]
+        [--frames 8] [--target tensorrt] [--nodes N]
 
 For each output of each model: Spearman's rank correlation, over the nodes that the plan
 makes int8, of the estimated noise with the measured one; the median of their quotient;
 and the CPU time of the estimate per frame over that of inference, one thread, opening
-apart. Measured costs stay in OUT: a run that was stopped goes on from them.
+apart. Measured costs stay in OUT: a run that was stopped goes on from them. Of more
+nodes than ``--nodes``, evenly spread ones are measured.
 """
 
 import argparse
@@ -30,7 +31,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.display import table
 from me2e_compress.fidelity.compare import Reference
 from me2e_compress.graph.modules import map_of
-from me2e_compress.quantization.plan import FLOAT, QuantPlan, make_plan
+from me2e_compress.quantization.plan import FLOAT, RESIDUAL, QuantPlan, make_plan
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.atomic import write_json
@@ -38,9 +39,6 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session, replay
 from me2e_compress.sensitivity.estimate import blamed, estimate
 from me2e_compress.targets import TARGETS, Target
-
-CALIBRATED = 8
-"""Frames that ranges are measured on."""
 
 
 def main() -> None:
@@ -50,12 +48,15 @@ def main() -> None:
     parser.add_argument("--models", default="highway,tcp,vad-tiny")
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--target", default="tensorrt")
+    parser.add_argument("--nodes", type=int, default=1000, help="most to measure")
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
     rows = []
     for name in asked.models.split(","):
-        subject = make(name, asked.out, max(asked.frames, CALIBRATED))
-        rows += rows_of(Case.of(subject, asked.frames, TARGETS.parse(asked.target)))
+        subject = make(name, asked.out, asked.frames)
+        rows += rows_of(
+            Case.of(subject, asked.frames, TARGETS.parse(asked.target)), asked.nodes
+        )
         columns = (
             "model", "output", "nodes", "Spearman", "estimated / measured", "x time"
         )  # fmt: skip
@@ -105,14 +106,15 @@ class Case:
         plan = dataclasses.replace(self.plan, decisions=decisions, groups=())
         return self.target.place(self.model, plan, self.ranges)
 
-    def measured(self) -> Mapping[str, Mapping[str, float]]:
-        """Measure the noise of each node at each output, relative to its signal."""
+    def measured(self, most: int) -> Mapping[str, Mapping[str, float]]:
+        """Measure the noise of nodes at each output, relative to its signal."""
         name = f"measured-{self.target.name}-{len(self.frames)}.json"
         saved = self.subject.folder / name
         found = json.loads(saved.read_text()) if saved.is_file() else {}
         reference = Reference.of(Session(self.model, threads=1), self.frames)
-        for each in self.plan.placed:
-            if each.rule == "residual" or each.output in found:
+        layers = [each for each in self.plan.placed if each.rule != RESIDUAL]
+        for each in layers[:: -(-len(layers) // most)]:
+            if each.output in found:
                 continue
             session = Session(self.alone(each.output), threads=1)
             outputs = reference.compare(session).outputs
@@ -121,15 +123,15 @@ class Case:
         return found
 
 
-def rows_of(case: Case) -> list[tuple[str, ...]]:
+def rows_of(case: Case, most: int) -> list[tuple[str, ...]]:
     """Return a row for each output."""
     grids = case.target.grids(case.plan, case.model, case.ranges)
     told = partial(estimate, case.model, case.plan, grids, threads=1)
     found = {e.output: e.noise for e in told(case.frames) if e.noise is not None}
     ratio = per_frame_s(case, told) / per_frame_s(case, partial(_infer, case.model))
-    measured, rows = case.measured(), []
+    measured, rows = case.measured(most), []
     for output in next(iter(found.values()), {}):
-        names = [name for name in found if measured[name][output] > 0]
+        names = [name for name in found if measured.get(name, {}).get(output)]
         ours = np.array([found[name][output] for name in names])
         theirs = np.array([measured[name][output] for name in names])
         rank, quotient = spearman(ours, theirs), float(np.median(ours / theirs))

@@ -8,9 +8,11 @@ inference for each. Choices (a TopK, comparisons, integers) count as fixed.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
+import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress import graph
@@ -24,6 +26,9 @@ from me2e_compress.runtime.session import Session, replay
 from me2e_compress.sensitivity.gradients import Backward, Tape
 from me2e_compress.targets.base import Grids
 from me2e_compress.targets.weights import QuantizedWeight, weights_of
+
+LEAST_CHANNELS = 16
+"""Output channels on which the rounding of a weight is judged, at least."""
 
 MOST_HELD = 1_500_000_000
 """Bytes of a graph's own tensors that may be kept in memory for its gradients."""
@@ -66,16 +71,16 @@ def estimate(
 ) -> tuple[NodeCost, ...]:
     """Estimate the cost of each int8 node of a plan for each output, in graph order.
 
-    Each frame tells of one output, they take turns: of an output without a frame
-    nothing is known. Those of whole numbers or of open size are left out; ``outputs``
-    None asks for all others.
+    Each run over a frame tells of one output, they take turns; where there are more
+    outputs, the frames are run again. Outputs of whole numbers or of open size are
+    left out; ``outputs`` None asks for all others.
     """
     written = _write(model, plan, grids, outputs)
     power = np.zeros((len(written.seeds), len(written.readings)))
     signal = np.zeros(len(written.seeds))
     if written.readings:
         session = Session(
-            written.model, threads=threads, frugal=True, release=True, provider=provider
+            written.model, threads=threads, frugal=True, provider=provider
         )
         fed = written.fed(frames, np.random.default_rng(seed))
         for at, values in enumerate(replay(session, fed, [_NOISE, _SIGNAL])):
@@ -100,7 +105,10 @@ class _Written:
 
     def fed(self, frames: Frames, random: np.random.Generator) -> Iterator[Frame]:
         """Yield frames with random signs for one output in turn, zeros for others."""
-        for at, frame in enumerate(frames):
+        rounds = -(-len(self.seeds) // len(frames))
+        for at, frame in enumerate(itertools.chain(*[frames] * max(rounds, 1))):
+            if at >= max(len(frames), len(self.seeds)):
+                return
             arrays: dict[str, Array] = dict(frame.arrays)
             for turn, value in enumerate(self.seeds.values()):
                 shape, kind = static_shape(value) or (), value.dtype
@@ -235,38 +243,43 @@ class _Sources:
         """Write the sum of squares of what the channels of an error do."""
         value = node.outputs[0]
         rank = len(static_shape(value) or ())
-        if value in self.taps:
-            effect = t.times(g, _rounding(t, node, *self.grids[value]))
-            layer = next(iter(value.consumers()), None)
-            convolved = layer is not None and layer.op_type.startswith("Conv")
-            along = range(2, rank) if convolved else range(max(rank - 2, 0), rank - 1)
-        else:
-            effect = t.times(g, self._of_weight(t, node))
-            channel = 1 if node.op_type.startswith("Conv") else rank - 1
-            along = [at for at in range(rank) if at != channel]
-        total = t.total(effect, [*along], keep=False)
-        return t.op("ReduceSumSquare", [total], {"keepdims": 0})
+        if value not in self.taps:
+            return self._power_of_weight(t, node, g, rank)
+        layer = next(iter(value.consumers()), None)
+        convolved = layer is not None and layer.op_type.startswith("Conv")
+        along = range(2, rank) if convolved else range(max(rank - 2, 0), rank - 1)
+        effect = t.times(g, _rounding(t, node, *self.grids[value]))
+        return _squared(t, t.total(effect, [*along], keep=False))
 
-    def _of_weight(self, t: Tape, node: ir.Node) -> ir.Value:
-        """Write what the rounding of a weight adds to the output of its layer."""
+    def _power_of_weight(
+        self, t: Tape, node: ir.Node, g: ir.Value, rank: int
+    ) -> ir.Value:
+        """Write what the rounding of a weight does, judged on a part of its channels.
+
+        That takes a product as large as the layer's own, but for the part.
+        """
         name = str(node.outputs[0].name)
-        decision, weight = self.decisions[name], self.weights[name]
-        read = node.inputs[decision.weight or 0]
-        steps = weight.scales
-        if weight.axis is not None:
-            sides = [1] * weight.integers.ndim
-            sides[weight.axis] = -1
-            steps = steps.reshape(sides)
-        near = np.asarray(weight.integers * steps, np.float32)
-        exact = array_of(read)
-        if exact is not None:
-            error = t.constant(near - exact.reshape(near.shape).astype(np.float32))
-        else:
-            flat = t.shaped(read, near.shape)
-            error = t.op("Sub", [t.constant(near), flat])
+        at, weight = self.decisions[name].weight or 0, self.weights[name]
+        near, exact = _stored(weight), array_of(node.inputs[at])
         inputs = list(node.inputs[:2])
-        inputs[decision.weight or 0] = error
-        return t.op(node.op_type, inputs, node.attributes)
+        channel = 1 if node.op_type.startswith("Conv") else rank - 1
+        part = 1
+        if exact is None:
+            flat = t.op("Reshape", [node.inputs[at], t.ints(near.shape)])
+            inputs[at] = t.op("Sub", [t.constant(near), flat])
+        else:
+            error = near - exact.reshape(near.shape).astype(np.float32)
+            axis = _output_axis(node, near.ndim)
+            if axis is not None and near.shape[axis] >= 2 * LEAST_CHANNELS:
+                part = near.shape[axis] // LEAST_CHANNELS
+                error = error.take(range(0, near.shape[axis], part), axis)
+                ends = (t.ints([each]) for each in (0, 1 << 31, channel, part))
+                g = t.op("Slice", [g, *ends])
+            inputs[at] = t.constant(np.ascontiguousarray(error))
+        effect = t.times(g, t.op(node.op_type, inputs, node.attributes))
+        along = [axis for axis in range(rank) if axis != channel]
+        power = _squared(t, t.total(effect, along, keep=False))
+        return t.times(power, t.number(part, None))
 
     def behind(self, missing: Mapping[ir.Value, str]) -> dict[str, str]:
         """Return the layers whose gradient lacks a part, with the reasons."""
@@ -284,6 +297,29 @@ class _Sources:
             for value, layer in where.items()
             if value in reasons
         }
+
+
+def _squared(t: Tape, value: ir.Value) -> ir.Value:
+    return t.op("ReduceSumSquare", [value], {"keepdims": 0})
+
+
+def _stored(weight: QuantizedWeight) -> npt.NDArray[np.float32]:
+    """Return a weight as int8 keeps it."""
+    steps = weight.scales
+    if weight.axis is not None:
+        sides = [1] * weight.integers.ndim
+        sides[weight.axis] = -1
+        steps = steps.reshape(sides)
+    return np.asarray(weight.integers * steps, np.float32)
+
+
+def _output_axis(node: ir.Node, rank: int) -> int | None:
+    """Return the axis of a weight along which a part of the output can be computed."""
+    if node.op_type == "Conv":
+        return 0 if node.attributes.get_int("group", 1) == 1 else None
+    if node.op_type == "Gemm":
+        return 0 if node.attributes.get_int("transB", 0) else 1
+    return rank - 1 if node.op_type == "MatMul" else None
 
 
 def _rounding(t: Tape, tap: ir.Node, step: np.float32, zero: int) -> ir.Value:

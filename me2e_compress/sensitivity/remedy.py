@@ -91,11 +91,13 @@ class RemedySearch:
     an output are kept float until what is left would be allowed; where that takes too
     many, modules are. A variant is built, and what it shows is the start of the next.
 
-    ``costs`` are of all int8 nodes; what they do not explain of the measured noise is
-    shared by those without an estimate. ``unsteady`` outputs are not judged.
+    ``costs`` are of all int8 nodes, for the outputs that are ``told``; what they do not
+    explain of the measured noise is shared by the nodes without an estimate.
+    ``unsteady`` outputs are not judged.
     """
 
     costs: Sequence[NodeCost]
+    told: Collection[str]
     measure: Measure
     floor: Floor
     unsteady: Collection[str] = ()
@@ -122,6 +124,8 @@ class RemedySearch:
         left = [each for each in self.costs if not self._is_float(each)]
         before = len(self.nodes) + len(self.modules)
         for each in below:
+            if each.output not in self.told:
+                continue
             power = _powers(left, found, each.output)
             goal = sum(power.values()) * (1 - (MARGIN / each.excess) ** 2)
             named = {cost: own for cost, own in power.items() if self._is_named(cost)}

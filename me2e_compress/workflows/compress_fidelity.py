@@ -192,7 +192,7 @@ class _Measurement:
         )
         progress = partial(self.listener.on_progress, "search")
         progress(0, MOST_TRIALS, "the nodes that lose it (--no-remedy: none)")
-        # each frame tells of one output: the worst come first
+        # as many outputs as frames, so that it takes three inferences a frame
         low = [each.output for each in found.shortfalls][: len(reference.frames)]
         costs = estimate(
             before,
@@ -208,7 +208,7 @@ class _Measurement:
             varied = self._with_overrides(quantizer, more)
             return reference.compare(self._session(varied))
 
-        return RemedySearch(costs, measure, self.floor, found.unsteady, progress)
+        return RemedySearch(costs, low, measure, self.floor, found.unsteady, progress)
 
     def _with_overrides(
         self, quantizer: LossyPass, more: Sequence[Override]
