@@ -145,7 +145,8 @@ def _write(
     ports = [
         value
         for value in main.outputs
-        if value in reached and value.dtype in FLOATS and static_shape(value)
+        if value in reached and value.dtype in FLOATS
+        and static_shape(value) is not None
         and (outputs is None or value.name in outputs)
     ]  # fmt: skip
     nodes, tape = list(main), Tape(sources.model)

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import rewrite, static_shape
+from me2e_compress.graph import array_of, rewrite, static_shape
 from me2e_compress.graph.nodes import Array
 
 Attributes: TypeAlias = Mapping[
@@ -134,6 +134,8 @@ def numpy_of(value: ir.Value | None) -> np.dtype[np.generic]:
 def sizes_of(value: ir.Value | None) -> tuple[int, ...]:
     """Return the shape of a value, which must be known."""
     shape = static_shape(value)
+    if shape is None and (constant := array_of(value)) is not None:
+        return constant.shape
     if shape is None:
         raise NoRuleError("a size is not known")
     return shape
