@@ -37,7 +37,8 @@ from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session, replay
-from me2e_compress.sensitivity.estimate import blamed, estimate
+from me2e_compress.sensitivity.error_sources import blamed
+from me2e_compress.sensitivity.estimate import estimate
 from me2e_compress.targets import TARGETS, Target
 
 

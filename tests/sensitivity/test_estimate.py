@@ -18,7 +18,8 @@ from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import FLOAT, RESIDUAL, QuantPlan
 from me2e_compress.runtime.session import Session
 from me2e_compress.sensitivity import estimate as room
-from me2e_compress.sensitivity.estimate import NO_PATH, NodeCost, blamed, estimate
+from me2e_compress.sensitivity.error_sources import blamed
+from me2e_compress.sensitivity.estimate import NO_PATH, NodeCost, estimate
 from me2e_compress.targets import TARGETS, Target
 from tests.frames import record
 from tests.nets import MODULES, conv_attention, net
