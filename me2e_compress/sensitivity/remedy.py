@@ -22,6 +22,9 @@ MOST_TRIALS = 3
 MOST_NODES = 8
 """Nodes that are named one by one; where it takes more, their modules are."""
 
+MOST_FLOAT = 0.5
+"""Part of the int8 nodes that may be kept float: more is no remedy of int8."""
+
 MARGIN = 0.9
 """What is aimed at, of the noise that the floor allows: an estimate is not exact."""
 
@@ -130,18 +133,24 @@ class RemedySearch:
             goal = sum(power.values()) * (1 - (MARGIN / each.excess) ** 2)
             named = {cost: own for cost, own in power.items() if self._is_named(cost)}
             nodes = _heaviest(named, goal)
-            if nodes is not None and len(nodes) <= min(MOST_NODES, len(left) // 2):
+            if nodes is not None and len(nodes) <= MOST_NODES:
                 made = (Int8Node(e.node, e.op, e.module) for e in nodes)
-                self.nodes |= dict.fromkeys(made)
+                self._add(dict.fromkeys(made), {})
                 continue
-            # spread over many nodes: whole modules, but not all of them
-            inside = dict.fromkeys((cost.module for cost in left), 0.0)
+            # spread over many nodes: whole modules
+            inside = dict.fromkeys((cost.module for cost in left if cost.module), 0.0)
             for cost, own in power.items():
-                inside[cost.module] += own
-            modules = _heaviest({m: p for m, p in inside.items() if m}, goal)
-            if modules is not None and len(modules) < len(inside):
-                self.modules |= dict.fromkeys(modules)
+                if cost.module:
+                    inside[cost.module] += own
+            self._add({}, dict.fromkeys(_heaviest(inside, goal) or ()))
         return len(self.nodes) + len(self.modules) > before
+
+    def _add(self, nodes: dict[Int8Node, None], modules: dict[str, None]) -> None:
+        """Keep these float too, unless most of the graph would be float then."""
+        before = self.nodes, self.modules
+        self.nodes, self.modules = self.nodes | nodes, self.modules | modules
+        if sum(map(self._is_float, self.costs)) > MOST_FLOAT * len(self.costs):
+            self.nodes, self.modules = before
 
     def _is_float(self, cost: NodeCost) -> bool:
         node = Int8Node(cost.node, cost.op, cost.module)

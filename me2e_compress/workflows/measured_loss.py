@@ -133,7 +133,7 @@ class MeasuredLoss:
             *(f"many nodes of module {name}" for name in remedy.modules),
         ]
         if not blamed:
-            yield f"no single node or module is to blame ({runs})"
+            yield f"no few nodes or modules are to blame ({runs})"
             return
         yield f"lost at {'; '.join(blamed)}"
         # show the overrides with what they achieve

@@ -84,6 +84,15 @@ def test_noise_that_is_everywhere_is_never_cured_by_giving_up_int8() -> None:
     assert remedy.trials == 0
 
 
+def test_most_of_the_graph_is_never_kept_float() -> None:
+    spread = {at: 0.2 for at in range(48)}
+
+    remedy = search(spread)
+
+    assert not remedy.modules
+    assert remedy.trials == 0
+
+
 def test_an_estimate_that_is_too_low_is_mended_by_what_a_variant_shows() -> None:
     remedy = search({37: 0.9, 3: 0.5}, told={37: 0.9, 3: 0.05})
 
