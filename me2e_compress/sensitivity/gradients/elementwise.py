@@ -118,9 +118,8 @@ def _spread(t: Tape, node: ir.Node, g: ir.Value) -> tuple[ir.Value, list[int], i
     if axes is None and input_at(node, 1) is not None:
         raise NoRuleError("its axes are not constant")
     if not axes:
-        axes = (
-            [] if node.attributes.get_int("noop_with_empty_axes", 0) else range(len(x))
-        )
+        idle = node.attributes.get_int("noop_with_empty_axes", 0)
+        axes = [] if idle else [*range(len(x))]
     gone = {at % len(x) for at in axes}
     kept = [1 if at in gone else size for at, size in enumerate(x)]
     return t.shaped(g, kept), kept, math.prod(x[at] for at in gone)

@@ -12,6 +12,7 @@ from me2e_compress.graph.nodes import (
     permutation_of,
 )
 from me2e_compress.sensitivity.gradients.tape import (
+    Attributes,
     Found,
     NoRuleError,
     Rule,
@@ -93,7 +94,7 @@ def _in_place(
     column = t.shaped(places, [-1] + [1] * (len(shape) - axis - 1))
     wide = t.op("Expand", [column, t.ints(shape)])
     zeros = t.zeros([*shape[:axis], size, *shape[axis + 1 :]], x)
-    options = {"axis": axis, "reduction": "add"}
+    options: Attributes = {"axis": axis, "reduction": "add"}
     return t.op("ScatterElements", [zeros, wide, g], options)
 
 
@@ -109,7 +110,7 @@ def _gather(t: Tape, node: ir.Node, g: ir.Value) -> Found:
 
 def _gather_elements(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     x, axis = given(node.inputs[0]), node.attributes.get_int("axis", 0)
-    options = {"axis": axis, "reduction": "add"}
+    options: Attributes = {"axis": axis, "reduction": "add"}
     return [
         t.op("ScatterElements", [t.zeros(sizes_of(x), x), node.inputs[1], g], options)
     ]
@@ -150,7 +151,7 @@ def _scatter_elements(t: Tape, node: ir.Node, g: ir.Value) -> Found:
 
 def _top_k(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     x, axis = given(node.inputs[0]), node.attributes.get_int("axis", -1)
-    options = {"axis": axis, "reduction": "add"}
+    options: Attributes = {"axis": axis, "reduction": "add"}
     return [
         t.op("ScatterElements", [t.zeros(sizes_of(x), x), node.outputs[1], g], options)
     ]

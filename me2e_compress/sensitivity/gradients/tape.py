@@ -44,10 +44,10 @@ class Tape:
     ) -> ir.Value:
         """Append a node and return its last output."""
         node = ir.node(op_type, inputs, attributes, num_outputs=outputs)
-        for value in node.outputs:
-            value.name = self._name(op_type)
+        for made in node.outputs:
+            made.name = self._name(op_type)
         for value in inputs:
-            if value in self._before:
+            if value is not None and value in self._before:
                 self._before.remove(value)
                 self.held += math.prod(static_shape(value) or ()) * 4
         self.graph.append(node)
@@ -114,11 +114,6 @@ class Tape:
             if at < lead or (want[at - lead] == 1 and size != 1)
         ]
         return self.shaped(self.total(g, axes, keep=False), want)
-
-
-Rule: TypeAlias = Callable[[Tape, ir.Node, ir.Value], Found]
-RULES: dict[str, Rule] = {}
-"""Rules by operator; they get the gradient of the first output."""
 
 
 Rule: TypeAlias = Callable[[Tape, ir.Node, ir.Value], Found]
