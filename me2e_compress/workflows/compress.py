@@ -255,17 +255,14 @@ class Compression:
         `passes` come from :meth:`CompressOptions.passes`.
         """
         start, options, listener = cpu_seconds(), self.options, self.listener
-        source, model = loaded.path, loaded.model
-        seen = frames.calibration or frames.samples
-        count, provider = options.verify_frames or 1, options.provider
+        source, model, provider = loaded.path, loaded.model, options.provider
+        seen, count = frames.calibration or frames.samples, options.verify_frames or 1
         first = partial(try_first, listener=listener, count=count, provider=provider)
         answers = first(model, source.name, seen, file=loaded.file)
         # apply the passes, and refuse a result that is unproven or not int8
-        context = Context(modules, frames.calibration, options.seed, options.provider)
-        checked, samples = options.verify_frames, frames.samples
-        manager = PassManager(
-            passes, checked, self.reproducers, samples, first, answers
-        )
+        context = Context(modules, frames.calibration, options.seed, provider)
+        checked, folder = options.verify_frames, self.reproducers
+        manager = PassManager(passes, checked, folder, frames.samples, first, answers)
         report = manager.run(model, context, partial(listener.on_progress, "passes"))
         _refuse_unproven(report, options)
         int8 = Int8Outcome.of(report, context)
