@@ -68,7 +68,7 @@ def _sacrifices(found: Sensitivity) -> list[_Sacrifice]:
     order = []
     for each in found.findings:
         name, own = each.module, each.score.loss
-        order += [_Sacrifice(name, group, loss) for group, loss in each.blamed]
+        order += [_Sacrifice(name, (node,), loss) for node, loss in each.blamed]
         order.append(_Sacrifice(name, None, own))
     return order
 

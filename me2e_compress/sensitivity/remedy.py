@@ -1,27 +1,32 @@
 """Find the nodes or modules that restore quality when kept in float."""
 
 import dataclasses
-from collections import Counter
-from collections.abc import Callable, Collection, Sequence
-from functools import partial
-from itertools import islice
-from typing import TypeAlias
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import TypeAlias, TypeVar
 
-import onnx_ir as ir
-
-from me2e_compress.fidelity.compare import Fidelity, Reference
+from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.floor import Floor, Shortfall
-from me2e_compress.quantization.plan import FLOAT, RESIDUAL, QuantPlan
+from me2e_compress.quantization.plan import FLOAT
 from me2e_compress.quantization.plan.overrides import (
     Override,
     keep_float,
     overrides_text,
 )
-from me2e_compress.runtime.session import Session
-from me2e_compress.sensitivity.analysis import bisect
+from me2e_compress.sensitivity.estimate import NodeCost
 
-MOST_TRIALS = 12
-"""Variants built and run in one search: one node among a thousand, confirmed."""
+Key = TypeVar("Key")
+
+MOST_TRIALS = 3
+"""Variants built and run in one search: the estimate mostly needs one."""
+
+MOST_NODES = 8
+"""Nodes that are named one by one; where it takes more, their modules are."""
+
+MOST_FLOAT = 0.5
+"""Part of the int8 nodes that may be kept float: more is no remedy of int8."""
+
+MARGIN = 0.9
+"""What is aimed at, of the noise that the floor allows: an estimate is not exact."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,9 +50,10 @@ class Remedy:
     """What is kept in float to stay true to the float model, and the fidelity then.
 
     Attributes:
-        nodes: noisy alone; in the order in which they were found.
+        nodes: those that explain the noise; in the order in which they were found.
         modules: kept whole; the noise is spread over their nodes.
         shortfalls: that are left; empty if these cure everything.
+        trials: variants that were built and run.
     """
 
     nodes: tuple[Int8Node, ...]
@@ -63,152 +69,122 @@ class Remedy:
 
     def overrides(self) -> str:
         """Return what ``--overrides`` takes; empty if nothing was found."""
-        return overrides_text(
-            (
-                *(keep_float(each.name, "") for each in self.nodes),
-                *(Override(dtype=FLOAT, module=each) for each in self.modules),
-            )
-        )
+        return overrides_text(overrides_of(self.nodes, self.modules))
 
 
-Measure: TypeAlias = Callable[[Sequence[Int8Node]], Fidelity]
-"""Builds the variant in which some nodes are float, and compares it."""
-
-Build: TypeAlias = Callable[[Sequence[Override]], ir.Model]
-"""Builds the int8 graph again, with overrides behind those that it was built with."""
-
-
-def int8_nodes(plan: QuantPlan) -> tuple[Int8Node, ...]:
-    """List the nodes that a plan makes int8, in graph order.
-
-    Residual Adds are left out, since they follow their convolution, and so are nodes
-    without a unique name.
-    """
-    chosen = [each for each in plan.placed if each.rule != RESIDUAL and each.node]
-    often = Counter(each.node for each in chosen)
-    return tuple(
-        Int8Node(each.node, each.op, each.module)
-        for each in chosen
-        if often[each.node] == 1
+def overrides_of(
+    nodes: Iterable[Int8Node], modules: Iterable[str]
+) -> tuple[Override, ...]:
+    """Return the overrides that keep nodes and whole modules in float."""
+    return (
+        *(keep_float(each.name, "") for each in nodes),
+        *(Override(dtype=FLOAT, module=each) for each in modules),
     )
 
 
-def find_remedy(
-    plan: QuantPlan,
-    made: ir.Model,
-    build: Build,
-    reference: Reference,
-    floor: Floor,
-    *,
-    unsteady: Collection[str] = (),
-    progress: Callable[[int, int, str], None] = lambda done, most, what: None,
-) -> Remedy:
-    """Search what must be float in a graph that was made by a plan, on few frames.
-
-    The first frame alone is compared if it shows the loss.
-    """
-
-    def compare(model: ir.Model) -> Fidelity:
-        provider = reference.session.provider
-        return used.compare(Session(model, release=True, provider=provider))
-
-    first = tuple(islice(reference.frames, 1))
-    used = Reference(reference.session, first, reference.answers[:1])
-    start = compare(made)
-    if not floor.shortfalls(start, unsteady):
-        used = reference
-        start = compare(made)
-    search = RemedySearch(
-        int8_nodes(plan),
-        lambda floats: compare(build([keep_float(each.name, "") for each in floats])),
-        floor,
-        unsteady,
-        progress=progress,
-    )
-    return search.run(start)
+Measure: TypeAlias = Callable[[Sequence[Override]], Fidelity]
+"""Builds the int8 graph again with these overrides too, and compares it."""
 
 
 @dataclasses.dataclass
 class RemedySearch:
     """A search of the nodes that must be float for every output to be above the floor.
 
-    The noise of the worst output is followed by bisection: half of the nodes is int8 at
-    a time, one trial a step; the other half makes what is left of the noise, as a sum
-    of squares. A node that alone makes half of the noise's amplitude is kept float; if
-    there is no such node, the module from which most of the noise comes is. Then the
-    whole is measured again, and the next one is looked for.
+    Noise adds up as squares. The nodes that are estimated to make most of the noise of
+    an output are kept float until what is left would be allowed; where that takes too
+    many, modules are. A variant is built, and what it shows is the start of the next.
 
-    ``nodes`` are the int8 ones in graph order; ``unsteady`` outputs are not judged;
-    ``progress`` is called as ``progress(trials done, most trials, words)``; ``done``
-    counts trials, ``alone`` and ``modules`` are kept float so far.
+    ``costs`` are of all int8 nodes, for the outputs that are ``told``; what they do not
+    explain of the measured noise is shared by the nodes without an estimate.
+    ``unsteady`` outputs are not judged.
     """
 
-    nodes: Sequence[Int8Node]
+    costs: Sequence[NodeCost]
+    told: Collection[str]
     measure: Measure
     floor: Floor
     unsteady: Collection[str] = ()
-    most_trials: int = MOST_TRIALS
     progress: Callable[[int, int, str], None] = lambda done, most, what: None
-    done: int = 0
-    alone: list[Int8Node] = dataclasses.field(default_factory=list)
-    modules: list[str] = dataclasses.field(default_factory=list)
+    nodes: dict[Int8Node, None] = dataclasses.field(default_factory=dict)
+    modules: dict[str, None] = dataclasses.field(default_factory=dict)
 
     def run(self, start: Fidelity) -> Remedy:
-        """Follow the worst output until none is below the floor, or trials run out.
+        """Keep nodes float until no output is below the floor, or nothing helps.
 
         ``start`` is the fidelity with all nodes in int8.
         """
-        found = start
+        found, done = start, 0
         while below := self.floor.shortfalls(found, self.unsteady):
-            # A step of the bisection, and the trial that confirms it.
-            if not self._has_left(2) or not self._keep(below[0]):
+            if done == MOST_TRIALS or not self._keep(found, below):
                 break
-            found = self._try(self._floats())
-        nodes = [each for each in self.alone if each.module not in self.modules]
-        return Remedy(tuple(nodes), tuple(self.modules), found, below, self.done)
+            self.progress(done, MOST_TRIALS, "")
+            found, done = self.measure(overrides_of(self.nodes, self.modules)), done + 1
+        nodes = tuple(each for each in self.nodes if each.module not in self.modules)
+        return Remedy(nodes, tuple(self.modules), found, below, done)
 
-    def _keep(self, worst: Shortfall) -> bool:
-        """Keep more nodes float; False if nothing is left that would help."""
-        left = [each for each in self.nodes if each not in self._floats()]
-        group = self._narrow(left, worst)
-        if len(group) == 1:
-            self.alone += group
-            return True
-        modules = Counter(each.module for each in group if each.module)
-        inside = {each.module for each in left}
-        if not modules or len(inside) == 1:
-            return False  # all that is left would be float
-        self.modules.append(modules.most_common(1)[0][0])
-        return True
+    def _keep(self, found: Fidelity, below: Sequence[Shortfall]) -> bool:
+        """Keep more nodes float for each output; False if none can help."""
+        left = [each for each in self.costs if not self._is_float(each)]
+        before = len(self.nodes) + len(self.modules)
+        for each in below:
+            if each.output not in self.told:
+                continue
+            power = _powers(left, found, each.output)
+            goal = sum(power.values()) * (1 - (MARGIN / each.excess) ** 2)
+            named = {cost: own for cost, own in power.items() if self._is_named(cost)}
+            nodes = _heaviest(named, goal)
+            if nodes is not None and len(nodes) <= MOST_NODES:
+                made = (Int8Node(e.node, e.op, e.module) for e in nodes)
+                self._add(dict.fromkeys(made), {})
+                continue
+            # spread over many nodes: whole modules
+            inside = dict.fromkeys((cost.module for cost in left if cost.module), 0.0)
+            for cost, own in power.items():
+                if cost.module:
+                    inside[cost.module] += own
+            self._add({}, dict.fromkeys(_heaviest(inside, goal) or ()))
+        return len(self.nodes) + len(self.modules) > before
 
-    def _narrow(
-        self, group: Sequence[Int8Node], worst: Shortfall
-    ) -> Sequence[Int8Node]:
-        """Narrow a group down for as long as one half makes most of the noise."""
+    def _add(self, nodes: dict[Int8Node, None], modules: dict[str, None]) -> None:
+        """Keep these float too, unless most of the graph would be float then."""
+        before = self.nodes, self.modules
+        self.nodes, self.modules = self.nodes | nodes, self.modules | modules
+        if sum(map(self._is_float, self.costs)) > MOST_FLOAT * len(self.costs):
+            self.nodes, self.modules = before
 
-        def louder(
-            halves: tuple[Sequence[Int8Node], Sequence[Int8Node]], noise: float
-        ) -> list[tuple[Sequence[Int8Node], float]]:
-            first, second = halves
-            found = self._try([e for e in self.nodes if e not in first])
-            one = self.floor.excess(found, worst.output)
-            other = max(noise**2 - one**2, 0.0) ** 0.5
-            return [(first, one) if one >= other else (second, other)]
+    def _is_float(self, cost: NodeCost) -> bool:
+        node = Int8Node(cost.node, cost.op, cost.module)
+        return node in self.nodes or cost.module in self.modules
 
-        may_go_on = partial(self._has_left, 2)
-        return next(bisect(group, worst.excess, louder, may_go_on)).items
+    def _is_named(self, cost: NodeCost) -> bool:
+        """Return whether an override can name this node and no other."""
+        return [each.node for each in self.costs].count(cost.node) == 1
 
-    def _has_left(self, trials: int) -> bool:
-        return self.done + trials <= self.most_trials
 
-    def _floats(self) -> list[Int8Node]:
-        return [
-            each
-            for each in self.nodes
-            if each in self.alone or each.module in self.modules
-        ]
+def _powers(
+    costs: Sequence[NodeCost], found: Fidelity, output: str
+) -> dict[NodeCost, float]:
+    """Return the noise power of each node at an output, relative to its signal.
 
-    def _try(self, floats: Sequence[Int8Node]) -> Fidelity:
-        self.progress(self.done, self.most_trials, "")
-        self.done += 1
-        return self.measure(floats)
+    Nodes without an estimate share what the others leave of the measured power.
+    """
+    known = {
+        cost: cost.noise[output] ** 2
+        for cost in costs
+        if cost.noise is not None and output in cost.noise
+    }
+    unknown = [cost for cost in costs if cost not in known]
+    (sqnr,) = (each.sqnr_db for each in found.outputs if each.name == output)
+    rest = max(10 ** (-sqnr / 10) - sum(known.values()), 0.0)
+    return known | dict.fromkeys(unknown, rest / max(len(unknown), 1))
+
+
+def _heaviest(power: Mapping[Key, float], goal: float) -> list[Key] | None:
+    """Return the fewest keys whose power adds up to a goal; None if all do not."""
+    chosen, total = list[Key](), 0.0
+    for key in sorted(power, key=lambda each: -power[each]):
+        if total >= goal:
+            break
+        chosen.append(key)
+        total += power[key]
+    return chosen if total >= goal else None

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from time import process_time
 from typing import TypeAlias
 
 from me2e_compress import graph
@@ -20,6 +19,7 @@ from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RuleSet
+from me2e_compress.runtime.children import cpu_seconds
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.calibrate_result import beside_ranges
 from me2e_compress.workflows.checks import (
@@ -71,6 +71,7 @@ class CompressOptions:
             passes on; 0 measures nothing and calibrates on all.
         floor: SQNR in dB below which an output is warned of.
         alive: share of an output's movement below which it is dead; 0 does not ask.
+        no_remedy: do not search the nodes that put an output below the floor.
         allow_empty: write the graph although nothing in it became int8.
         smaller: add no weights to remove nodes: fewer bytes instead of fewer nodes.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
@@ -93,6 +94,7 @@ class CompressOptions:
     measure_frames: int = 8
     floor: float = SQNR_FLOOR_DB
     alive: float = ALIVE
+    no_remedy: bool = False
     allow_empty: bool = False
     smaller: bool = False
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -251,17 +253,16 @@ class Compression:
         frames: SplitFrames,
     ) -> CompressResult:
         """Try, compress, measure and write; errors are those of :func:`compress`."""
-        start, options, listener = process_time(), self.options, self.listener
-        source, model = loaded.path, loaded.model
-        seen = frames.calibration or frames.samples
-        count, provider = options.verify_frames or 1, options.provider
+        start, options, listener = cpu_seconds(), self.options, self.listener
+        source, model, provider = loaded.path, loaded.model, options.provider
+        seen, count = frames.calibration or frames.samples, options.verify_frames or 1
         first = partial(try_first, listener=listener, count=count, provider=provider)
         answers = first(model, source.name, seen, file=loaded.file)
         # apply the passes, and refuse a result that is unproven or not int8
-        context = Context(modules, frames.calibration, options.seed, options.provider)
-        checked, samples = options.verify_frames, frames.samples
-        work = PassManager(passes, checked, self.reproducers, samples, first, answers)
-        report = work.run(model, context, partial(listener.on_progress, "passes"))
+        context = Context(modules, frames.calibration, options.seed, provider)
+        checked, folder = options.verify_frames, self.reproducers
+        manager = PassManager(passes, checked, folder, frames.samples, first, answers)
+        report = manager.run(model, context, partial(listener.on_progress, "passes"))
         _refuse_unproven(report, options)
         int8 = Int8Outcome.of(report, context)
         _refuse_empty(int8, options, listener)
@@ -269,9 +270,10 @@ class Compression:
         if report.lossy and frames.measured is not None:
             first(report.model, self.output.name)
         floor = Floor(options.floor, alive=options.alive)
-        loss = measure_loss(report, context, frames, floor, listener)
+        search = not options.no_remedy
+        loss = measure_loss(report, context, frames, floor, listener, search)
         linted = lint_written(report.model, passes, self.output, options.target)
-        seconds = process_time() - start
+        seconds = cpu_seconds() - start
         return write_result(report, loaded, self.output, int8, loss, seconds, linted)
 
 

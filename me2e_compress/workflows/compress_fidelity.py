@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import process_time
 
 import onnx_ir as ir
 
@@ -22,12 +21,16 @@ from me2e_compress.graph import LoadedModel
 from me2e_compress.manager import Report
 from me2e_compress.manager.report import LossyPass
 from me2e_compress.passes import Context, Pass
-from me2e_compress.quantization.plan import plan_of
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.plan import QuantPlan, plan_of
 from me2e_compress.quantization.plan.overrides import Override, overrides_text
+from me2e_compress.runtime.children import cpu_seconds
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
-from me2e_compress.sensitivity.remedy import find_remedy
+from me2e_compress.sensitivity.estimate import estimate
+from me2e_compress.sensitivity.remedy import MOST_TRIALS, RemedySearch
+from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.workflows.measured_loss import NOT_ASKED, MeasuredLoss
 from me2e_compress.zoo.shipped import sample_frames
@@ -91,20 +94,23 @@ def measure_loss(
     frames: SplitFrames,
     floor: Floor,
     listener: Listener,
+    search: bool = True,
 ) -> MeasuredLoss | None:
     """Compare the graph with that before the first lossy pass; None if all are exact.
 
     Below the floor, the outputs that choose between near-equal candidates are set
-    aside, and the nodes of the int8 plan are searched for the cause of the loss.
+    aside, and, with ``search``, the nodes of the int8 plan that cause the loss found.
     """
     if not report.lossy:
         return None
     if frames.measured is None:
         return MeasuredLoss(None, frames.kind, floor)
-    start = process_time()
+    start = cpu_seconds()
     listener.on_progress("fidelity", 0, 1, "")
     # a graph that does not run or compare is a finding, not a failure
-    measurement = _Measurement(report, context, frames.measured, floor, listener)
+    measurement = _Measurement(
+        report, context, frames.measured, floor, listener, search
+    )
     found = MeasuredLoss(None, frames.kind, floor)
     try:
         found = measurement.judge(found)
@@ -112,7 +118,7 @@ def measure_loss(
         found = dataclasses.replace(found, on=str(error))
     except EvaluationError as error:  # not finite, or of another shape
         found = dataclasses.replace(found, on=str(error), incomparable=True)
-    return dataclasses.replace(found, seconds=process_time() - start)
+    return dataclasses.replace(found, seconds=cpu_seconds() - start)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,6 +128,7 @@ class _Measurement:
     frames: Frames
     floor: Floor
     listener: Listener
+    search: bool
 
     def judge(self, found: MeasuredLoss) -> MeasuredLoss:
         """Measure; below the floor, find out which outputs, passes and nodes."""
@@ -162,6 +169,8 @@ class _Measurement:
         quantizer = next((each for each in lossy if each.applied.quantizes), None)
         if quantizer is None:
             return dataclasses.replace(found, guilty=names)
+        assert found.fidelity is not None
+        added = found.fidelity
         if quantizer is not lossy[0]:  # it is judged by what it adds to the others
             reference = self._reference(quantizer)
             added = self._compare(reference)
@@ -169,25 +178,55 @@ class _Measurement:
                 others = tuple(each for each in names if each != quantizer.applied.name)
                 return dataclasses.replace(found, guilty=others)
         guilty = dataclasses.replace(found, guilty=(quantizer.applied.name,))
-        # only a plan with overrides can be varied node by node
-        plan = plan_of(self.report.model)
-        if plan is None or "overrides" not in quantizer.applied.option_names():
+        applied, plan = quantizer.applied, plan_of(self.report.model)
+        # only what the toolkit's own pass decides can be varied node by node
+        if not self.search or plan is None or not isinstance(applied, QuantizeInt8):
             return guilty
-        build = partial(self._with_overrides, quantizer)
-        progress = partial(self.listener.on_progress, "search")
+        begun = cpu_seconds()
         try:
-            remedy = find_remedy(
-                plan,
-                self.report.model,
-                build,
-                reference,
-                self.floor,
-                unsteady=found.unsteady,
-                progress=progress,
-            )
+            search = self._search(quantizer, applied, plan, reference, guilty)
+            remedy = search.run(added)
         except Me2eError:  # a variant that cannot be made or compared ends the search
-            return guilty
-        return dataclasses.replace(guilty, remedy=remedy)
+            remedy = None
+        seconds = cpu_seconds() - begun
+        return dataclasses.replace(guilty, remedy=remedy, search_seconds=seconds)
+
+    def _search(
+        self,
+        quantizer: LossyPass,
+        applied: QuantizeInt8,
+        plan: QuantPlan,
+        reference: Reference,
+        found: MeasuredLoss,
+    ) -> RemedySearch:
+        """Estimate what each int8 node costs the outputs that are below the floor."""
+        before, target = quantizer.before, TARGETS.parse(applied.target)
+        ranges = self.context.ranges(
+            applied.name,
+            before,
+            target.tensors(plan, before),
+            method=applied.method,
+            saved=applied.ranges,
+        )
+        progress = partial(self.listener.on_progress, "search")
+        progress(0, MOST_TRIALS, "the nodes that lose it (--no-remedy: none)")
+        # as many outputs as frames, so that it takes three inferences a frame
+        low = [each.output for each in found.shortfalls][: len(reference.frames)]
+        costs = estimate(
+            before,
+            plan,
+            target.grids(plan, before, ranges),
+            reference.frames,
+            outputs=low,
+            seed=self.context.seed,
+            provider=self.context.provider,
+        )
+
+        def measure(more: Sequence[Override]) -> Fidelity:
+            varied = self._with_overrides(quantizer, more)
+            return reference.compare(self._session(varied))
+
+        return RemedySearch(costs, low, measure, self.floor, found.unsteady, progress)
 
     def _with_overrides(
         self, quantizer: LossyPass, more: Sequence[Override]

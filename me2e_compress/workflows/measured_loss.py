@@ -34,6 +34,7 @@ class MeasuredLoss:
             another pass is guilty, or the one that quantizes takes no overrides.
         liveness: which outputs still answer their inputs; None if not asked.
         seconds: CPU time of measuring and searching.
+        search_seconds: CPU time of the search for a remedy.
     """
 
     fidelity: Fidelity | None
@@ -46,6 +47,7 @@ class MeasuredLoss:
     guilty: tuple[str, ...] = ()
     remedy: Remedy | None = None
     seconds: float = 0.0
+    search_seconds: float = 0.0
     incomparable: bool = False
 
     def lines(self) -> Iterator[str]:
@@ -108,7 +110,7 @@ class MeasuredLoss:
     def record(self) -> dict[str, object]:
         """Return what the report says of it: all but the time."""
         names = [each.name for each in dataclasses.fields(self)]
-        names.remove("seconds")
+        names = [each for each in names if each not in ("seconds", "search_seconds")]
         said = {name: getattr(self, name) for name in names}
         if self.remedy is not None:
             overrides = {"overrides": self.remedy.overrides()}
@@ -164,7 +166,7 @@ class MeasuredLoss:
             *(f"many nodes of module {name}" for name in remedy.modules),
         ]
         if not blamed:
-            yield f"no single node or module is to blame ({runs})"
+            yield f"no few nodes or modules are to blame ({runs})"
             return
         yield f"lost at {'; '.join(blamed)}"
         # show the overrides with what they achieve

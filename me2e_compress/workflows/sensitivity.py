@@ -37,6 +37,9 @@ from me2e_compress.workflows.result import (
     table,
 )
 
+SHOWN = 10
+"""Nodes in the table."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SensitivityOptions(TrialOptions):
@@ -49,14 +52,14 @@ class SensitivityOptions(TrialOptions):
             ``ID,ID`` or a file.
         drive_limit: most points of driving score that the recipe may lose.
         workers: routes at a time.
-        node_trials: most trials on the nodes of a module; 0 leaves nodes out.
+        node_trials: most nodes of a module that are tried alone; 0 leaves nodes out.
     """
 
     limit: float = 0.1
     drive: str | None = None
     drive_limit: float | None = None
     workers: int = 1
-    node_trials: int = 24
+    node_trials: int = 4
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -92,13 +95,11 @@ class SensitivityResult(Result):
     def lines(self) -> tuple[str, ...]:
         """Return the nodes to blame, the recipe and its loss."""
         unit = self.found.together.unit
-        blamed = []
-        for each in self.found.findings:
-            for (first, *rest), alone in each.blamed:
-                more = f" and {len(rest)} more" if rest else ""
-                blamed.append(
-                    f"{each.module}: {first}{more}: {significant(alone)} {unit} alone"
-                )
+        blamed = [
+            f"{each.module}: {node}: {significant(alone)} {unit} alone"
+            for each in self.found.findings
+            for node, alone in each.blamed
+        ]
         cost = []
         if self.score is not None:
             loss = f"{significant(self.score.loss)} {self.score.unit}"
@@ -109,7 +110,38 @@ class SensitivityResult(Result):
         return *blamed, self.written, *cost
 
     def tables(self) -> tuple[Table, ...]:
-        """Return what int8 costs module by module."""
+        """Return what int8 costs module by module, and at most of its nodes."""
+        return tuple(filter(None, [self._modules(), self._nodes()]))
+
+    def _nodes(self) -> Table | None:
+        """Return the nodes that are estimated to cost most."""
+        output, nodes = self.found.together.output, self.found.nodes
+        known = [(each, each.noise) for each in nodes if each.noise]
+        if not known:
+            return None
+        known.sort(key=lambda each: -each[1].get(output, 0.0))
+        rows = []
+        for cost, noise in known[:SHOWN]:
+            worst = max(noise, key=lambda name: noise[name])
+            own = noise.get(output)
+            rows.append(
+                (
+                    cost.node or cost.output,
+                    cost.module,
+                    "" if own is None else significant(own),
+                    f"{worst} {significant(noise[worst])}",
+                )
+            )
+        # say of how many nothing is known, and why
+        note = f"{counted(len(nodes), 'node')}; choices between candidates are left out"
+        missing = [each.reason for each in nodes if each.noise is None]
+        if missing:
+            note += f"\n{len(missing)} not estimated, the first since: {missing[0]}"
+        columns = ("node", "module", f"noise of {output}", "noisiest output")
+        title = "Int8 node by node, as estimated: noise relative to the signal"
+        return table(title, columns, rows, note)
+
+    def _modules(self) -> Table:
         found, driven = self.found, self.found.float_driving is not None
         rows = [
             (each.module, str(each.nodes), *_cells(each.score, each.driving))
@@ -124,13 +156,11 @@ class SensitivityResult(Result):
         columns = ("module", "nodes", f"loss {found.together.unit}", "worst dB", "DS")
         width = len(columns) if driven else len(columns) - 1
         size = megabytes(found.together.weight_bytes)
-        return (
-            table(
-                "Int8 module by module",
-                columns[:width],
-                [row[:width] for row in rows],
-                f"{counted(found.trials, 'variant')} run; all together {size} MB",
-            ),
+        return table(
+            "Int8 module by module",
+            columns[:width],
+            [row[:width] for row in rows],
+            f"{counted(found.trials, 'variant')} run; all together {size} MB",
         )
 
     def records(self) -> list[dict[str, object]]:

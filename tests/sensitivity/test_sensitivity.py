@@ -28,6 +28,7 @@ from me2e_compress.sensitivity import (
     write_recipe,
 )
 from me2e_compress.sensitivity.analysis import names_of
+from me2e_compress.sensitivity.estimate import NodeCost
 from me2e_compress.sensitivity.search import nothing_fits
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.search import SearchResult
@@ -95,23 +96,27 @@ def trials(tmp_path: Path, bad: int) -> Trials:
 
 
 @pytest.mark.parametrize("bad", [2, 3, 5])
-def test_the_guilty_node_is_found_by_bisection(tmp_path: Path, bad: int) -> None:
+def test_the_guilty_node_is_estimated_and_measured(tmp_path: Path, bad: int) -> None:
     found = analyse(trials(tmp_path, bad), ("backbone", "head"))
 
     worst = found.findings[0]
     assert worst.module == "head"
     assert worst.nodes == 4
-    assert [group for group, _ in worst.blamed] == [(f"/head/MatMul_{bad}",)]
+    assert [node for node, _ in worst.blamed] == [f"/head/MatMul_{bad}"]
+    assert found.trials <= 2 + 1 + (1 + 2)
+    costs = {each.node: each.noise for each in found.nodes if each.noise}
+    assert len(costs) == LAYERS
+    assert max(costs, key=lambda name: costs[name]["plan"]) == f"/head/MatMul_{bad}"
     assert worst.score.loss > 5 * found.findings[1].score.loss
     assert worst.score.unit == "m"
 
 
-def test_a_module_without_a_culprit_blames_nobody(tmp_path: Path) -> None:
-    found = analyse(trials(tmp_path, bad=99), ("backbone", "head"), node_trials=2)
+def test_nodes_that_cost_alike_are_tried_up_to_the_limit(tmp_path: Path) -> None:
+    found = analyse(trials(tmp_path, bad=99), ("backbone", "head"), node_trials=1)
 
     assert {each.module for each in found.findings} == {"backbone", "head"}
-    for each in found.findings:
-        assert all(len(group) < each.nodes for group, _ in each.blamed)
+    assert found.trials <= 2 + 1 + 2
+    assert all(len(each.blamed) <= 1 for each in found.findings)
 
 
 def test_node_trials_are_kept_and_no_choice_runs_twice(tmp_path: Path) -> None:
@@ -120,6 +125,7 @@ def test_node_trials_are_kept_and_no_choice_runs_twice(tmp_path: Path) -> None:
 
     assert found.trials == 3
     assert not any(each.blamed for each in found.findings)
+    assert not found.nodes
     analyse(judge, ("backbone", "head"), node_trials=0)
     assert judge.done == 3
 
@@ -149,9 +155,16 @@ def invented(judge: Trials, cost: dict[str, float], *, joint: bool = False) -> T
         ]
         loss = max(costs, default=0.0) if joint else sum(costs)
         plan = Displacement(mean_m=loss, max_m=loss)
-        return Score(Fidelity((), (), plan, "", 1), 0)
+        return Score(Fidelity((), (), plan, "", 1, "plan"), 0)
+
+    def costs(choice: Int8Choice) -> tuple[NodeCost, ...]:
+        return tuple(
+            NodeCost(name, name, "MatMul", name.split("/")[1], {"plan": loss})
+            for name, loss in cost.items()
+        )
 
     judge.score = score  # type: ignore[method-assign]
+    judge.costs = costs  # type: ignore[method-assign]
     return judge
 
 
@@ -171,10 +184,8 @@ def test_one_culprit_after_the_other_is_given_up(tmp_path: Path) -> None:
 def test_what_fits_in_spite_of_its_blame_is_taken_back(tmp_path: Path) -> None:
     judge = invented(trials(tmp_path, 99), COSTS, joint=True)
     found = analyse(judge, ("backbone", "head"))
-    assert [group for group, _ in found.findings[0].blamed] == [
-        ("/head/MatMul_2",),
-        ("/head/MatMul_4",),
-    ]
+    blamed = [node for node, _ in found.findings[0].blamed]
+    assert blamed == ["/head/MatMul_2", "/head/MatMul_4"]
 
     # 4 was in vain, 2 alone is too much
     choice = advise(judge, dataclasses.replace(found, findings=found.findings[::-1]), 3)
@@ -219,7 +230,7 @@ def driven(judge: Trials, drive: Drive) -> Trials:
     )  # fmt: skip
 
 
-def test_modules_are_driven_once_and_halves_of_them_are_not(tmp_path: Path) -> None:
+def test_modules_are_driven_once_and_nodes_of_them_are_not(tmp_path: Path) -> None:
     seen: list[Int8Choice] = []
 
     def drive(choice: Int8Choice, made: ir.Model) -> float:

@@ -102,6 +102,19 @@ def test_lost_quality_is_found_named_and_given_back(
     assert "below the floor" not in capsys.readouterr().out
 
 
+def test_the_search_says_what_it_takes_and_how_to_leave_it_out(
+    command: Command, cameras: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(*PAPER) == 0
+    assert "to find the nodes to blame: --no-remedy)" in capsys.readouterr().out
+
+    assert command(*PAPER, "--no-remedy") == 0
+    said = capsys.readouterr().out
+    assert "below the floor (20 dB, 0.5 m of plan): bev" in said
+    assert "lost at" not in said
+    assert "--no-remedy" not in said
+
+
 def test_the_report_holds_the_measurement_and_the_remedy(
     cameras: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,7 +21,7 @@ DriveLimit = Annotated[
     float | None, typer.Option(help="with --drive: most points of DS that may be lost")
 ]
 NodeTrials = Annotated[
-    int, typer.Option(min=0, help="most trials on the nodes of a module; 0: none")
+    int, typer.Option(min=0, help="most nodes of a module to try alone; 0: none")
 ]
 
 
@@ -37,7 +37,7 @@ def sensitivity(
     drive_limit: DriveLimit = None,
     adapter: given.Adapter = None,
     workers: given.Workers = 1,
-    node_trials: NodeTrials = 24,
+    node_trials: NodeTrials = 4,
     ranges: given.SavedRanges = None,
     module_map: given.ModuleMap = None,
     set_dim: given.SetDim = None,

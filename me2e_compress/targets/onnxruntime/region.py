@@ -10,6 +10,7 @@ import onnx_ir as ir
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.graph import producer_of
 from me2e_compress.operators import int8_inputs
+from me2e_compress.targets.base import MIDDLE
 from me2e_compress.targets.onnxruntime.kernels import (
     JOINS,
     end_of,
@@ -17,9 +18,6 @@ from me2e_compress.targets.onnxruntime.kernels import (
     is_clip_at_zero,
     is_move,
 )
-
-MIDDLE = 128
-"""uint8 zero point of a signed tensor: int8 value plus 128."""
 
 _UNSIGNED = frozenset({"Abs", "Exp", "HardSigmoid", "Relu", "Sigmoid", "Softmax"})
 

@@ -1,0 +1,172 @@
+"""Estimate what int8 of every node costs every output, by first-order propagation.
+
+The gradient g of an output, weighted by random signs, meets the local error e of each
+int8 node: E (g e)^2 = |J e|^2 is the power of the noise that e makes at the output. The
+errors of different channels are taken to be independent, so that products are summed
+per channel, then squared. One backward pass so tells of all nodes what would take an
+inference for each. Choices (a TopK, comparisons, integers) count as fixed.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Collection, Iterator, Mapping, Sequence
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import rewrite, static_shape
+from me2e_compress.graph.nodes import FLOATS
+from me2e_compress.quantization.plan import RESIDUAL, QuantPlan
+from me2e_compress.runtime.frames import Array, Frame, Frames
+from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.session import Session, replay
+from me2e_compress.sensitivity.error_sources import ErrorSources
+from me2e_compress.sensitivity.gradients import Backward, Tape
+from me2e_compress.targets.base import Grids
+
+MOST_HELD = 1_500_000_000
+"""Bytes of a graph's own tensors that may be kept in memory for its gradients."""
+
+NO_PATH = "no output depends on it but by choices or whole numbers"
+
+_SIGNS, _NOISE, _SIGNAL = (
+    f"me2e_sensitivity_{name}" for name in ("signs", "noise", "signal")
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NodeCost:
+    """What int8 of one node costs, with the residual Add that follows it.
+
+    Attributes:
+        output: name of the node's first output, which is unique.
+        noise: noise amplitude by output, relative to its signal; None if not estimated.
+        reason: why it was not.
+    """
+
+    node: str
+    output: str
+    op: str
+    module: str
+    noise: Mapping[str, float] | None
+    reason: str = ""
+
+
+def estimate(
+    model: ir.Model,
+    plan: QuantPlan,
+    grids: Grids,
+    frames: Frames,
+    *,
+    outputs: Collection[str] | None = None,
+    seed: int = 0,
+    threads: int = 0,
+    provider: Provider = CPU,
+) -> tuple[NodeCost, ...]:
+    """Estimate the cost of each int8 node of a plan for each output, in graph order.
+
+    Each run over a frame tells of one output, they take turns; where there are more
+    outputs, the frames are run again. Outputs of whole numbers or of open size are
+    left out; ``outputs`` None asks for all others.
+    """
+    written = _write(model, plan, grids, outputs)
+    power = np.zeros((len(written.seeds), len(written.readings)))
+    signal = np.zeros(len(written.seeds))
+    if written.readings:
+        session = Session(
+            written.model, threads=threads, frugal=True, provider=provider
+        )
+        fed = written.fed(frames, np.random.default_rng(seed))
+        for at, values in enumerate(replay(session, fed, [_NOISE, _SIGNAL])):
+            turn = at % len(signal)
+            power[turn] += values[_NOISE]
+            signal[turn] += values[_SIGNAL][turn]
+    return tuple(written.costs(plan, power, signal))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Written:
+    """A graph that gives noise power by reading, and signal power by output.
+
+    ``seeds`` are the inputs for random signs, by output; ``readings`` name the layers
+    that readings belong to, by output, ``missing`` those that lack one.
+    """
+
+    model: ir.Model
+    seeds: Mapping[str, ir.Value]
+    readings: Sequence[str]
+    missing: Mapping[str, str]
+
+    def fed(self, frames: Frames, random: np.random.Generator) -> Iterator[Frame]:
+        """Yield frames with random signs for one output in turn, zeros for others."""
+        rounds = -(-len(self.seeds) // len(frames))
+        for at, frame in enumerate(itertools.chain(*[frames] * max(rounds, 1))):
+            if at >= max(len(frames), len(self.seeds)):
+                return
+            arrays: dict[str, Array] = dict(frame.arrays)
+            for turn, value in enumerate(self.seeds.values()):
+                shape, kind = static_shape(value) or (), value.dtype
+                signs = np.zeros(shape, None if kind is None else kind.numpy())
+                if turn == at % len(self.seeds):
+                    signs += random.integers(0, 2, shape) * 2 - 1
+                arrays[str(value.name)] = signs
+            yield dataclasses.replace(frame, arrays=arrays)
+
+    def costs(self, plan: QuantPlan, power: Array, signal: Array) -> Iterator[NodeCost]:
+        """Yield what was found of each int8 node; residual Adds follow another's."""
+        for each in plan.placed:
+            if each.rule == RESIDUAL:
+                continue
+            mine = [at for at, name in enumerate(self.readings) if name == each.output]
+            reason = self.missing.get(each.output, "" if mine else NO_PATH)
+            noise = None
+            if not reason:
+                noise = {
+                    name: float(np.sqrt(power[turn, mine].sum() / signal[turn]))
+                    for turn, name in enumerate(self.seeds)
+                    if signal[turn] > 0
+                }
+            yield NodeCost(each.node, each.output, each.op, each.module, noise, reason)
+
+
+def _write(
+    model: ir.Model, plan: QuantPlan, grids: Grids, outputs: Collection[str] | None
+) -> _Written:
+    # every reading of an activation becomes a value of its own, fused nodes bodies
+    sources = ErrorSources.of(model, plan, grids)
+    main = sources.model.graph
+    reached = sources.reached()
+    ports = [
+        value
+        for value in main.outputs
+        if value in reached and value.dtype in FLOATS
+        and static_shape(value) is not None
+        and (outputs is None or value.name in outputs)
+    ]  # fmt: skip
+    nodes, tape = list(main), Tape(sources.model)
+    signal = [tape.op("ReduceSumSquare", [each], {"keepdims": 0}) for each in ports]
+    # the backward pass; where a gradient is complete it meets the error
+    back, seeds = Backward(tape, reached, MOST_HELD), dict[str, ir.Value]()
+    for value in ports:
+        signs = ir.Value(
+            name=f"{_SIGNS}_{value.name}", shape=value.shape, type=value.type
+        )
+        main.inputs.append(signs)
+        seeds[str(value.name)] = signs
+        back.seed(value, signs)
+    names, powers = list[str](), list[ir.Value]()
+    for node in reversed(nodes):
+        found = back.found.get(node.outputs[0])
+        if found is not None and (layer := sources.layer_of(node)):
+            names.append(layer)
+            powers.append(sources.power(tape, node, found))
+        back.pass_through(node)
+    # one vector of each kind
+    for name, values in ((_NOISE, powers), (_SIGNAL, signal)):
+        if values:
+            flat = [tape.shaped(each, [1]) for each in values]
+            joined = tape.op("Concat", flat, {"axis": 0})
+            joined.name, joined.type = name, ir.TensorType(ir.DataType.FLOAT)
+            main.outputs.append(joined)
+    rewrite.remove_dead(main)
+    return _Written(sources.model, seeds, names, sources.behind(back.missing))

@@ -1,0 +1,264 @@
+"""Gradients of what works element by element, of sums and normalizations."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias
+
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of
+from me2e_compress.graph.nodes import input_at, integers_at
+from me2e_compress.sensitivity.gradients.tape import (
+    Found,
+    NoRuleError,
+    Rule,
+    Tape,
+    given,
+    sizes_of,
+)
+
+Slope: TypeAlias = Callable[[Tape, ir.Value, ir.Value], ir.Value]
+"""Writes the slope at x, where an operator gives y."""
+
+
+def _bell(t: Tape, x: ir.Value, scale: float, width: float) -> ir.Value:
+    """Return scale * exp(-width * x^2)."""
+    power = t.times(x, x, t.number(-width, x))
+    return t.times(t.op("Exp", [power]), t.number(scale, x))
+
+
+def _erf(t: Tape, x: ir.Value, y: ir.Value) -> ir.Value:
+    return _bell(t, x, 2 / math.sqrt(math.pi), 1)
+
+
+def _gelu(t: Tape, x: ir.Value, y: ir.Value) -> ir.Value:
+    half = t.number(0.5, x)
+    erf = t.op("Erf", [t.times(x, t.number(math.sqrt(0.5), x))])
+    below = t.op("Add", [half, t.times(half, erf)])
+    density = _bell(t, x, 1 / math.sqrt(2 * math.pi), 0.5)
+    return t.op("Add", [below, t.times(x, density)])
+
+
+def _same(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    return [g]
+
+
+def _relu(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    y = node.outputs[0]
+    return [t.only(t.op("Greater", [y, t.number(0, y)]), g, y)]
+
+
+def _leaky_relu(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    y, slope = node.outputs[0], node.attributes.get_float("alpha", 0.01)
+    above = t.op("Greater", [y, t.number(0, y)])
+    return [t.op("Where", [above, g, t.times(g, t.number(slope, y))])]
+
+
+def _clip(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    y = node.outputs[0]
+    return [t.only(t.op("Equal", [node.inputs[0], y]), g, y)]
+
+
+def _cast(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    kind = given(node.inputs[0]).dtype or ir.DataType.FLOAT
+    return [t.op("Cast", [g], {"to": kind.value})]
+
+
+def _add(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    return [t.narrowed(g, node.outputs[0], given(each)) for each in node.inputs]
+
+
+def _sub(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    y, (a, b) = node.outputs[0], map(given, node.inputs)
+    return [t.narrowed(g, y, a), t.narrowed(t.op("Neg", [g]), y, b)]
+
+
+def _mul(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    y, (a, b) = node.outputs[0], map(given, node.inputs)
+    return [t.narrowed(t.times(g, b), y, a), t.narrowed(t.times(g, a), y, b)]
+
+
+def _div(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    y, (a, b) = node.outputs[0], map(given, node.inputs)
+    each = t.op("Div", [g, b])
+    below = t.op("Neg", [t.times(each, y)])
+    return [t.narrowed(each, y, a), t.narrowed(below, y, b)]
+
+
+def _pow(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    y, (a, b) = node.outputs[0], map(given, node.inputs)
+    power = array_of(b)
+    if power is None or power.size != 1:
+        raise NoRuleError("its exponent is not a constant")
+    less = t.op("Pow", [a, t.number(float(power.item()) - 1, a)])
+    return [t.narrowed(t.times(g, t.number(float(power.item()), a), less), y, a)]
+
+
+def _extreme(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    y = node.outputs[0]
+    return [
+        t.narrowed(t.only(t.op("Equal", [each, y]), g, y), y, given(each))
+        for each in node.inputs
+    ]
+
+
+def _mod(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    return [t.narrowed(g, node.outputs[0], given(node.inputs[0]))]
+
+
+def _where(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    y, (choice, a, b) = node.outputs[0], map(given, node.inputs)
+    other = t.op("Where", [choice, t.number(0, y), g])
+    return [None, t.narrowed(t.only(choice, g, y), y, a), t.narrowed(other, y, b)]
+
+
+def _spread(t: Tape, node: ir.Node, g: ir.Value) -> tuple[ir.Value, list[int], int]:
+    """Return a gradient with the reduced axes as ones, that shape, and their size."""
+    x, axes = sizes_of(node.inputs[0]), integers_at(node, "axes", 1)
+    if axes is None and input_at(node, 1) is not None:
+        raise NoRuleError("its axes are not constant")
+    if not axes:
+        idle = node.attributes.get_int("noop_with_empty_axes", 0)
+        axes = [] if idle else [*range(len(x))]
+    gone = {at % len(x) for at in axes}
+    kept = [1 if at in gone else size for at, size in enumerate(x)]
+    return t.shaped(g, kept), kept, math.prod(x[at] for at in gone)
+
+
+def _reduce_sum(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    kept, _, _ = _spread(t, node, g)
+    return [t.op("Expand", [kept, t.ints(sizes_of(node.inputs[0]))])]
+
+
+def _reduce_mean(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    kept, _, count = _spread(t, node, g)
+    part = t.times(kept, t.number(1 / count, node.inputs[0]))
+    return [t.op("Expand", [part, t.ints(sizes_of(node.inputs[0]))])]
+
+
+def _reduce_extreme(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    kept, shape, _ = _spread(t, node, g)
+    x, y = given(node.inputs[0]), t.shaped(node.outputs[0], shape)
+    return [t.only(t.op("Equal", [x, y]), kept, x)]
+
+
+def _reduce_l2(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    kept, shape, _ = _spread(t, node, g)
+    part = t.op("Div", [kept, t.shaped(node.outputs[0], shape)])
+    return [t.times(given(node.inputs[0]), part)]
+
+
+def _cum_sum(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    reverse = 1 - node.attributes.get_int("reverse", 0)
+    exclusive = node.attributes.get_int("exclusive", 0)
+    options = {"reverse": reverse, "exclusive": exclusive}
+    return [t.op("CumSum", [g, node.inputs[1]], options)]
+
+
+def _softmax(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    y, axis = node.outputs[0], node.attributes.get_int("axis", -1)
+    weighted = t.times(g, y)
+    total = t.total(weighted, [axis], keep=True)
+    return [t.op("Sub", [weighted, t.times(y, total)])]
+
+
+def _log_softmax(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    axis = node.attributes.get_int("axis", -1)
+    total = t.total(g, [axis], keep=True)
+    return [t.op("Sub", [g, t.times(t.op("Exp", [node.outputs[0]]), total)])]
+
+
+def _layer_norm(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    x, scale = given(node.inputs[0]), given(node.inputs[1])
+    rank = len(sizes_of(x))
+    first = node.attributes.get_int("axis", -1) % rank
+    epsilon = node.attributes.get_float("epsilon", 1e-5)
+    return [_normalized(t, x, t.times(g, scale), range(first, rank), epsilon)]
+
+
+def _instance_norm(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    x, scale = given(node.inputs[0]), given(node.inputs[1])
+    rank = len(sizes_of(x))
+    scale = t.shaped(scale, [-1] + [1] * (rank - 2))
+    epsilon = node.attributes.get_float("epsilon", 1e-5)
+    return [_normalized(t, x, t.times(g, scale), range(2, rank), epsilon)]
+
+
+def _normalized(
+    t: Tape, x: ir.Value, g: ir.Value, axes: Sequence[int], epsilon: float
+) -> ir.Value:
+    """Return r (g - mean(g) - n mean(g n)) of n = r (x - mean(x))."""
+    each = t.number(1 / math.prod(sizes_of(x)[at] for at in axes), x)
+
+    def mean(value: ir.Value) -> ir.Value:
+        return t.times(t.total(value, list(axes), keep=True), each)
+
+    centred = t.op("Sub", [x, mean(x)])
+    variance = t.op("Add", [mean(t.times(centred, centred)), t.number(epsilon, x)])
+    rate = t.op("Reciprocal", [t.op("Sqrt", [variance])])
+    n = t.times(centred, rate)
+    left = t.op("Sub", [g, mean(g)])
+    return t.times(rate, t.op("Sub", [left, t.times(n, mean(t.times(g, n)))]))
+
+
+def _batch_norm(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    x, scale, _, _, variance = map(given, node.inputs)
+    epsilon = t.number(node.attributes.get_float("epsilon", 1e-5), variance)
+    spread = t.op("Sqrt", [t.op("Add", [variance, epsilon])])
+    factor = t.op("Div", [scale, spread])
+    return [t.times(g, t.shaped(factor, [-1] + [1] * (len(sizes_of(x)) - 2)))]
+
+
+SLOPES: Mapping[str, Slope] = {
+    "Abs": lambda t, x, y: t.op("Sign", [x]),
+    "Cos": lambda t, x, y: t.op("Neg", [t.op("Sin", [x])]),
+    "Erf": _erf,
+    "Exp": lambda t, x, y: y,
+    "Gelu": _gelu,
+    "Log": lambda t, x, y: t.op("Reciprocal", [x]),
+    "Neg": lambda t, x, y: t.number(-1, x),
+    "Reciprocal": lambda t, x, y: t.op("Neg", [t.times(y, y)]),
+    "Sigmoid": lambda t, x, y: t.op("Sub", [y, t.times(y, y)]),
+    "Sin": lambda t, x, y: t.op("Cos", [x]),
+    "Softplus": lambda t, x, y: t.op("Sigmoid", [x]),
+    "Sqrt": lambda t, x, y: t.op("Div", [t.number(0.5, x), y]),
+    "Tanh": lambda t, x, y: t.op("Sub", [t.number(1, x), t.times(y, y)]),
+}
+
+
+def _of_slope(slope: Slope) -> Rule:
+    def rule(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+        return [t.times(g, slope(t, given(node.inputs[0]), node.outputs[0]))]
+
+    return rule
+
+
+RULES: Mapping[str, Rule] = {
+    "Identity": _same,
+    "Relu": _relu,
+    "LeakyRelu": _leaky_relu,
+    "Clip": _clip,
+    "Cast": _cast,
+    "Add": _add,
+    "Sum": _add,
+    "Sub": _sub,
+    "Mul": _mul,
+    "Div": _div,
+    "Pow": _pow,
+    "Max": _extreme,
+    "Min": _extreme,
+    "Mod": _mod,
+    "Where": _where,
+    "ReduceSum": _reduce_sum,
+    "ReduceMean": _reduce_mean,
+    "ReduceMax": _reduce_extreme,
+    "ReduceMin": _reduce_extreme,
+    "ReduceL2": _reduce_l2,
+    "CumSum": _cum_sum,
+    "Softmax": _softmax,
+    "LogSoftmax": _log_softmax,
+    "LayerNormalization": _layer_norm,
+    "InstanceNormalization": _instance_norm,
+    "BatchNormalization": _batch_norm,
+    **{name: _of_slope(slope) for name, slope in SLOPES.items()},
+}

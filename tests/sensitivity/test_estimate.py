@@ -1,0 +1,223 @@
+"""What one backward pass tells, beside what one int8 node at a time does."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.fidelity.compare import Reference
+from me2e_compress.graph import static_shape
+from me2e_compress.passes import Context
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.plan import FLOAT, RESIDUAL, QuantPlan
+from me2e_compress.runtime.session import Session
+from me2e_compress.sensitivity import estimate as room
+from me2e_compress.sensitivity.error_sources import blamed
+from me2e_compress.sensitivity.estimate import NO_PATH, NodeCost, estimate
+from me2e_compress.targets import TARGETS, Target
+from tests.frames import record
+from tests.nets import MODULES, conv_attention, net
+
+HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
+BLOCK = (
+    HEAD
+    + """
+net (float[1,3,16,16] image, float[16,3,3,3] w0, float[16,16,3,3] w1,
+     float[16,16,1,1] w2, float[16,8] w3) => (float[1,16,4,4] small, float[1,256,8] y)
+    <int64[3] tokens = {1, 16, 256}> {
+    ["/backbone/stem"] a = Conv<pads=[1,1,1,1]>(image, w0)
+    ["/backbone/Relu"] r = Relu(a)
+    ["/backbone/main"] b = Conv<pads=[1,1,1,1]>(r, w1)
+    ["/backbone/shortcut"] s = Conv(r, w2)
+    ["/backbone/Add"] sum = Add(b, s)
+    ["/backbone/Pool"] small = MaxPool<kernel_shape=[4,4], strides=[4,4]>(sum)
+    ["/head/Reshape"] flat = Reshape(sum, tokens)
+    ["/head/Transpose"] rows = Transpose<perm=[0,2,1]>(flat)
+    ["/head/Linear"] l = MatMul(rows, w3)
+    ["/head/Tanh"] y = Tanh(l)
+}"""
+)
+
+
+def block(outlier: float = 0.0) -> ir.Model:
+    """A residual block and a head; the head's weight may have an outlier."""
+    random = np.random.default_rng(0)
+    shapes = ((16, 3, 3, 3), (16, 16, 3, 3), (16, 16, 1, 1), (16, 8))
+    weights = {f"w{at}": random.normal(0, 0.2, each) for at, each in enumerate(shapes)}
+    weights["w3"][0] += outlier
+    weights["w1"][0] *= 1e-3 if outlier else 1
+    weights["w2"][0] *= 1e-3 if outlier else 1
+    return net(BLOCK, weights)
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A calibrated graph with its plan."""
+
+    model: ir.Model
+    plan: QuantPlan
+    target: Target
+    frames: CalibrationSet
+
+    @classmethod
+    def of(cls, folder: Path, model: ir.Model, target: str = "tensorrt") -> "Case":
+        random, place = np.random.default_rng(1), TARGETS.parse(target)
+        shapes = {str(v.name): static_shape(v) for v in model.graph.inputs}
+        drawn = [
+            {n: random.standard_normal(s).astype("f") for n, s in shapes.items()}
+            for _ in range(6)
+        ]
+        frames = CalibrationSet(record(folder / "frames", drawn))
+        plan = QuantizeInt8(rules="paper", target=target).plan(model, Context(MODULES))
+        kept = place.kept_float(plan, model)
+        return cls(model, dataclasses.replace(plan, kept_float=kept), place, frames)
+
+    def told(self, seed: int = 0) -> dict[str, NodeCost]:
+        """Estimate, by node."""
+        ranges = Calibrator(threads=1).run(
+            self.model, self.target.tensors(self.plan, self.model), self.frames
+        )
+        grids = self.target.grids(self.plan, self.model, ranges)
+        costs = estimate(
+            self.model, self.plan, grids, self.frames, seed=seed, threads=1
+        )
+        return {each.node: each for each in costs}
+
+    def measured(self, node: str) -> dict[str, float]:
+        """Make one node int8, with the residual Add behind it."""
+        ranges = Calibrator(threads=1).run(
+            self.model, self.target.tensors(self.plan, self.model), self.frames
+        )
+        nodes = {str(n.outputs[0].name): n for n in self.model.graph}
+        (output,) = (e.output for e in self.plan.decisions if e.node == node)
+        decisions = tuple(
+            each
+            if blamed(nodes[each.output], each) == output
+            else dataclasses.replace(each, dtype=FLOAT, activations=(), weight=None)
+            for each in self.plan.decisions
+        )
+        plan = dataclasses.replace(self.plan, decisions=decisions, groups=())
+        made = self.target.place(self.model, plan, ranges)
+        reference = Reference.of(Session(self.model, threads=1), self.frames)
+        found = reference.compare(Session(made, threads=1)).outputs
+        return {each.name: 10 ** (-each.sqnr_db / 20) for each in found}
+
+
+@pytest.mark.parametrize(
+    ("make", "factor"), [(block, 1.6), (lambda: block(30.0), 1.6), (conv_attention, 2)]
+)
+def test_the_estimate_is_near_what_one_int8_node_at_a_time_costs(
+    tmp_path: Path, make: Callable[[], ir.Model], factor: float
+) -> None:
+    case = Case.of(tmp_path, make())
+    told = case.told()
+
+    assert len(told) >= 3
+    for name, cost in told.items():
+        measured = case.measured(name)
+        assert cost.noise is not None
+        for output, noise in cost.noise.items():
+            if measured[output] > 0:
+                assert abs(math.log(noise / measured[output])) < math.log(factor)
+            else:
+                assert noise == 0
+
+
+def test_a_residual_branch_is_counted_to_the_convolution_it_follows(
+    tmp_path: Path,
+) -> None:
+    case = Case.of(tmp_path, block())
+    (add,) = (each for each in case.plan.placed if each.rule == RESIDUAL)
+    without = tuple(each for each in case.plan.decisions if each is not add)
+    bare = dataclasses.replace(
+        case, plan=dataclasses.replace(case.plan, decisions=without)
+    )
+
+    both, alone = case.told()["/backbone/main"], bare.told()["/backbone/main"]
+
+    assert "/backbone/Add" not in case.told()
+    assert both.noise is not None
+    assert alone.noise is not None
+    assert both.noise["y"] > 1.02 * alone.noise["y"]
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
+    case = Case.of(tmp_path, block())
+
+    first, again, other = (
+        [each.noise for each in case.told(seed).values()] for seed in (0, 0, 1)
+    )
+
+    assert first == again
+    assert first != other
+
+
+def test_onnxruntimes_finer_grid_of_what_is_never_negative_is_known(
+    tmp_path: Path,
+) -> None:
+    coarse = Case.of(tmp_path, block()).told()["/backbone/main"].noise
+    (tmp_path / "cpu").mkdir()
+    fine = (
+        Case.of(tmp_path / "cpu", block(), "onnxruntime").told()["/backbone/main"].noise
+    )
+
+    assert coarse is not None
+    assert fine is not None
+    assert fine["small"] < 0.9 * coarse["small"]
+
+
+CUT = (
+    HEAD
+    + """
+net (float[4,32] x, float[32,32] w0, float[32,32] w1, float[32,32] w2)
+    => (float[4,32] y, int64[4,1] best) {{
+    ["/head/first"] a = MatMul(x, w0)
+    ["/head/odd"] b = {op}(a)
+    ["/head/second"] y = MatMul(b, w1)
+    ["/head/third"] c = MatMul(x, w2)
+    ["/head/best"] best = ArgMax<axis=1>(c)
+}}"""
+)
+
+
+def cut(op: str) -> ir.Model:
+    random = np.random.default_rng(0)
+    weights = {f"w{at}": random.normal(0, 0.2, (32, 32)) for at in range(3)}
+    return net(CUT.format(op=op), weights)
+
+
+def test_what_lies_behind_an_operator_without_a_rule_is_not_estimated(
+    tmp_path: Path,
+) -> None:
+    told = Case.of(tmp_path, cut("Atan")).told()
+
+    assert told["/head/first"].noise is None
+    assert told["/head/first"].reason == "Atan /head/odd: no rule"
+    assert told["/head/second"].noise is not None
+
+
+def test_a_node_that_only_a_choice_reads_is_not_estimated_and_not_zero(
+    tmp_path: Path,
+) -> None:
+    told = Case.of(tmp_path, cut("Tanh")).told()
+
+    assert told["/head/third"].noise is None
+    assert told["/head/third"].reason == NO_PATH
+    assert told["/head/first"].noise is not None
+
+
+def test_memory_is_kept_and_what_lies_behind_the_limit_is_not_estimated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(room, "MOST_HELD", 30_000)
+    told = Case.of(tmp_path, block()).told()
+
+    assert told["/head/Linear"].noise is not None
+    assert told["/backbone/stem"].noise is None
+    assert "held already" in told["/backbone/stem"].reason
