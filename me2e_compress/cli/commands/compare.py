@@ -1,5 +1,6 @@
 """``me2e-compress compare``."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -8,12 +9,17 @@ from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import compare as workflow
+from me2e_compress.workflows import compare_dump as against_engine
 
 
 def compare(
     reference: Annotated[str, typer.Argument(help="graph or stack to be true to")],
-    candidate: Annotated[str, typer.Argument(help="the graph that is judged")],
-    frames: given.Recording,
+    candidate: Annotated[
+        str, typer.Argument(help="the graph that is judged; not with --outputs")
+    ],
+    frames: Annotated[
+        Path | None, typer.Argument(help="the recorded FRAMES", show_default=False)
+    ] = None,
     as_it_stands: Annotated[
         bool,
         typer.Option(
@@ -21,19 +27,32 @@ def compare(
             help="the first without onnxruntime's optimizations, the second with all",
         ),
     ] = False,
+    outputs: Annotated[
+        Path | None,
+        typer.Option(help="what an engine of the graph answered: DUMP/ or JSON"),
+    ] = None,
+    float_graph: Annotated[
+        str | None,
+        typer.Option("--float", help="the graph's float source, with --outputs"),
+    ] = None,
     adapter: given.Adapter = None,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
 ) -> None:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres."""
+    runs_on = provider_named(provider, plugins or ())
+    if (outputs is None) == (frames is None):
+        said = "M.onnx FRAMES --outputs DUMP" if frames else "A.onnx B.onnx FRAMES"
+        raise typer.BadParameter(f"expected {said}", param_hint="FRAMES")
     with listening() as listener:
-        found = workflow.compare(
-            reference,
-            candidate,
-            frames,
-            listener,
-            as_it_stands=as_it_stands,
-            provider=provider_named(provider, plugins or ()),
-            adapter=adapter,
-        )
+        if outputs is not None:
+            found = against_engine.compare_dump(
+                *(reference, outputs, candidate, listener),
+                float_graph=float_graph, provider=runs_on, adapter=adapter,
+            )  # fmt: skip
+        else:
+            found = workflow.compare(
+                *(reference, candidate, frames, listener),
+                as_it_stands=as_it_stands, provider=runs_on, adapter=adapter,
+            )  # fmt: skip
     show(found)

@@ -1,0 +1,384 @@
+"""Ways in which a host feeds an engine wrongly: state, frames, inputs, pictures.
+
+A fault changes what a graph is fed on a frame. If the graph, fed so, answers as the
+engine did, then the engine was fed so.
+"""
+
+import functools
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from me2e_compress.runtime.any_session import AnySession
+from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.session import DTYPES
+
+Feeds: TypeAlias = dict[str, Array]
+State: TypeAlias = Mapping[str, Array]
+SMALLEST_PICTURE = 8
+"""Rows and columns; a matrix has fewer."""
+OWN_STATE_BYTES = 1 << 29
+"""State of our own run that is kept for single frames: 50 frames of VAD-tiny."""
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """How pixels became an image input: (scale * pixel - mean) / std, by channel."""
+
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+    scale: float = 1.0
+
+
+@dataclass(eq=False)
+class Fed:
+    """What a graph is fed over frames: state as an engine gave it, else our own.
+
+    Attributes:
+        session: The graph.
+        frames: The recording.
+        given: The engine's recurrent outputs after a frame, by the graph's input;
+            empty if the dump has none.
+        own: Recurrent outputs of our own run after a frame, where the engine's are
+            not known.
+    """
+
+    session: AnySession
+    frames: Sequence[Frame]
+    given: Callable[[int], State]
+    own: dict[int, State] = field(default_factory=dict)
+
+    def after(self, index: int) -> State:
+        """Return the state after a frame, of the types that the graph takes."""
+        held = {**self.own.get(index, {}), **self.given(index)}
+        ports = self.session.inputs
+        return {
+            name: np.asarray(held[name], DTYPES[ports[name].type])
+            for name in self.session.recurrent
+        }
+
+    def state(self, index: int) -> State:
+        """Return the state that is right at a frame."""
+        frame = self.frames[index]
+        if frame.starts_scene or index == 0:
+            return self.session.first_state(frame.arrays)
+        return self.after(index - 1)
+
+    def feeds(self, index: int, faults: Sequence["FeedFault"] = ()) -> Feeds:
+        """Return what the graph is fed on a frame, by hosts with these faults."""
+        found = {**self.frames[index].arrays, **self.state(index)}
+        for each in sorted(faults, key=lambda fault: fault.turn):
+            found = each.apply(self, index, found)
+        return found
+
+    def answer(
+        self, index: int, faults: Sequence["FeedFault"], names: Sequence[str]
+    ) -> dict[str, Array]:
+        """Run one inference as a host with these faults would have."""
+        first = self.frames[index].starts_scene
+        return self.session.run(self.feeds(index, faults), names, first=first)
+
+    def knows(self, index: int) -> bool:
+        """Return whether the state before a frame is known, and the one before that."""
+        return all(
+            at < 0 or {**self.own.get(at, {}), **self.given(at)}.keys()
+            >= self.session.recurrent.keys()
+            for at in (index - 2, index - 1)
+        )
+
+    def follow(
+        self, faults: Sequence["FeedFault"], names: Sequence[str]
+    ) -> Iterator[dict[str, Array]]:
+        """Run all frames in order, as a host with these faults would have.
+
+        Our own state, where it counts, is that of this run; that of the first frames is
+        kept.
+        """
+        self.own.clear()
+        lacking = self._lacking()
+        asked = list(dict.fromkeys([*names, *lacking.values()]))
+        kept = 0
+        for index in range(len(self.frames)):
+            found = self.answer(index, faults, asked)
+            self.own[index] = {
+                name: np.array(found[output]) for name, output in lacking.items()
+            }
+            kept += sum(each.nbytes for each in self.own[index].values())
+            # two frames back is as far as any fault looks
+            if kept > OWN_STATE_BYTES and index - 3 in self.own:
+                dropped = self.own.pop(index - 3)
+                kept -= sum(each.nbytes for each in dropped.values())
+            yield {name: found[name] for name in names}
+
+    def _lacking(self) -> dict[str, str]:
+        held = self.given(0)
+        pairs = self.session.recurrent.items()
+        return {name: output for name, output in pairs if name not in held}
+
+
+@dataclass(frozen=True)
+class FeedFault:
+    """One thing that a host feeds wrongly.
+
+    Attributes:
+        kind: The fault in a word or two, for programs.
+        said: What the host did, as a sentence without its end.
+        turn: When it acts: frames are chosen first, then inputs are changed, then state
+            is fed.
+    """
+
+    kind: str
+    said: str
+
+    turn = 1
+
+    def apply(self, fed: Fed, index: int, feeds: Feeds) -> Feeds:
+        """Return what the graph is fed instead."""
+        raise NotImplementedError
+
+    def touches(self, fed: Fed, index: int) -> bool:
+        """Return whether a frame is fed otherwise than it should be."""
+        return True
+
+
+@dataclass(frozen=True)
+class StateFault(FeedFault):
+    """State of some recurrent inputs: carried over, one frame late, or never fed."""
+
+    how: Literal["carried", "late", "never"]
+    names: tuple[str, ...]
+    turn = 2
+
+    def apply(self, fed: Fed, index: int, feeds: Feeds) -> Feeds:
+        """Feed the state that this fault leaves."""
+        if not self.touches(fed, index):
+            return feeds
+        if self.how == "carried":
+            state = fed.after(index - 1)
+        elif self.how == "late":
+            state = fed.state(index - 1)
+        else:
+            state = fed.session.first_state({})
+        return feeds | {name: state[name] for name in self.names}
+
+    def touches(self, fed: Fed, index: int) -> bool:
+        """Return whether a scene starts here, or does not."""
+        starts = fed.frames[index].starts_scene
+        return index > 0 and starts == (self.how == "carried")
+
+
+@dataclass(frozen=True)
+class FrameFault(FeedFault):
+    """Inputs of another frame: so many frames away, or of one frame for ever.
+
+    ``names`` are the inputs; ``away`` None takes the first frame.
+    """
+
+    names: tuple[str, ...]
+    away: int | None
+    turn = 0
+
+    def apply(self, fed: Fed, index: int, feeds: Feeds) -> Feeds:
+        """Feed the inputs of the other frame."""
+        held = fed.frames[self._other(fed, index)].arrays
+        return feeds | {name: held[name] for name in self.names}
+
+    def touches(self, fed: Fed, index: int) -> bool:
+        """Return whether the other frame differs."""
+        mine, other = (fed.frames[at].arrays for at in (index, self._other(fed, index)))
+        return any(not np.array_equal(mine[name], other[name]) for name in self.names)
+
+    def _other(self, fed: Fed, index: int) -> int:
+        if self.away is None:
+            return 0
+        return min(max(index + self.away, 0), len(fed.frames) - 1)
+
+
+@dataclass(frozen=True)
+class InputFault(FeedFault):
+    """One input, changed in the same way on every frame."""
+
+    name: str
+    change: Callable[[Array], Array]
+
+    def apply(self, fed: Fed, index: int, feeds: Feeds) -> Feeds:
+        """Feed the changed input."""
+        value = feeds[self.name]
+        return feeds | {self.name: self.change(value).astype(value.dtype)}
+
+
+def feed_faults(
+    fed: Fed, pixels: Mapping[str, Pixels]
+) -> Iterator[tuple[FeedFault, ...]]:
+    """Propose faults in groups, the common ones first; camera orders come apart."""
+    states = tuple(fed.session.recurrent)
+    inputs = [name for name in fed.frames[0].arrays if name not in states]
+    yield tuple(_of_state(states))
+    yield tuple(_of_frames(inputs))
+    for name in inputs:
+        value = fed.frames[0].arrays[name]
+        yield tuple(_of_input(name, value, pixels.get(name)))
+
+
+def _of_state(states: Sequence[str]) -> Iterator[StateFault]:
+    # all state at once, then each of several
+    for names in dict.fromkeys([tuple(states), *((name,) for name in states)]):
+        if not names:
+            continue
+        said = "the state" if len(names) > 1 or len(states) == 1 else names[0]
+        yield StateFault(
+            "state-not-reset", f"{said} is not reset where a scene begins",
+            "carried", names,
+        )  # fmt: skip
+        yield StateFault(
+            "state-late", f"{said} is one frame stale: it is that before the last",
+            "late", names,
+        )  # fmt: skip
+        yield StateFault(
+            "state-never-fed", f"{said} is never fed: it stays at its first value",
+            "never", names,
+        )  # fmt: skip
+
+
+def _of_frames(inputs: Sequence[str]) -> Iterator[FrameFault]:
+    for away, said in ((-1, "before"), (1, "after")):
+        yield FrameFault(
+            "frames-shifted", f"frames are shifted by one: each is fed the one {said}",
+            tuple(inputs), away,
+        )  # fmt: skip
+    for name in inputs:
+        yield FrameFault(
+            "input-stuck", f"input {name} is stuck at its first frame", (name,), None
+        )
+        yield FrameFault(
+            "input-late", f"input {name} is one frame late", (name,), -1
+        )
+
+
+def _of_input(name: str, value: Array, pixels: Pixels | None) -> Iterator[InputFault]:
+    def fault(
+        kind: str, said: str, change: Callable[[Array], Array]
+    ) -> InputFault:
+        return InputFault(kind, f"input {name} {said}", name, change)
+
+    yield fault("input-never-fed", "is never fed: it stays zero", np.zeros_like)
+    if value.ndim >= 2 and value.shape[-1] == value.shape[-2] and value.shape[-1] <= 4:
+        yield fault(
+            "input-layout", "has its matrices transposed", lambda x: x.swapaxes(-1, -2)
+        )
+        if value.dtype.kind == "f":
+            yield fault("input-inverse", "has its matrices inverted", np.linalg.pinv)
+    if (channels := _channels(value)) is None:
+        return
+    # pictures: their range, then channels and layout
+    if value.dtype.kind == "f":
+        for said, change in _ranges(channels, pixels):
+            yield fault("normalisation", said, change)
+    yield fault("colours", "has red and blue swapped", _swapped(channels, pixels))
+    yield fault(
+        *("input-layout", "has its channels last, read as first"),
+        lambda x: np.moveaxis(x, channels, -1).reshape(x.shape),
+    )
+
+
+def _ranges(
+    channels: int, pixels: Pixels | None
+) -> Iterator[tuple[str, Callable[[Array], Array]]]:
+    """Propose other ranges of pictures; those of grey levels need their statistics."""
+    yield "is of 0 to 1 where 0 to 255 is meant: divided by 255", lambda x: x / 255
+    yield "is of 0 to 255 where 0 to 1 is meant: times 255", lambda x: x * 255
+    if pixels is None:
+        return
+    mean, std = (_by_channel(each, channels) for each in (pixels.mean, pixels.std))
+    yield "is not normalised: neither mean nor std", lambda x: x * std + mean
+    yield "is not normalised: grey levels of 0 to 1", lambda x: (x * std + mean) / 255
+    yield (
+        "is of 0 to 1 before mean and std of 0 to 255",
+        lambda x: ((x * std + mean) / 255 - mean) / std,
+    )
+    yield "misses the mean", lambda x: x + mean / std
+    yield "misses the std", lambda x: x * std
+    yield "is normalised twice", lambda x: (x - mean) / std
+
+
+def _swapped(channels: int, pixels: Pixels | None) -> Callable[[Array], Array]:
+    """Return what swaps red and blue before the normalisation."""
+    if pixels is None:
+        return lambda x: np.flip(x, channels)
+    mean, std = (_by_channel(each, channels) for each in (pixels.mean, pixels.std))
+    return lambda x: (np.flip(x * std + mean, channels) - mean) / std
+
+
+def _by_channel(values: Sequence[float], channels: int) -> Array:
+    return np.array(values, np.float64).reshape([-1, *[1] * (-1 - channels)])
+
+
+def _channels(value: Array) -> int | None:
+    """Return the axis of three colours, from the end; None if these are no pictures."""
+    if value.ndim < 4:
+        return None
+    for axis, sides in ((-3, value.shape[-2:]), (-1, value.shape[-3:-1])):
+        if value.shape[axis] == 3 and min(sides) >= SMALLEST_PICTURE:
+            return axis
+    return None
+
+
+def camera_inputs(fed: Fed) -> Iterator[tuple[str, int]]:
+    """Return the inputs that have an axis of cameras, pictures first, and that axis."""
+    arrays = fed.frames[0].arrays
+    found = dict[str, int]()
+    for name, value in arrays.items():
+        if value.ndim >= 4 and _channels(value) is not None:
+            found |= {name: axis for axis in (1, 0) if 1 < value.shape[axis] <= 12}
+    counts = {arrays[name].shape[axis] for name, axis in found.items()}
+    for name, value in arrays.items():
+        if name not in found and value.ndim >= 3 and name not in fed.session.recurrent:
+            axes = [axis for axis in (1, 0) if value.shape[axis] in counts]
+            found |= {name: axis for axis in axes[:1]}
+    yield from found.items()
+
+
+def cameras_ordered(name: str, axis: int, order: tuple[int, ...]) -> InputFault:
+    """Return the fault that feeds cameras in another order."""
+    told = ", ".join(map(str, order))
+    return InputFault(
+        "cameras",
+        f"input {name} has the cameras in another order: {told}",
+        name,
+        functools.partial(np.take, indices=order, axis=axis),
+    )
+
+
+def camera_orders(count: int) -> Iterator[tuple[int, ...]]:
+    """Propose orders of cameras: swaps of two, turns, reversed, those of the field."""
+    straight = tuple(range(count))
+    yield from swaps(straight)
+    for turn in range(1, count):
+        yield (*straight[turn:], *straight[:turn])
+    for turn in range(count):
+        back = straight[::-1]
+        yield (*back[turn:], *back[:turn])
+    if count == len(CONVENTIONS[0]):
+        for mine, theirs in itertools.permutations(CONVENTIONS, 2):
+            yield tuple(mine.index(camera) for camera in theirs)
+
+
+CONVENTIONS = (
+    ("f", "fl", "fr", "b", "bl", "br"),  # VAD's and UniAD's agents in CARLA, ours
+    ("f", "fr", "fl", "b", "bl", "br"),  # nuScenes in mmdetection3d, BEVFormer
+    ("fl", "f", "fr", "bl", "b", "br"),  # pictures of nuScenes in two rows
+    ("f", "fr", "br", "b", "bl", "fl"),  # clockwise
+    ("f", "fl", "bl", "b", "br", "fr"),
+)
+"""Six cameras, front and back, left and right, as programs order them."""
+
+
+def swaps(order: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+    """Return an order with every two of its places exchanged."""
+    for one, other in itertools.combinations(range(len(order)), 2):
+        found = list(order)
+        found[one], found[other] = found[other], found[one]
+        yield tuple(found)
