@@ -61,9 +61,9 @@ class Host:
     """
 
     names: tuple[str, ...]
-    feed: Callable[[Sequence[Frame], int], Arrays] = lambda frames, at: frames[
-        at
-    ].arrays
+    feed: Callable[[Sequence[Frame], int], Arrays] = lambda frames, at: (
+        frames[at].arrays
+    )
     state: Callable[[Arrays, bool, list[Arrays]], Arrays] = (
         lambda first, starts, before: first if starts else before[-1]
     )
@@ -115,7 +115,9 @@ def hosts(stack: str) -> dict[str, Host]:
     """Return the seeded faults by name."""
     on_vad = stack != "highway"
     image = "img"
-    mean, std = (np.array(each, np.float32).reshape(3, 1, 1) for each in STATISTICS[stack])
+    mean, std = (
+        np.array(each, np.float32).reshape(3, 1, 1) for each in STATISTICS[stack]
+    )
     large = "bev_embed" if on_vad else "occupancy"
     small = "ego_fut_preds" if on_vad else "plan"
     slots = "all_bbox_preds" if on_vad else "boxes"
@@ -205,7 +207,9 @@ def drive(session: Session, frames: Sequence[Frame], host: Host) -> list[Arrays]
     return [host.read(given[at]) for at in host.order(len(given))]
 
 
-def write(folder: Path, names: Sequence[str], dump: Sequence[Mapping[str, Array]]) -> Path:
+def write(
+    folder: Path, names: Sequence[str], dump: Sequence[Mapping[str, Array]]
+) -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for name, arrays in zip(names, dump, strict=True):
@@ -224,14 +228,18 @@ def engine_of(path: Path, kind: str) -> Session:
     return Session(model, threads=1, release=True)
 
 
-def judged(model: Path, dump: Path, frames: Path, without: bool) -> tuple[DumpResult, float]:
+def judged(
+    model: Path, dump: Path, frames: Path, without: bool
+) -> tuple[DumpResult, float]:
     start = process_time()
     found = compare_dump(model, dump, frames)
     return found, process_time() - start
 
 
 def told(name: str, found: DumpResult, seconds: float) -> str:
-    faults = "; ".join(f"{each.kind}: {each.said}" for each in found.faults) or "nothing"
+    faults = (
+        "; ".join(f"{each.kind}: {each.said}" for each in found.faults) or "nothing"
+    )
     before = min((each.before_db for each in found.faults), default=float("nan"))
     after = min((each.after_db for each in found.faults), default=float("nan"))
     return (
@@ -327,7 +335,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--scene", type=int, default=4)
     parser.add_argument("--recipe", default="")
     parser.add_argument("--only", default="")
-    parser.add_argument("--stateful", action="store_true", help="with dumped state only")
+    parser.add_argument(
+        "--stateful", action="store_true", help="with dumped state only"
+    )
     parser.add_argument("--alarms", action="store_true")
     options = parser.parse_args(argv)
     out: Path = options.out / options.stack

@@ -26,8 +26,8 @@ from me2e_compress.runtime.frames import Array
 _NPZ, _JSON = ".npz", ".json"
 _NOT_JSON = re.compile(rb"(?<=[\[,\s])(-?)(nan|inf)(?=[\],\s])", re.IGNORECASE)
 """What C++ writes, and trtexec with it, where a number is not finite."""
-_KEPT = 3
-"""Frames of JSON in memory: state comes from one and two frames before."""
+_KEPT = 8
+"""Frames in memory: some are read again and again."""
 
 
 class EngineDump(Displayed):

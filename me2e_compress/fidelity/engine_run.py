@@ -1,25 +1,28 @@
 """An engine's answers beside its graph, both fed alike, frame by frame."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.dump_readings import (
-    FrameOrder,
     Reading,
     closeness,
     undone,
 )
-from me2e_compress.fidelity.feed_faults import Fed, FeedFault, State
+from me2e_compress.fidelity.fed import Fed, FeedFault, State
+from me2e_compress.fidelity.frame_order import FrameOrder
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
 
 Answers: TypeAlias = Mapping[str, Array]
 Closeness: TypeAlias = Mapping[tuple[str, int], float]
 """dB by output and frame."""
+RECENT = 8
+"""Frames in memory: 140 MB of VAD-tiny's."""
 Watch: TypeAlias = Callable[[int, Answers, Answers], None]
 """Shown a frame's index, the graph's answers, and the engine's as they should be."""
 
@@ -30,6 +33,20 @@ class Followed:
 
     close: Closeness
     own: dict[int, State]
+
+
+class _Recent(Sequence[Frame]):
+    """Frames, the last few of them in memory."""
+
+    def __init__(self, frames: Sequence[Frame]) -> None:
+        self._count = len(frames)
+        self._at = functools.lru_cache(maxsize=RECENT)(frames.__getitem__)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._at(index)
 
 
 class EngineRun:
@@ -54,7 +71,7 @@ class EngineRun:
     ) -> None:
         self.dump = dump
         self.names = [name for name in session.outputs if name in dump[0]]
-        self.fed = Fed(session, frames, self._given)
+        self.fed = Fed(session, _Recent(frames), self._given)
         self.readings = dict[str, tuple[Reading, ...]]()
         self.order: FrameOrder | None = None
         self.causes = tuple[FeedFault, ...]()

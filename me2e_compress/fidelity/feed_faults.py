@@ -7,21 +7,17 @@ engine did, then the engine was fed so.
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from me2e_compress.runtime.any_session import AnySession
-from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.session import DTYPES
+from me2e_compress.fidelity.fed import Fed, FeedFault, Feeds
+from me2e_compress.runtime.frames import Array
 
-Feeds: TypeAlias = dict[str, Array]
-State: TypeAlias = Mapping[str, Array]
+MOST_CAMERAS = 12
 SMALLEST_PICTURE = 8
 """Rows and columns; a matrix has fewer."""
-OWN_STATE_BYTES = 1 << 29
-"""State of our own run that is kept for single frames: 50 frames of VAD-tiny."""
 
 
 @dataclass(frozen=True)
@@ -31,117 +27,6 @@ class Pixels:
     mean: tuple[float, ...]
     std: tuple[float, ...]
     scale: float = 1.0
-
-
-@dataclass(eq=False)
-class Fed:
-    """What a graph is fed over frames: state as an engine gave it, else our own.
-
-    Attributes:
-        session: The graph.
-        frames: The recording.
-        given: The engine's recurrent outputs after a frame, by the graph's input;
-            empty if the dump has none.
-        own: Recurrent outputs of our own run after a frame, where the engine's are
-            not known.
-    """
-
-    session: AnySession
-    frames: Sequence[Frame]
-    given: Callable[[int], State]
-    own: dict[int, State] = field(default_factory=dict)
-
-    def after(self, index: int) -> State:
-        """Return the state after a frame, of the types that the graph takes."""
-        held = {**self.own.get(index, {}), **self.given(index)}
-        ports = self.session.inputs
-        return {
-            name: np.asarray(held[name], DTYPES[ports[name].type])
-            for name in self.session.recurrent
-        }
-
-    def state(self, index: int) -> State:
-        """Return the state that is right at a frame."""
-        frame = self.frames[index]
-        if frame.starts_scene or index == 0:
-            return self.session.first_state(frame.arrays)
-        return self.after(index - 1)
-
-    def feeds(self, index: int, faults: Sequence["FeedFault"] = ()) -> Feeds:
-        """Return what the graph is fed on a frame, by hosts with these faults."""
-        found = {**self.frames[index].arrays, **self.state(index)}
-        for each in sorted(faults, key=lambda fault: fault.turn):
-            found = each.apply(self, index, found)
-        return found
-
-    def answer(
-        self, index: int, faults: Sequence["FeedFault"], names: Sequence[str]
-    ) -> dict[str, Array]:
-        """Run one inference as a host with these faults would have."""
-        first = self.frames[index].starts_scene
-        return self.session.run(self.feeds(index, faults), names, first=first)
-
-    def knows(self, index: int) -> bool:
-        """Return whether the state before a frame is known, and the one before that."""
-        return all(
-            at < 0 or {**self.own.get(at, {}), **self.given(at)}.keys()
-            >= self.session.recurrent.keys()
-            for at in (index - 2, index - 1)
-        )
-
-    def follow(
-        self, faults: Sequence["FeedFault"], names: Sequence[str]
-    ) -> Iterator[dict[str, Array]]:
-        """Run all frames in order, as a host with these faults would have.
-
-        Our own state, where it counts, is that of this run; that of the first frames is
-        kept.
-        """
-        self.own.clear()
-        lacking = self._lacking()
-        asked = list(dict.fromkeys([*names, *lacking.values()]))
-        kept = 0
-        for index in range(len(self.frames)):
-            found = self.answer(index, faults, asked)
-            self.own[index] = {
-                name: np.array(found[output]) for name, output in lacking.items()
-            }
-            kept += sum(each.nbytes for each in self.own[index].values())
-            # two frames back is as far as any fault looks
-            if kept > OWN_STATE_BYTES and index - 3 in self.own:
-                dropped = self.own.pop(index - 3)
-                kept -= sum(each.nbytes for each in dropped.values())
-            yield {name: found[name] for name in names}
-
-    def _lacking(self) -> dict[str, str]:
-        held = self.given(0)
-        pairs = self.session.recurrent.items()
-        return {name: output for name, output in pairs if name not in held}
-
-
-@dataclass(frozen=True)
-class FeedFault:
-    """One thing that a host feeds wrongly.
-
-    Attributes:
-        kind: The fault in a word or two, for programs.
-        said: What the host did, as a sentence without its end.
-        turn: When it acts: frames are chosen first, then inputs are changed, then state
-            is fed.
-    """
-
-    kind: str
-    said: str
-
-    turn = 1
-
-    def apply(self, fed: Fed, index: int, feeds: Feeds) -> Feeds:
-        """Return what the graph is fed instead."""
-        raise NotImplementedError
-
-    def touches(self, fed: Fed, index: int) -> bool:
-        """Return whether a frame is fed otherwise than it should be."""
-        return True
 
 
 @dataclass(frozen=True)
@@ -253,15 +138,11 @@ def _of_frames(inputs: Sequence[str]) -> Iterator[FrameFault]:
         yield FrameFault(
             "input-stuck", f"input {name} is stuck at its first frame", (name,), None
         )
-        yield FrameFault(
-            "input-late", f"input {name} is one frame late", (name,), -1
-        )
+        yield FrameFault("input-late", f"input {name} is one frame late", (name,), -1)
 
 
 def _of_input(name: str, value: Array, pixels: Pixels | None) -> Iterator[InputFault]:
-    def fault(
-        kind: str, said: str, change: Callable[[Array], Array]
-    ) -> InputFault:
+    def fault(kind: str, said: str, change: Callable[[Array], Array]) -> InputFault:
         return InputFault(kind, f"input {name} {said}", name, change)
 
     yield fault("input-never-fed", "is never fed: it stays zero", np.zeros_like)
@@ -271,7 +152,7 @@ def _of_input(name: str, value: Array, pixels: Pixels | None) -> Iterator[InputF
         )
         if value.dtype.kind == "f":
             yield fault("input-inverse", "has its matrices inverted", np.linalg.pinv)
-    if (channels := _channels(value)) is None:
+    if (channels := _colour_axis(value)) is None:
         return
     # pictures: their range, then channels and layout
     if value.dtype.kind == "f":
@@ -316,7 +197,7 @@ def _by_channel(values: Sequence[float], channels: int) -> Array:
     return np.array(values, np.float64).reshape([-1, *[1] * (-1 - channels)])
 
 
-def _channels(value: Array) -> int | None:
+def _colour_axis(value: Array) -> int | None:
     """Return the axis of three colours, from the end; None if these are no pictures."""
     if value.ndim < 4:
         return None
@@ -326,19 +207,23 @@ def _channels(value: Array) -> int | None:
     return None
 
 
-def camera_inputs(fed: Fed) -> Iterator[tuple[str, int]]:
+def camera_inputs(fed: Fed) -> list[tuple[str, int]]:
     """Return the inputs that have an axis of cameras, pictures first, and that axis."""
     arrays = fed.frames[0].arrays
     found = dict[str, int]()
-    for name, value in arrays.items():
-        if value.ndim >= 4 and _channels(value) is not None:
-            found |= {name: axis for axis in (1, 0) if 1 < value.shape[axis] <= 12}
-    counts = {arrays[name].shape[axis] for name, axis in found.items()}
-    for name, value in arrays.items():
-        if name not in found and value.ndim >= 3 and name not in fed.session.recurrent:
-            axes = [axis for axis in (1, 0) if value.shape[axis] in counts]
-            found |= {name: axis for axis in axes[:1]}
-    yield from found.items()
+    counts = set[int]()
+    pictures = [name for name in arrays if _colour_axis(arrays[name]) is not None]
+    for name in dict.fromkeys([*pictures, *arrays]):
+        sides = arrays[name].shape[:2]
+        axes = [
+            axis
+            for axis, count in reversed(list(enumerate(sides)))
+            if 1 < count <= MOST_CAMERAS and (name in pictures or count in counts)
+        ]
+        if axes and arrays[name].ndim >= 3 and name not in fed.session.recurrent:
+            found[name] = axes[0]
+            counts.add(sides[axes[0]])
+    return list(found.items())
 
 
 def cameras_ordered(name: str, axis: int, order: tuple[int, ...]) -> InputFault:

@@ -13,36 +13,30 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from me2e_compress.fidelity.dump_readings import (
+    EXPLAINED_DB,
     HIGHEST_DB,
     NAMED_DB,
     closeness,
-    find_order,
     find_readings,
-    sample,
 )
 from me2e_compress.fidelity.engine_run import Closeness, EngineRun
-from me2e_compress.fidelity.feed_faults import (
-    Fed,
-    FeedFault,
-    Pixels,
-    camera_inputs,
-    camera_orders,
-    cameras_ordered,
-    feed_faults,
-    swaps,
+from me2e_compress.fidelity.fed import Fed, FeedFault
+from me2e_compress.fidelity.feed_faults import Pixels
+from me2e_compress.fidelity.feed_search import (
+    PROBES,
+    SCREENED_DB,
+    SURE_DB,
+    TOUCHED_DB,
+    find_contenders,
+    gain_of,
+    touched_by,
 )
+from me2e_compress.fidelity.frame_order import find_order, sample
 
-TOUCHED_DB = 0.5
-"""An explanation says something of an output that it moves so much nearer or away."""
-SCREENED_DB = 3.0
-"""What an explanation takes from the residual of one frame to be tried on more."""
-SURE_DB = 15.0
-"""What an explanation takes from the residual for rarer ones not to be looked for."""
-MOST_GAIN_DB = 40.0
-"""One output that comes right does not outweigh ten that get worse."""
+NEAR_DB, EVIDENT_DB = 20.0, 10.0
+"""How near an explanation must come for the order of frames not to be looked for, and
+to be named at all."""
 MOST_FAULTS = 3
-PROBES = 3
-"""Frames that an explanation is tried on, and explanations that are tried on all."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,16 +85,18 @@ def explain(run: EngineRun, pixels: Mapping[str, Pixels]) -> tuple[HostFault, ..
     close, run.fed.own = followed.close, followed.own
     faults = list[HostFault]()
     for _ in range(MOST_FAULTS):
-        if min(close.values(), default=HIGHEST_DB) >= HIGHEST_DB:
+        if min(close.values(), default=HIGHEST_DB) >= EXPLAINED_DB:
             break
-        found = _find_cause(run, pixels, close) or _find_order(run, close)
+        found = _find_fed(run, pixels, close)
         if found is None:
             break
         fault, close = found
         faults.append(fault)
-        # what was hidden by this fault may be seen now
-        if _find_readings(run):
-            close = run.follow().close
+        if fault.after_db >= EXPLAINED_DB:
+            break
+    # what was hidden by a fault may be seen now
+    if faults and _find_readings(run):
+        close = run.follow().close
     return (*faults, *_read_wrongly(run, close))
 
 
@@ -129,7 +125,7 @@ def _read_anew(run: EngineRun, names: Sequence[str], shown: Sequence[int]) -> bo
     new = False
     for name in names:
         likes, values = ([each[name] for each in all_] for all_ in (truths, answered))
-        if min(map(closeness, likes, values)) < HIGHEST_DB:
+        if min(map(closeness, likes, values)) < EXPLAINED_DB:
             found = find_readings(values, likes)
             run.readings[name] = (*run.readings.get(name, ()), *found)
             new |= bool(found)
@@ -161,27 +157,39 @@ def _read_wrongly(run: EngineRun, close: Closeness) -> Iterator[HostFault]:
         yield HostFault(readings[0].kind, said, *means, len(run), name)
 
 
+def _find_fed(
+    run: EngineRun, pixels: Mapping[str, Pixels], close: Closeness
+) -> tuple[HostFault, Closeness] | None:
+    """Name what was fed wrongly, or in which order frames were dumped."""
+    before = run.causes, run.fed
+    found = _find_cause(run, pixels, close)
+    if found is not None and found[0].after_db >= NEAR_DB:
+        return found
+    after = run.causes, run.fed
+    run.causes, run.fed = before
+    ordered = _find_order(run, close)
+    if ordered is None and found is not None:
+        gained = found[0].after_db - found[0].before_db
+        run.causes, run.fed = after
+        if found[0].after_db >= EVIDENT_DB or gained >= SURE_DB:
+            return found
+        run.causes, run.fed = before
+        return None
+    return ordered
+
+
 def _find_cause(
     run: EngineRun, pixels: Mapping[str, Pixels], close: Closeness
 ) -> tuple[HostFault, Closeness] | None:
     """Name what was fed wrongly, and the closeness with it; None if nothing was."""
-    contenders = list[tuple[float, FeedFault]]()
-    named = {each.said for each in run.causes}
-    for group in feed_faults(run.fed, pixels):
-        fresh = [each for each in group if each.said not in named]
-        contenders += _screened(run, fresh, close)
-        if any(gain >= SURE_DB for gain, _ in contenders):
-            break
-    else:
-        contenders += _camera_orders(run, close)
-    contenders.sort(key=lambda each: -each[0])
+    contenders = find_contenders(run, pixels, close)
     # the winner must win over all frames; so must what comes near it
     confirmed = list[tuple[float, FeedFault, Closeness, Fed]]()
     for gain, fault in contenders[:PROBES]:
         if confirmed and gain < contenders[0][0] - SCREENED_DB:
             break
         followed = run.follow([fault])
-        found = _gain(close, followed.close)
+        found = gain_of(close, followed.close)
         if found >= NAMED_DB:
             fed = dataclasses.replace(run.fed, own=followed.own)
             confirmed.append((found, fault, followed.close, fed))
@@ -201,82 +209,13 @@ def _fault(
     kind: str, said: str, close: Closeness, after: Closeness,
     rivals: tuple[str, ...] = (),
 ) -> HostFault:  # fmt: skip
-    touched = _touched(close, after)
+    touched = touched_by(close, after)
     means = (float(np.mean([by[at] for at in touched])) for by in (close, after))
     frames = len({index for _, index in touched})
     return HostFault(kind, said, *means, frames, rivals=rivals)
 
 
-def _screened(
-    run: EngineRun, faults: Sequence[FeedFault], close: Closeness
-) -> list[tuple[float, FeedFault]]:
-    """Return the faults that explain a few frames, with their gains in dB."""
-    found = list[tuple[float, FeedFault]]()
-    for fault in faults:
-        after = dict[tuple[str, int], float]()
-        for index in _telling(run, fault, close):
-            after |= _tried(run, fault, index)
-            if _gain(close, after) < SCREENED_DB:
-                break
-        if (gain := _gain(close, after)) >= SCREENED_DB:
-            found.append((gain, fault))
-    return found
-
-
-def _tried(
-    run: EngineRun, fault: FeedFault, index: int
-) -> dict[tuple[str, int], float]:
-    truth, answered = run.answer(index, [fault]), run.engine(index)
-    return {
-        (name, index): closeness(truth[name], answered[name]) for name in run.names
-    }
-
-
-def _telling(run: EngineRun, fault: FeedFault, close: Closeness) -> list[int]:
-    """Return the frames that a fault touches, those with the worst answers first."""
-    found = list[int]()
-    for index in _worst_first(run, close):
-        if run.fed.knows(index) and fault.touches(run.fed, index):
-            found.append(index)
-        if len(found) == PROBES:
-            break
-    return found
-
-
-def _worst_first(run: EngineRun, close: Closeness) -> list[int]:
-    means = [
-        float(np.mean([close[name, index] for name in run.names]))
-        for index in range(len(run))
-    ]
-    return sorted(range(len(means)), key=lambda index: means[index])
-
-
-def _camera_orders(run: EngineRun, close: Closeness) -> list[tuple[float, FeedFault]]:
-    """Look for an order of cameras, by swaps from the best of the usual ones."""
-    index = next(at for at in _worst_first(run, close) if run.fed.knows(at))
-    found = list[tuple[float, FeedFault]]()
-    for name, axis in camera_inputs(run.fed):
-        straight = tuple(range(run.fed.frames[0].arrays[name].shape[axis]))
-        best, tried = straight, {straight: TOUCHED_DB}
-        orders = list(camera_orders(len(straight)))
-        while orders:
-            for order in dict.fromkeys(orders):
-                if order not in tried:
-                    fault = cameras_ordered(name, axis, order)
-                    tried[order] = _gain(close, _tried(run, fault, index))
-            leader = max(tried, key=lambda order: tried[order])
-            orders = list(swaps(leader)) if leader != best else []
-            best = leader
-        if best != straight:
-            found += _screened(run, [cameras_ordered(name, axis, best)], close)
-        if any(gain >= SURE_DB for gain, _ in found):
-            break
-    return found
-
-
-def _find_order(
-    run: EngineRun, close: Closeness
-) -> tuple[HostFault, Closeness] | None:
+def _find_order(run: EngineRun, close: Closeness) -> tuple[HostFault, Closeness] | None:
     """Look for another order of the dump's frames."""
     if run.order is not None or run.causes or len(run) < PROBES:
         return None
@@ -290,25 +229,9 @@ def _find_order(
     if run.order is None:
         return None
     followed = run.follow()
-    if _gain(close, followed.close) < NAMED_DB:
+    if gain_of(close, followed.close) < NAMED_DB:
         run.order = None
         return None
     run.fed.own = followed.own
     said = run.order.said
     return _fault("frame-order", said, close, followed.close), followed.close
-
-
-def _touched(before: Closeness, after: Closeness) -> list[tuple[str, int]]:
-    """Return where an explanation moves the closeness of an output on a frame."""
-    return [at for at in after if abs(after[at] - before[at]) >= TOUCHED_DB]
-
-
-def _gain(before: Closeness, after: Closeness) -> float:
-    """Return the mean gain in dB where an explanation says something; 0 if it is worse.
-
-    Two of three outputs and frames that it touches must come nearer.
-    """
-    gains = np.array([after[at] - before[at] for at in _touched(before, after)])
-    if len(gains) == 0 or np.mean(gains > 0) < 2 / 3:
-        return 0.0
-    return float(np.mean(np.clip(gains, -MOST_GAIN_DB, MOST_GAIN_DB)))
