@@ -33,10 +33,11 @@ from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.export import export_stack
 from me2e_compress.workflows.frames import FramesOptions, record_frames
 
-Arrays: TypeAlias = dict[str, Array]
+Arrays: TypeAlias = dict[str, Any]
+Change: TypeAlias = Callable[[Any], Any]
 OF_OTHERS = ("uniad-", "vad-")
-PAIR = (0, 2, 1, 3, 5, 4)
-"""Cameras of nuScenes' usual order, fed to a model of CARLA's."""
+MIRRORED = (0, 2, 1, 3, 5, 4)
+"""Left and right cameras exchanged."""
 MIXED = (2, 0, 1, 5, 3, 4)
 NOISE_DB = 50.0
 STATISTICS = {
@@ -71,7 +72,7 @@ class Host:
     order: Callable[[int], list[int]] = lambda count: list(range(count))
 
 
-def changed(name: str, change: Callable[[Array], Array]) -> Any:
+def changed(name: str, change: Change) -> Any:
     def feed(frames: Sequence[Frame], at: int) -> Arrays:
         arrays = frames[at].arrays
         value = arrays[name]
@@ -89,7 +90,7 @@ def from_other(name: str | None, other: Callable[[int], int]) -> Any:
     return feed
 
 
-def reading(name: str, change: Callable[[Array], Array]) -> Any:
+def reading(name: str, change: Change) -> Any:
     return lambda outputs: outputs | {name: change(outputs[name])}
 
 
@@ -124,16 +125,20 @@ def hosts(stack: str) -> dict[str, Host]:
     motion = "can_bus"
     geometry = "lidar2img"
 
-    def shuffled(value: Array) -> Array:
+    def shuffled(value: Any) -> Any:
         axis = SLOT_AXIS[stack]
         order = np.random.default_rng(3).permutation(value.shape[axis])
         return np.take(value, order, axis=axis)
 
-    def channels_last(value: Array) -> Array:
+    def channels_last(value: Any) -> Any:
         return np.moveaxis(value, 1, -1).copy()
 
-    def blue_first(value: Array) -> Array:
+    def blue_first(value: Any) -> Any:
         return ((value * std + mean)[:, :, ::-1] - mean) / std
+
+    def half_filled(value: Any) -> Any:
+        halves = np.resize(value.astype(np.float16), 2 * value.size)
+        return halves.view(np.float32).reshape(value.shape)
 
     def as_text(count: int) -> list[int]:
         return sorted(range(count), key=str)
@@ -144,27 +149,34 @@ def hosts(stack: str) -> dict[str, Host]:
         "state one frame stale": Host(("state-late",), state=late),
         "state never fed": Host(("state-never-fed",), state=never),
         "images of 0 to 1": Host(
-            ("normalisation",), changed(image, lambda x: ((x * std + mean) / 255 - mean) / std)
+            ("normalisation",),
+            changed(image, lambda x: ((x * std + mean) / 255 - mean) / std),
         ),
         "images not normalised": Host(
             ("normalisation",), changed(image, lambda x: x * std + mean)
         ),
-        "mean missing": Host(("normalisation",), changed(image, lambda x: x + mean / std)),
+        "mean missing": Host(
+            ("normalisation",), changed(image, lambda x: x + mean / std)
+        ),
         "red and blue swapped": Host(("colours",), changed(image, blue_first)),
         "channels last": Host(
             ("input-layout",),
             changed(image, lambda x: np.moveaxis(x, 2, -1).copy().reshape(x.shape)),
         ),
-        "cameras as in nuScenes": Host(
-            ("cameras",), changed(image, lambda x: x[:, list(PAIR)])
+        "left and right cameras": Host(
+            ("cameras",), changed(image, lambda x: x[:, list(MIRRORED)])
         ),
-        "cameras mixed": Host(("cameras",), changed(image, lambda x: x[:, list(MIXED)])),
+        "cameras mixed": Host(
+            ("cameras",), changed(image, lambda x: x[:, list(MIXED)])
+        ),
         "matrices transposed": Host(
             ("input-layout",), changed(geometry, lambda x: x.swapaxes(-1, -2))
         ),
         "ego status stuck": Host(("input-stuck",), from_other(motion, lambda at: 0)),
         "command stuck": Host(("input-stuck",), from_other("command", lambda at: 0)),
-        "images one frame late": Host(("input-late",), from_other(image, lambda at: at - 1)),
+        "images one frame late": Host(
+            ("input-late",), from_other(image, lambda at: at - 1)
+        ),
         "ego status never fed": Host(
             ("input-never-fed",), changed(motion, np.zeros_like)
         ),
@@ -177,20 +189,18 @@ def hosts(stack: str) -> dict[str, Host]:
         ),
         "float16 read as float32": Host(
             ("dtype",),
-            read=reading(
-                large,
-                lambda x: np.resize(x.astype(np.float16), 2 * x.size).view(np.float32).reshape(x.shape),
-            ),
+            read=reading(large, half_filled),
         ),
         "big endian": Host(("dtype",), read=reading(small, lambda x: x.byteswap())),
         "output channels last": Host(("layout",), read=reading(large, channels_last)),
         "output transposed, shape kept": Host(
-            ("layout",), read=reading(large, lambda x: channels_last(x).reshape(x.shape))
+            ("layout",),
+            read=reading(large, lambda x: channels_last(x).reshape(x.shape)),
         ),
         "output flat": Host(("layout",), read=reading(small, lambda x: x.reshape(-1))),
         "slots in another order": Host(("slots",), read=reading(slots, shuffled)),
         "output scaled": Host(("scale",), read=reading(large, lambda x: x * 0.5)),
-    }  # fmt: skip
+    }
 
 
 def drive(session: Session, frames: Sequence[Frame], host: Host) -> list[Arrays]:
@@ -273,7 +283,7 @@ def faults(model: Path, recording: CalibrationSet, out: Path, options: Any) -> N
                 for each in given
             ]
             folder = write(out / "dump", names, kept)
-            found, seconds = judged(model, folder, recording.folder, not dumped)
+            found, seconds = judged(model, folder, recording.folder)
             total += 1
             right += (ok := is_right(host, found))
             line = told(name, found, seconds)
@@ -291,9 +301,10 @@ def alarms(source: Path, seen: Path, recording: CalibrationSet, out: Path) -> No
         model = source if name == "source" else made(source, name, seen, out)
         for kind in ("float32", "float16", "bfloat16"):
             given = drive(engine_of(model, kind), list(recording), Host(("",)))
-            for said, dump in _roundings(given) if kind == "float32" else [("", given)]:
+            dumps = list(_roundings(given)) if kind == "float32" else [("", given)]
+            for said, dump in dumps:
                 folder = write(out / "dump", names, dump)
-                found, _ = judged(model, folder, recording.folder, False)
+                found, _ = judged(model, folder, recording.folder)
                 least = min(each.compilation_db for each in found.outputs)
                 kinds = ", ".join(each.said for each in found.faults) or "nothing"
                 print(
@@ -306,12 +317,12 @@ def alarms(source: Path, seen: Path, recording: CalibrationSet, out: Path) -> No
 def _roundings(given: list[Arrays]) -> Iterator[tuple[str, list[Arrays]]]:
     noise = np.random.default_rng(0)
 
-    def noisy(value: Array) -> Array:
+    def noisy(value: Any) -> Any:
         power = np.sqrt(np.mean(np.square(value, dtype=np.float64)))
         level = power * 10 ** (-NOISE_DB / 20)
         return (value + noise.normal(0, level, value.shape)).astype(value.dtype)
 
-    def each(change: Callable[[Array], Array]) -> list[Arrays]:
+    def each(change: Change) -> list[Arrays]:
         return [{name: change(value) for name, value in of.items()} for of in given]
 
     yield "", given

@@ -193,7 +193,7 @@ def _run_results(path: Path, document: Mapping[str, Any]) -> list[Mapping[str, A
         runners: Sequence[Any] = document["lst"]
         if len(runners) != 1:
             raise ValueError(f"{len(runners)} runners, expected one: save each alone")
-        found = [
+        found: list[Mapping[str, Array]] = [
             {name: _array(name, each) for name, each in iteration["outputs"].items()}
             for iteration in runners[0][1]
         ]

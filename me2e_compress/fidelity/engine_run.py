@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from me2e_compress.fidelity.dump_readings import (
     closeness,
     undone,
 )
-from me2e_compress.fidelity.fed import Fed, FeedFault, State
+from me2e_compress.fidelity.fed import Fed, FeedFault, Indexed, State
 from me2e_compress.fidelity.frame_order import FrameOrder
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
@@ -35,17 +35,17 @@ class Followed:
     own: dict[int, State]
 
 
-class _Recent(Sequence[Frame]):
+class _Recent:
     """Frames, the last few of them in memory."""
 
-    def __init__(self, frames: Sequence[Frame]) -> None:
+    def __init__(self, frames: Indexed[Frame]) -> None:
         self._count = len(frames)
         self._at = functools.lru_cache(maxsize=RECENT)(frames.__getitem__)
 
     def __len__(self) -> int:
         return self._count
 
-    def __getitem__(self, index: Any) -> Any:
+    def __getitem__(self, index: int, /) -> Frame:
         return self._at(index)
 
 
@@ -65,8 +65,8 @@ class EngineRun:
     def __init__(
         self,
         session: AnySession,
-        frames: Sequence[Frame],
-        dump: Sequence[Answers],
+        frames: Indexed[Frame],
+        dump: Indexed[Answers],
         on_inference: Callable[[int], None] = lambda count: None,
     ) -> None:
         self.dump = dump

@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -13,8 +13,21 @@ from me2e_compress.runtime.session import DTYPES
 
 Feeds: TypeAlias = dict[str, Array]
 State: TypeAlias = Mapping[str, Array]
+T_co = TypeVar("T_co", covariant=True)
 OWN_STATE_BYTES = 1 << 29
 """State of our own run that is kept for single frames: 50 frames of VAD-tiny."""
+
+
+class Indexed(Protocol[T_co]):
+    """A recording that is read by index."""
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        ...
+
+    def __getitem__(self, index: int, /) -> T_co:
+        """Read one frame."""
+        ...
 
 
 @dataclass(eq=False)
@@ -31,7 +44,7 @@ class Fed:
     """
 
     session: AnySession
-    frames: Sequence[Frame]
+    frames: Indexed[Frame]
     given: Callable[[int], State]
     own: dict[int, State] = field(default_factory=dict)
 

@@ -8,13 +8,16 @@ import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from me2e_compress.fidelity.fed import Fed, FeedFault, Feeds
 from me2e_compress.runtime.frames import Array
 
+Change: TypeAlias = Callable[[Any], Any]
+"""Returns an input, changed."""
 MOST_CAMERAS = 12
 SMALLEST_PICTURE = 8
 """Rows and columns; a matrix has fewer."""
@@ -87,12 +90,13 @@ class InputFault(FeedFault):
     """One input, changed in the same way on every frame."""
 
     name: str
-    change: Callable[[Array], Array]
+    change: Change
 
     def apply(self, fed: Fed, index: int, feeds: Feeds) -> Feeds:
         """Feed the changed input."""
         value = feeds[self.name]
-        return feeds | {self.name: self.change(value).astype(value.dtype)}
+        changed: Array = self.change(value).astype(value.dtype)
+        return feeds | {self.name: changed}
 
 
 def feed_faults(
@@ -142,7 +146,7 @@ def _of_frames(inputs: Sequence[str]) -> Iterator[FrameFault]:
 
 
 def _of_input(name: str, value: Array, pixels: Pixels | None) -> Iterator[InputFault]:
-    def fault(kind: str, said: str, change: Callable[[Array], Array]) -> InputFault:
+    def fault(kind: str, said: str, change: Change) -> InputFault:
         return InputFault(kind, f"input {name} {said}", name, change)
 
     yield fault("input-never-fed", "is never fed: it stays zero", np.zeros_like)
@@ -165,9 +169,7 @@ def _of_input(name: str, value: Array, pixels: Pixels | None) -> Iterator[InputF
     )
 
 
-def _ranges(
-    channels: int, pixels: Pixels | None
-) -> Iterator[tuple[str, Callable[[Array], Array]]]:
+def _ranges(channels: int, pixels: Pixels | None) -> Iterator[tuple[str, Change]]:
     """Propose other ranges of pictures; those of grey levels need their statistics."""
     yield "is of 0 to 1 where 0 to 255 is meant: divided by 255", lambda x: x / 255
     yield "is of 0 to 255 where 0 to 1 is meant: times 255", lambda x: x * 255
@@ -185,7 +187,7 @@ def _ranges(
     yield "is normalised twice", lambda x: (x - mean) / std
 
 
-def _swapped(channels: int, pixels: Pixels | None) -> Callable[[Array], Array]:
+def _swapped(channels: int, pixels: Pixels | None) -> Change:
     """Return what swaps red and blue before the normalisation."""
     if pixels is None:
         return lambda x: np.flip(x, channels)
@@ -193,7 +195,7 @@ def _swapped(channels: int, pixels: Pixels | None) -> Callable[[Array], Array]:
     return lambda x: (np.flip(x * std + mean, channels) - mean) / std
 
 
-def _by_channel(values: Sequence[float], channels: int) -> Array:
+def _by_channel(values: Sequence[float], channels: int) -> npt.NDArray[np.float64]:
     return np.array(values, np.float64).reshape([-1, *[1] * (-1 - channels)])
 
 
@@ -254,6 +256,7 @@ def camera_orders(count: int) -> Iterator[tuple[int, ...]]:
 CONVENTIONS = (
     ("f", "fl", "fr", "b", "bl", "br"),  # VAD's and UniAD's agents in CARLA, ours
     ("f", "fr", "fl", "b", "bl", "br"),  # nuScenes in mmdetection3d, BEVFormer
+    ("f", "fr", "fl", "b", "br", "bl"),  # left and right exchanged
     ("fl", "f", "fr", "bl", "b", "br"),  # pictures of nuScenes in two rows
     ("f", "fr", "br", "b", "bl", "fl"),  # clockwise
     ("f", "fl", "bl", "b", "br", "fr"),

@@ -96,10 +96,10 @@ def _camera_orders(run: EngineRun, close: Closeness) -> list[tuple[float, FeedFa
     index = next(at for at in _worst_first(run, close) if run.fed.knows(at))
     if np.mean([close[name, index] for name in run.names]) >= CAMERAS_DB:
         return []
-    pictures, *others = camera_inputs(run.fed) or [None]
-    if pictures is None:
+    found = camera_inputs(run.fed)
+    if not found:
         return []
-    name, axis = pictures
+    (name, axis), *others = found
     straight = tuple(range(run.fed.frames[0].arrays[name].shape[axis]))
     best, tried = straight, {straight: TOUCHED_DB}
     orders = list(camera_orders(len(straight)))

@@ -19,7 +19,7 @@ from me2e_compress.fidelity.dump_readings import (
     closeness,
     find_readings,
 )
-from me2e_compress.fidelity.engine_run import Closeness, EngineRun
+from me2e_compress.fidelity.engine_run import Answers, Closeness, EngineRun
 from me2e_compress.fidelity.fed import Fed, FeedFault
 from me2e_compress.fidelity.feed_faults import Pixels
 from me2e_compress.fidelity.feed_search import (
@@ -138,9 +138,9 @@ def _read_wrongly(run: EngineRun, close: Closeness) -> Iterator[HostFault]:
         return
     plain = dict[str, list[float]]()
 
-    def watch(index: int, truth: Mapping[str, object], _: object) -> None:
+    def watch(index: int, truth: Answers, _: Answers) -> None:
         for name in run.names:
-            right, raw = np.asarray(truth[name]), run.raw(index)[name]
+            right, raw = truth[name], run.raw(index)[name]
             plain.setdefault(name, []).append(closeness(right, raw))
 
     with np.errstate(all="ignore"):  # as they stand, they may be any numbers
@@ -210,9 +210,11 @@ def _fault(
     rivals: tuple[str, ...] = (),
 ) -> HostFault:  # fmt: skip
     touched = touched_by(close, after)
-    means = (float(np.mean([by[at] for at in touched])) for by in (close, after))
+    before_db, after_db = (
+        float(np.mean([by[at] for at in touched])) for by in (close, after)
+    )
     frames = len({index for _, index in touched})
-    return HostFault(kind, said, *means, frames, rivals=rivals)
+    return HostFault(kind, said, before_db, after_db, frames, rivals=rivals)
 
 
 def _find_order(run: EngineRun, close: Closeness) -> tuple[HostFault, Closeness] | None:
@@ -221,7 +223,7 @@ def _find_order(run: EngineRun, close: Closeness) -> tuple[HostFault, Closeness]
         return None
     # state that follows the frames as recorded, whatever the dump says
     own = Fed(run.fed.session, run.fed.frames, lambda index: {})
-    truths = list[Mapping[str, object]]()
+    truths = list[Answers]()
     for answers in own.follow((), run.names):
         run.count()
         truths.append(sample(answers))

@@ -10,6 +10,7 @@ from me2e_compress.cli.console import listening, show
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import compare as workflow
 from me2e_compress.workflows import compare_dump as against_engine
+from me2e_compress.workflows.result import Result
 
 
 def compare(
@@ -44,13 +45,14 @@ def compare(
     if (outputs is None) == (frames is None):
         said = "M.onnx FRAMES --outputs DUMP" if frames else "A.onnx B.onnx FRAMES"
         raise typer.BadParameter(f"expected {said}", param_hint="FRAMES")
+    found: Result
     with listening() as listener:
         if outputs is not None:
             found = against_engine.compare_dump(
                 *(reference, outputs, candidate, listener),
                 float_graph=float_graph, provider=runs_on, adapter=adapter,
             )  # fmt: skip
-        else:
+        elif frames is not None:
             found = workflow.compare(
                 *(reference, candidate, frames, listener),
                 as_it_stands=as_it_stands, provider=runs_on, adapter=adapter,
