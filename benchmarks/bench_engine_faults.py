@@ -238,9 +238,7 @@ def engine_of(path: Path, kind: str) -> Session:
     return Session(model, threads=1, release=True)
 
 
-def judged(
-    model: Path, dump: Path, frames: Path, without: bool
-) -> tuple[DumpResult, float]:
+def judged(model: Path, dump: Path, frames: Path) -> tuple[DumpResult, float]:
     start = process_time()
     found = compare_dump(model, dump, frames)
     return found, process_time() - start

@@ -28,6 +28,7 @@ from me2e_compress.sensitivity.remedy import Remedy
 from me2e_compress.study.on_road.halving import Rung
 from me2e_compress.targets.base import LintFinding
 from me2e_compress.workflows.check_model import ModelCheck
+from me2e_compress.workflows.compare_dump import DumpResult
 from me2e_compress.workflows.doctor import Checkup
 from me2e_compress.workflows.inspect_result import InspectResult
 from me2e_compress.workflows.int8_outcome import Int8Outcome
@@ -40,7 +41,7 @@ NAMED = (
     *(Ranges, PortUse, Fidelity, OpenLoop, Step, Verification, Decision, QuantPlan),
     *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity, Remedy, Rung),
     *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
-    *(Int8Outcome, WeightsRecord),
+    *(Int8Outcome, WeightsRecord, DumpResult),
 )
 """Classes that the forms name; what their fields name is found."""
 HEAD = """\

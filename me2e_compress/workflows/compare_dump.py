@@ -322,9 +322,9 @@ def _losses(run: EngineRun, source: AnySession | None) -> tuple[OutputLoss, ...]
             if name in exact:
                 each["quantization"].add(exact[name], truth[name])
             each["compilation"].add(as_fed[name], read[name])
-            each["host"].add(truth[name], as_fed[name])
-            if run.readings.get(name) or run.order:
-                each["host"].add(read[name], dumped[name])
+            changed = _changed(read[name], dumped[name])
+            found = None if changed is None else np.add(as_fed[name], changed)
+            each["host"].add(truth[name], found)
             each["all"].add(exact.get(name, truth[name]), dumped[name])
     faulty = run.causes or run.order
     return tuple(
@@ -337,6 +337,14 @@ def _losses(run: EngineRun, source: AnySession | None) -> tuple[OutputLoss, ...]
         )
         for name, each in sums.items()
     )
+
+
+def _changed(read: Array, dumped: Array) -> Array | None:
+    """Return what reading an output wrongly added to it; None if the shape differs."""
+    if read.shape != dumped.shape:
+        return None
+    with np.errstate(all="ignore"):  # bytes of another type are any numbers
+        return np.asarray(dumped, np.float64) - np.asarray(read, np.float64)
 
 
 def _known(decibels: float | None) -> float:
