@@ -141,7 +141,8 @@ def hosts(stack: str) -> dict[str, Host]:
         return halves.view(np.float32).reshape(value.shape)
 
     def as_text(count: int) -> list[int]:
-        return sorted(range(count), key=str)
+        straight = list(range(count))
+        return sorted(straight, key=str) if count > 10 else straight[::-1]
 
     return {
         "none": Host(("",)),

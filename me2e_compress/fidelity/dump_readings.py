@@ -182,7 +182,7 @@ def find_readings(
 ) -> tuple[Reading, ...]:
     """Return what brings an output to the graph's answer on frames; empty if nothing.
 
-    Constants and orders are fitted on the first frame, and must hold on the last.
+    Constants and orders are fitted on the first frame, and must hold on the others.
     """
     found = tuple[Reading, ...]()
     reached = _closeness(found, values, likes)
@@ -206,10 +206,18 @@ def find_readings(
 def _closeness(
     readings: Sequence[Reading], values: Sequence[Array], likes: Sequence[Array]
 ) -> float:
-    """Return the closeness on the last frame: the one that nothing was fitted on."""
-    with np.errstate(all="ignore"):
-        read = undone(readings, values[-1], likes[-1])
-    return LOWEST_DB if read is None else closeness(likes[-1], read)
+    """Return the mean closeness on frames; what is fitted is not judged on the first.
+
+    A mean, since an engine may choose another plan or order of agents on one frame.
+    """
+    fitted = any(isinstance(each, Scaled | Slots) for each in readings)
+    begin = 1 if fitted and len(values) > 1 else 0
+    found = list[float]()
+    for value, like in zip(values[begin:], likes[begin:], strict=True):
+        with np.errstate(all="ignore"):
+            read = undone(readings, value, like)
+        found.append(LOWEST_DB if read is None else closeness(like, read))
+    return float(np.mean(found))
 
 
 def _candidates(value: Array | None, like: Array, *, single: bool) -> Iterator[Reading]:

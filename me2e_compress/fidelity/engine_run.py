@@ -119,15 +119,16 @@ class EngineRun:
         self.inferences += 1
         self._told(self.inferences)
 
-    def check(self) -> None:
+    def check(self, names: Sequence[str]) -> None:
         """Refuse answers whose size or numbers no reading explains.
 
         Raises:
             EvaluationError: an output has another shape, or is not finite.
         """
         for index in range(len(self)):
-            for name, value in self.engine(index).items():
-                right = self.likes[name]
+            answered = self.engine(index)
+            for name in names:
+                value, right = answered[name], self.likes[name]
                 if value.shape != right.shape:
                     raise EvaluationError(
                         f"output {name} is {list(value.shape)} in the dump at frame"

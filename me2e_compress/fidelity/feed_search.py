@@ -33,7 +33,7 @@ PROBES = 3
 def find_contenders(
     run: EngineRun, pixels: Mapping[str, Pixels], close: Closeness
 ) -> list[tuple[float, FeedFault]]:
-    """Return what explains a few frames, with the gains in dB, the largest first."""
+    """Return what explains a few frames, with gains in dB; the common ones first."""
     found = list[tuple[float, FeedFault]]()
     named = {each.said for each in run.causes}
     for group in feed_faults(run.fed, pixels):
@@ -43,7 +43,7 @@ def find_contenders(
             break
     else:
         found += _camera_orders(run, close)
-    return sorted(found, key=lambda each: -each[0])
+    return found
 
 
 def _screened(
@@ -58,7 +58,8 @@ def _screened(
             if gain_of(close, after) < SCREENED_DB:
                 break
         if (gain := gain_of(close, after)) >= SCREENED_DB:
-            found.append((gain, fault))
+            frames = {index for _, index in after}
+            found.append((gain * len(frames) / PROBES, fault))
     return found
 
 

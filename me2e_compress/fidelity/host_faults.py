@@ -24,9 +24,7 @@ from me2e_compress.fidelity.fed import Fed, FeedFault
 from me2e_compress.fidelity.feed_faults import Pixels
 from me2e_compress.fidelity.feed_search import (
     PROBES,
-    SCREENED_DB,
     SURE_DB,
-    TOUCHED_DB,
     find_contenders,
     gain_of,
     touched_by,
@@ -36,6 +34,8 @@ from me2e_compress.fidelity.frame_order import find_order, sample
 NEAR_DB, EVIDENT_DB = 20.0, 10.0
 """How near an explanation must come for the order of frames not to be looked for, and
 to be named at all."""
+AS_GOOD_DB = 1.0
+"""Explanations that differ by less over all frames are told together."""
 MOST_FAULTS = 3
 
 
@@ -80,7 +80,7 @@ def explain(run: EngineRun, pixels: Mapping[str, Pixels]) -> tuple[HostFault, ..
             it.
     """
     _find_readings(run)
-    run.check()
+    run.check(run.names)
     followed = run.follow()
     close, run.fed.own = followed.close, followed.own
     faults = list[HostFault]()
@@ -101,21 +101,20 @@ def explain(run: EngineRun, pixels: Mapping[str, Pixels]) -> tuple[HostFault, ..
 
 
 def _find_readings(run: EngineRun) -> bool:
-    """Look for readings on frames that no state reaches; return whether one is new."""
-    session, frames = run.fed.session, run.fed.frames
-    starts = [at for at in range(1, len(run)) if frames[at].starts_scene][:1]
-    if starts or len(run) == 1 or not session.recurrent:
-        others = starts or list(range(1, len(run)))[-1:]
-        return _read_anew(run, run.names, [0, *others])
-    # in a single scene, state is what recurrent outputs say: they are read first
-    states = [name for name in run.names if name in session.recurrent.values()]
-    new = _read_anew(run, states, [0])
-    if not run.fed.knows(1):
+    """Look for readings, on frames that no state reaches first; True if one is new."""
+    frames = run.fed.frames
+    starts = [at for at in range(1, len(run)) if frames[at].starts_scene][:2]
+    # recurrent outputs first: other frames are fed what they say
+    states = set(run.fed.session.recurrent.values())
+    recurrent = [name for name in run.names if name in states]
+    new = bool(recurrent) and _read_anew(run, recurrent, [0, *starts])
+    run.check(recurrent)
+    if len(run) > 1 and not run.fed.knows(1):
         next(run.fed.follow(run.causes, []))
         run.count()
-    run.likes |= run.answer(0, ()) if not states else {}
-    rest = [name for name in run.names if name not in states]
-    return _read_anew(run, rest, [0, 1]) or new
+    others = [at for at in (1, len(run) // 2 + 1, len(run) - 1) if at < len(run)]
+    known = [at for at in others if run.fed.knows(at)][-2:]
+    return _read_anew(run, run.names, [*dict.fromkeys([0, *starts, *known])]) or new
 
 
 def _read_anew(run: EngineRun, names: Sequence[str], shown: Sequence[int]) -> bool:
@@ -182,26 +181,27 @@ def _find_cause(
     run: EngineRun, pixels: Mapping[str, Pixels], close: Closeness
 ) -> tuple[HostFault, Closeness] | None:
     """Name what was fed wrongly, and the closeness with it; None if nothing was."""
-    contenders = find_contenders(run, pixels, close)
-    # the winner must win over all frames; so must what comes near it
+    proposed = find_contenders(run, pixels, close)
+    contenders = sorted(proposed, key=lambda each: -each[0])[:PROBES]
+    # the winner must win over all frames
     confirmed = list[tuple[float, FeedFault, Closeness, Fed]]()
-    for gain, fault in contenders[:PROBES]:
-        if confirmed and gain < contenders[0][0] - SCREENED_DB:
-            break
+    for _, fault in contenders:
         followed = run.follow([fault])
-        found = gain_of(close, followed.close)
-        if found >= NAMED_DB:
+        if gain_of(close, followed.close) >= NAMED_DB:
             fed = dataclasses.replace(run.fed, own=followed.own)
+            # what explains more frames explains more
+            found = float(np.mean(list(followed.close.values())))
             confirmed.append((found, fault, followed.close, fed))
     if not confirmed:
         return None
-    best, fault, after, run.fed = max(confirmed, key=lambda each: each[0])
+    # of what explains as much, what was proposed first is named: it is more common
+    best = max(found for found, *_ in confirmed)
+    order = {fault.said: at for at, (_, fault) in enumerate(proposed)}
+    equal = [each for each in confirmed if each[0] > best - AS_GOOD_DB]
+    equal.sort(key=lambda each: order[each[1].said])
+    _, fault, after, run.fed = equal[0]
     run.causes = (*run.causes, fault)
-    rivals = tuple(
-        other.said
-        for found, other, *_ in confirmed
-        if other is not fault and found > best - TOUCHED_DB
-    )
+    rivals = tuple(other.said for _, other, *_ in equal[1:])
     return _fault(fault.kind, fault.said, close, after, rivals), after
 
 
