@@ -290,12 +290,14 @@ def faults(model: Path, recording: CalibrationSet, out: Path, options: Any) -> N
         print(f"{right} of {total} right")
 
 
-def alarms(source: Path, seen: Path, recording: CalibrationSet, out: Path) -> None:
+def alarms(
+    source: Path, seen: Path, recording: CalibrationSet, out: Path, only: str
+) -> None:
     """Judge engines without a fault: every recipe, rounded in several ways."""
     names = [each.name for each in recording.files]
     print("recipe, engine | named | least dB | inferences")
     for name in ["source", *recipe.shipped()]:
-        if name.startswith(OF_OTHERS):
+        if name.startswith(OF_OTHERS) or (only and name not in only.split(",")):
             continue
         model = source if name == "source" else made(source, name, seen, out)
         for kind in ("float32", "float16", "bfloat16"):
@@ -362,7 +364,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             record_frames(options.stack, folder, given)
     recording = CalibrationSet(held_out)
     if options.alarms:
-        return alarms(source, seen, recording, out)
+        return alarms(source, seen, recording, out, options.only)
     model = made(source, options.recipe, seen, out) if options.recipe else source
     return faults(model, recording, out, options)
 

@@ -114,10 +114,11 @@ def feed_faults(
 
 def _of_state(states: Sequence[str]) -> Iterator[StateFault]:
     # all state at once, then each of several
-    for names in dict.fromkeys([tuple(states), *((name,) for name in states)]):
-        if not names:
-            continue
-        said = "the state" if len(names) > 1 or len(states) == 1 else names[0]
+    every = tuple(states)
+    for names in dict.fromkeys(
+        [every, *((name,) for name in states)] if states else []
+    ):
+        said = "the state" if names == every else names[0]
         yield StateFault(
             "state-not-reset", f"{said} is not reset where a scene begins",
             "carried", names,

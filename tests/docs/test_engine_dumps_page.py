@@ -53,7 +53,7 @@ def dumped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     record(tmp_path / "frames", [
         {
             name: np.array([1]) if name == "command"
-            else drawn.normal(size=port.shape).astype(np.float32)
+            else drawn.normal(size=np.array(port.shape, int)).astype(np.float32)
             for name, port in shapes.items() if not name.startswith("prev_")
         }
         for _ in range(3)
@@ -80,10 +80,11 @@ def test_the_script_dumps_what_a_replay_answers(dumped: Path) -> None:
         replay(Session(shipped("highway")), frames),
         strict=True,
     ):
-        found = np.load(path)
+        found = dict(np.load(path))
         assert path.name in {each.name for each in frames.files}
         for name, array in wanted.items():
-            np.testing.assert_allclose(found[name], array, rtol=1e-4, atol=1e-4)
+            right: Any = array
+            np.testing.assert_allclose(found[name], right, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -42,19 +42,19 @@ def compare(
 ) -> None:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres."""
     runs_on = provider_named(provider, plugins or ())
-    if (outputs is None) == (frames is None):
-        said = "M.onnx FRAMES --outputs DUMP" if frames else "A.onnx B.onnx FRAMES"
-        raise typer.BadParameter(f"expected {said}", param_hint="FRAMES")
     found: Result
     with listening() as listener:
-        if outputs is not None:
+        if outputs is not None and frames is None:
             found = against_engine.compare_dump(
                 *(reference, outputs, candidate, listener),
                 float_graph=float_graph, provider=runs_on, adapter=adapter,
             )  # fmt: skip
-        elif frames is not None:
+        elif outputs is None and frames is not None:
             found = workflow.compare(
                 *(reference, candidate, frames, listener),
                 as_it_stands=as_it_stands, provider=runs_on, adapter=adapter,
             )  # fmt: skip
+        else:
+            said = "M.onnx FRAMES --outputs DUMP" if frames else "A.onnx B.onnx FRAMES"
+            raise typer.BadParameter(f"expected {said}", param_hint="FRAMES")
     show(found)
