@@ -30,7 +30,7 @@ PROBES = 3
 """Frames that an explanation is tried on, and explanations that are tried on all."""
 
 
-def find_contenders(
+def find_explanations(
     run: EngineRun, pixels: Mapping[str, Pixels], close: Closeness
 ) -> list[tuple[float, FeedFault]]:
     """Return what explains a few frames, with gains in dB; the common ones first."""

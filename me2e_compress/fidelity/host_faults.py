@@ -25,7 +25,7 @@ from me2e_compress.fidelity.feed_faults import Pixels
 from me2e_compress.fidelity.feed_search import (
     PROBES,
     SURE_DB,
-    find_contenders,
+    find_explanations,
     gain_of,
     touched_by,
 )
@@ -181,11 +181,11 @@ def _find_cause(
     run: EngineRun, pixels: Mapping[str, Pixels], close: Closeness
 ) -> tuple[HostFault, Closeness] | None:
     """Name what was fed wrongly, and the closeness with it; None if nothing was."""
-    proposed = find_contenders(run, pixels, close)
-    contenders = sorted(proposed, key=lambda each: -each[0])[:PROBES]
+    proposed = find_explanations(run, pixels, close)
+    screened = sorted(proposed, key=lambda each: -each[0])[:PROBES]
     # the winner must win over all frames
     confirmed = list[tuple[float, FeedFault, Closeness, Fed]]()
-    for _, fault in contenders:
+    for _, fault in screened:
         followed = run.follow([fault])
         if gain_of(close, followed.close) >= NAMED_DB:
             fed = dataclasses.replace(run.fed, own=followed.own)
