@@ -58,7 +58,7 @@ def dumped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         }
         for _ in range(3)
     ], (0, 2))  # fmt: skip
-    package = {
+    package: dict[str, dict[str, Any]] = {
         "polygraphy.backend.common": {"BytesFromPath": str},
         "polygraphy.backend.trt": {"EngineFromBytes": str, "TrtRunner": Runner},
     }
