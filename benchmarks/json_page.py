@@ -30,6 +30,7 @@ from me2e_compress.sensitivity.remedy import Remedy
 from me2e_compress.study.on_road.halving import Rung
 from me2e_compress.targets.base import LintFinding
 from me2e_compress.workflows.check_model import ModelCheck
+from me2e_compress.workflows.compare_dump import DumpResult
 from me2e_compress.workflows.doctor import Checkup
 from me2e_compress.workflows.inspect_result import InspectResult
 from me2e_compress.workflows.int8_outcome import Int8Outcome
@@ -53,7 +54,7 @@ NAMED = (
     ),
     *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity, Remedy, Rung),
     *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
-    *(Int8Outcome, RuleSummary, WeightsRecord, RangeFinding),
+    *(Int8Outcome, RuleSummary, WeightsRecord, RangeFinding, DumpResult),
 )
 """Classes that the forms name; what their fields name is found."""
 HEAD = """\
@@ -85,7 +86,7 @@ _FILLER = re.compile(
     r"\b(an?|as|at|by|each|for|has|in|is|its?|of|on|one|per|th(e|at|is|ey)|to|was|were"
     r"|what|which|with)\b"
 )
-_MAY_BE_INFINITE = {"sqnr_db", "error"}
+_MAY_BE_INFINITE = {"sqnr_db", "error", "compilation_db"}
 """Of a comparison: outputs that are equal, or one that is zero."""
 
 

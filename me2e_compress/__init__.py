@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.calibrate_result import CalibrateResult
     from me2e_compress.workflows.check_model import ModelCheck, check_model
     from me2e_compress.workflows.compare import CompareResult, compare
+    from me2e_compress.workflows.compare_dump import DumpResult, compare_dump
     from me2e_compress.workflows.compress import CompressOptions, compress
     from me2e_compress.workflows.compress_result import CompressResult
     from me2e_compress.workflows.evaluate import (
@@ -68,6 +69,7 @@ __all__ = [
     "CompressOptions",
     "CompressResult",
     "Context",
+    "DumpResult",
     "EerOptions",
     "EngineResult",
     "EvaluateOptions",
@@ -102,6 +104,7 @@ __all__ = [
     "calibrate",
     "check_model",
     "compare",
+    "compare_dump",
     "compress",
     "evaluate",
     "graph",
@@ -144,6 +147,7 @@ _ROOMS = {
     "workflows.calibrate_result": ("CalibrateResult",),
     "workflows.check_model": ("ModelCheck", "check_model"),
     "workflows.compare": ("CompareResult", "compare"),
+    "workflows.compare_dump": ("DumpResult", "compare_dump"),
     "workflows.compress": ("CompressOptions", "compress"),
     "workflows.compress_result": ("CompressResult",),
     "workflows.evaluate": ("EvaluateOptions", "EvaluateResult", "evaluate"),

@@ -122,6 +122,8 @@ OTHERS = {
     "export highway -o out.onnx --heads nuscenes": "--heads.*cannot be chosen",
     "export highway -o out.onnx --weights a.pth": "--weights.*cannot be chosen",
     "compare dense.onnx path.onnx frames": "no output in common",
+    "compare dense.onnx frames --outputs none": "none: no such folder or file",
+    "compare dense.onnx frames --outputs frames": "the dump is of another graph",
     "frames vad-huge -o out": "no stack 'vad-huge' in the zoo",
     "plan latin.json": r"latin\.json: not a plan",
     "plan dense.onnx --against none.onnx": "none.onnx: no such file; models",

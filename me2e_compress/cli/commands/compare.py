@@ -1,5 +1,6 @@
 """``me2e-compress compare``."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -9,12 +10,17 @@ from me2e_compress.cli.console import listening, show
 from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import compare as workflow
+from me2e_compress.workflows import compare_dump as against_engine
 
 
 def compare(
     reference: Annotated[str, typer.Argument(help="graph or stack to be true to")],
-    candidate: Annotated[str, typer.Argument(help="the graph that is judged")],
-    frames: given.Recording,
+    candidate: Annotated[
+        str, typer.Argument(help="the graph that is judged; not with --outputs")
+    ],
+    frames: Annotated[
+        Path | None, typer.Argument(help="the recorded FRAMES", show_default=False)
+    ] = None,
     as_it_stands: Annotated[
         bool,
         typer.Option(
@@ -23,6 +29,14 @@ def compare(
         ),
     ] = False,
     alive: given.Alive = ALIVE,
+    outputs: Annotated[
+        Path | None,
+        typer.Option(help="what an engine of the graph answered: DUMP/ or JSON"),
+    ] = None,
+    float_graph: Annotated[
+        str | None,
+        typer.Option("--float", help="the graph's float source, with --outputs"),
+    ] = None,
     adapter: given.Adapter = None,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
@@ -31,16 +45,21 @@ def compare(
 
     Exit code 1 if an output of the second does not answer its inputs any more.
     """
+    runs_on = provider_named(provider, plugins or ())
     with listening() as listener:
+        if outputs is not None and frames is None:
+            dumped = against_engine.compare_dump(
+                *(reference, outputs, candidate, listener),
+                float_graph=float_graph, provider=runs_on, adapter=adapter,
+            )  # fmt: skip
+            show(dumped)
+            return
+        if outputs is not None or frames is None:
+            said = "M.onnx FRAMES --outputs DUMP" if frames else "A.onnx B.onnx FRAMES"
+            raise typer.BadParameter(f"expected {said}", param_hint="FRAMES")
         found = workflow.compare(
-            reference,
-            candidate,
-            frames,
-            listener,
-            as_it_stands=as_it_stands,
-            alive=alive,
-            provider=provider_named(provider, plugins or ()),
-            adapter=adapter,
-        )
+            *(reference, candidate, frames, listener), as_it_stands=as_it_stands,
+            alive=alive, provider=runs_on, adapter=adapter,
+        )  # fmt: skip
     show(found)
     found.check()

@@ -1,0 +1,253 @@
+"""Hold what an engine answered elsewhere against its graph, and split what was lost."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from me2e_compress import graph
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.engine_dump import EngineDump
+from me2e_compress.driving.adapter.image_inputs import IMAGE, ImageNormalization
+from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.fidelity.dump_readings import HIGHEST_DB
+from me2e_compress.fidelity.engine_loss import OutputLoss, losses
+from me2e_compress.fidelity.engine_run import EngineRun
+from me2e_compress.fidelity.feed_faults import Pixels
+from me2e_compress.fidelity.host_faults import HostFault, explain
+from me2e_compress.graph import LoadedModel
+from me2e_compress.registry import documents
+from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.stack_session import open_session
+from me2e_compress.targets.quantized import describe_quantized
+from me2e_compress.workflows.checks import adapted, model_path
+from me2e_compress.workflows.compress_result import beside
+from me2e_compress.workflows.first_opening import try_model
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.result import Result, Table, counted, number, table
+from me2e_compress.zoo.shipped import SHIPPED, shipped
+
+STAGE = "inferences"
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class DumpResult(Result):
+    """What an engine lost, split into quantization, compilation and host.
+
+    Attributes:
+        graph: The graph that the engine was built from.
+        dump: What it answered.
+        float_graph: The float source; None if none is known, for `float_reason`.
+        state: Whose state the graph was fed: the engine's, our own run's, or none.
+        faults: Of the host.
+        notes: What is no fault and worth knowing.
+        inferences: Of the graph, to find faults.
+    """
+
+    graph: Path
+    dump: Path
+    float_graph: Path | None
+    float_reason: str
+    frames: int
+    state: str
+    outputs: tuple[OutputLoss, ...]
+    faults: tuple[HostFault, ...]
+    notes: tuple[str, ...]
+    inferences: int
+
+    @property
+    def headline(self) -> str:
+        """What is to blame."""
+        if self.faults:
+            return f"{counted(len(self.faults), 'fault')} of the host named"
+        worst = min(self.outputs, key=lambda each: each.compilation_db)
+        if worst.compilation_db >= HIGHEST_DB:
+            return (
+                "the engine answers as its graph does"
+                f" (least: {worst.name}, {worst.compilation_db:.1f} dB)"
+            )
+        return (
+            "compilation: no fault of the host that was tried explains what is left"
+            f" (least: {worst.name}, {worst.compilation_db:.1f} dB)"
+        )
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the verdict, and what is worth knowing."""
+        return (self.headline, *self.notes)
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return the faults of the host."""
+        return tuple(each.line for each in self.faults)
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return one row per output."""
+        rows = [
+            (
+                each.name,
+                number(each.quantization_db, ".1f"),
+                number(each.compilation_db, ".1f"),
+                number(each.host_db, ".1f"),
+                number(each.all_db, ".1f"),
+            )
+            for each in self.outputs
+        ]
+        source = (
+            f"Quantization is not measured: {self.float_reason}."
+            if self.float_graph is None
+            else f"Float source: {self.float_graph}."
+        )
+        note = f"SQNR in dB; state: {self.state}. {source}"
+        columns = ("output", "quantization", "compilation", "host", "all")
+        title = f"What the engine lost over {counted(self.frames, 'frame')}"
+        return (table(title, columns, rows, note),)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return one row per output."""
+        return [dataclasses.asdict(each) for each in self.outputs]
+
+
+def compare_dump(
+    model: str | Path,
+    dump: str | Path,
+    frames: str | Path,
+    listener: Listener = SILENT,
+    *,
+    float_graph: str | Path | None = None,
+    provider: Provider = CPU,
+    adapter: str | Path | None = None,
+) -> DumpResult:
+    """Hold what an engine answered over frames against the graph it was built from.
+
+    The graph's nodes run as they are written: int8 is simulated. It is fed the state
+    that the engine gave, where the dump has it, so that each frame is judged by itself;
+    else that of its own run. ``float_graph`` None looks for the source that the report
+    beside the graph names.
+
+    Raises:
+        GraphError: A model does not exist or run.
+        FramesError: A frame does not fit the graph; the dump cannot be read, or is of
+            other frames.
+        ProviderError: The provider is not available.
+        EvaluationError: The dump is of another graph, or an output is not finite or has
+            another shape, and nothing explains it.
+    """
+    path = model_path(model)
+    recording, answered = CalibrationSet(Path(frames)), EngineDump(dump)
+    answered.check(recording)
+    loaded = LoadedModel.load(path)
+    said = adapted(loaded.model, adapter)
+    recording.check(loaded.model)
+    notes = _checked_names(answered, loaded)
+    try_model(loaded, listener, provider, recording)
+    session = open_session(
+        path, optimize=False, release=True, provider=provider, said=said
+    )
+
+    def told(count: int) -> None:
+        listener.on_progress(STAGE, count, 0, "")
+
+    # faults of the host first: what is left is the compiler's
+    run = EngineRun(session, recording, answered, told)
+    try:
+        faults = explain(run, _pixels(session.metadata))
+    except EvaluationError as error:
+        raise EvaluationError(f"{answered.path}: {error}") from error
+    source, why = _float_source(path, loaded, float_graph)
+    opened = None
+    if source is not None:
+        opened = open_session(source, release=True, provider=provider, said=said)
+    outputs = losses(run, opened)
+    return DumpResult(
+        path, answered.path, source, why, len(recording), _state(run), outputs, faults,
+        (*notes, *_rounded(run)), run.inferences,
+    )  # fmt: skip
+
+
+def _checked_names(dump: EngineDump, loaded: LoadedModel) -> tuple[str, ...]:
+    """Check that the dump is of this graph; return what of it is not compared."""
+    outputs = [str(each.name) for each in loaded.model.graph.outputs]
+    if not set(outputs) & set(dump.names):
+        raise EvaluationError(
+            f"{dump.path}: answers {', '.join(dump.names)}; {loaded.path} gives"
+            f" {', '.join(outputs)}: the dump is of another graph"
+        )
+    made = {value.name for node in loaded.model.graph for value in node.outputs}
+    inner = [each for each in dump.names if each not in outputs]
+    if unknown := [each for each in inner if each not in made]:
+        raise EvaluationError(
+            f"{dump.path}: {unknown[0]} is no tensor of {loaded.path}, whose outputs"
+            f" are {', '.join(outputs)}"
+        )
+    said = []
+    if lacking := [each for each in outputs if each not in dump.names]:
+        said.append(f"not dumped: {', '.join(lacking)}")
+    if inner:
+        said.append(f"not compared: {counted(len(inner), 'tensor')} inside the graph")
+    return tuple(said)
+
+
+def _pixels(metadata: Mapping[str, str]) -> dict[str, Pixels]:
+    """Return how pixels become the image input, where the metadata say it."""
+    if IMAGE not in metadata:
+        return {}
+    found = ImageNormalization.of(metadata)
+    return {found.input: Pixels(found.mean, found.std)}
+
+
+def _float_source(
+    path: Path, loaded: LoadedModel, given: str | Path | None
+) -> tuple[Path | None, str]:
+    """Return the float source of a graph, or why none is known."""
+    if given is not None:
+        return model_path(given), ""
+    if describe_quantized(loaded.model) is None:
+        return None, f"{path.name} is not quantized"
+    report = beside(path, "report")
+    if not report.is_file():
+        return None, f"there is no {report.name}, and --float names no source"
+    with documents.reading(report, GraphError, "not a report"):
+        content = documents.from_json(documents.content(report))
+    record = content.get("source") if isinstance(content, dict) else None
+    named = record if isinstance(record, dict) else {}
+    file, digest = str(named.get("file", "")), named.get("sha256")
+    shipped_files = [shipped(each) for each in SHIPPED if f"{each}.onnx" == file]
+    for candidate in (path.with_name(file or "."), Path(file), *shipped_files):
+        if candidate.is_file() and graph.sha256_of(candidate) == digest:
+            return candidate, ""
+    return None, f"{file or 'the source'} of {report.name} is not here: give --float"
+
+
+def _state(run: EngineRun) -> str:
+    pairs = run.fed.session.recurrent
+    own = [name for name, output in pairs.items() if output not in run.names]
+    if not pairs:
+        return "none"
+    if not own:
+        return "the engine's own, so each frame is judged by itself"
+    if len(own) == len(pairs):
+        return "of our own run, since the dump has none"
+    return f"the engine's own, but {', '.join(own)} of our own run"
+
+
+def _rounded(run: EngineRun) -> Iterator[str]:
+    """Say which outputs were rounded to fewer bits: no fault, but worth knowing."""
+    found = dict[str, list[str]]()
+    for name, value in run.engine(0).items():
+        if value.dtype == np.float16:
+            found.setdefault("float16", []).append(name)
+        elif value.dtype == np.float32 and value.any():
+            for kind, lost in (("float16", None), ("bfloat16", 0xFFFF)):
+                if _is_rounded(value, lost):
+                    found.setdefault(kind, []).append(name)
+                    break
+    for kind, names in found.items():
+        yield f"rounded to {kind}, no fault: {', '.join(names)}"
+
+
+def _is_rounded(value: Array, lost: int | None) -> bool:
+    if lost is not None:
+        return not (np.ascontiguousarray(value).view(np.uint32) & lost).any()
+    with np.errstate(over="ignore"):
+        return bool(np.array_equal(value, value.astype(np.float16).astype(np.float32)))

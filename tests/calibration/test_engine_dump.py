@@ -1,0 +1,210 @@
+"""Dumps of engines are read in every form, and refused in one line."""
+
+import base64
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.engine_dump import EngineDump
+from me2e_compress.errors import FramesError
+from me2e_compress.runtime.frames import Array
+from tests.frames import record
+
+ANSWERS: list[dict[str, Any]] = [
+    {
+        "plan": np.full((1, 6, 2), at, np.float32),
+        "score": np.array([at, 0.5], np.float32),
+    }
+    for at in range(3)
+]
+
+
+def as_npz(folder: Path, answers: Sequence[Mapping[str, Array]] = ANSWERS) -> Path:
+    return record(folder, answers)
+
+
+def exported(answers: Mapping[str, Array]) -> str:
+    """Write as trtexec does: sampleReporting.cpp, exportJSONOutput."""
+    parts = [
+        f'{{ "name" : "{name}"\n  , "dimensions" : "{"x".join(map(str, each.shape))}"\n'
+        f'  , "values" : [ {", ".join(f"{value:g}" for value in each.reshape(-1))} ]\n'
+        "  }\n"
+        for name, each in answers.items()
+    ]
+    return "[\n  " + ", ".join(parts) + "]\n"
+
+
+def as_trtexec(folder: Path) -> Path:
+    folder.mkdir()
+    for at, answers in enumerate(ANSWERS):
+        (folder / f"{at:06d}.json").write_text(exported(answers))
+    return folder
+
+
+def encoded(array: Array) -> dict[str, object]:
+    """Encode as polygraphy 0.53 does: json/serde.py, comparator/struct.py."""
+    content = io.BytesIO()
+    np.save(content, array, allow_pickle=False)
+    text = base64.b64encode(content.getvalue()).decode()
+    held = {"array": text, "polygraphy_class": "ndarray"}
+    return {"values": held, "polygraphy_class": "LazyArray"}
+
+
+def as_polygraphy(path: Path, runners: int = 1) -> Path:
+    iterations = [
+        {
+            "outputs": {name: encoded(each) for name, each in answers.items()},
+            "runtime": 0.1,
+            "runner_name": "trt-runner-N0",
+            "polygraphy_class": "IterationResult",
+        }
+        for answers in ANSWERS
+    ]
+    runs = [[f"trt-runner-N{at}", iterations] for at in range(runners)]
+    path.write_text(json.dumps({"lst": runs, "polygraphy_class": "RunResults"}))
+    return path
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> CalibrationSet:
+    return CalibrationSet(record(tmp_path / "frames", [{"x": np.ones(1)}] * 3))
+
+
+def _read(path: Path, frames: CalibrationSet | None) -> None:
+    found = EngineDump(path)
+    if frames is not None:
+        found.check(frames)
+
+
+def refused(path: Path, frames: CalibrationSet | None = None) -> str:
+    with pytest.raises(FramesError) as caught:
+        _read(path, frames)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("form", ["npz", "trtexec", "polygraphy", "in a folder"])
+def test_every_form_says_the_same(
+    form: str, tmp_path: Path, frames: CalibrationSet
+) -> None:
+    write: dict[str, Callable[[], Path]] = {
+        "npz": lambda: as_npz(tmp_path / "dump"),
+        "trtexec": lambda: as_trtexec(tmp_path / "dump"),
+        "polygraphy": lambda: as_polygraphy(tmp_path / "dump.json"),
+        "in a folder": lambda: as_polygraphy(frames.folder.with_name("d.json")),
+    }
+    dump = EngineDump(write[form]())
+    dump.check(frames)
+
+    assert dump.names == ("plan", "score")
+    assert len(dump) == 3
+    for found, wanted in zip(dump, ANSWERS, strict=True):
+        for name, array in wanted.items():
+            assert form == "trtexec" or found[name].dtype == array.dtype
+            np.testing.assert_array_equal(found[name], array)
+
+
+def test_what_cpp_writes_of_no_number_is_read(tmp_path: Path) -> None:
+    odd = {"plan": np.array([np.nan, -np.nan, np.inf, -np.inf], np.float32)}
+    (tmp_path / "000000.json").write_text(exported(odd).replace(" nan,", " -nan,", 1))
+    found = EngineDump(tmp_path)[0]["plan"]
+    assert np.isnan(found[:2]).all()
+    assert found[2:].tolist() == [np.inf, -np.inf]
+
+
+def test_no_dump(tmp_path: Path) -> None:
+    assert refused(tmp_path / "none").endswith("none: no such folder or file")
+
+
+def test_an_empty_folder(tmp_path: Path) -> None:
+    assert refused(tmp_path).endswith(
+        "holds no .npz and no .json of an engine's answers"
+    )
+
+
+def test_a_folder_of_both_forms(tmp_path: Path) -> None:
+    as_npz(tmp_path)
+    (tmp_path / "a.json").write_text("[]")
+    assert "holds both .npz and .json" in refused(tmp_path)
+
+
+@pytest.mark.parametrize("form", ["npz", "json"])
+def test_a_file_that_is_cut(form: str, tmp_path: Path, frames: CalibrationSet) -> None:
+    write = as_npz if form == "npz" else as_trtexec
+    file = write(tmp_path / "dump") / f"000001.{form}"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    assert str(file) in refused(tmp_path / "dump", frames)
+
+
+def test_run_results_that_are_cut(tmp_path: Path) -> None:
+    file = as_polygraphy(tmp_path / "dump.json")
+    file.write_text(file.read_text()[:-40])
+    assert f"{file}: not the JSON of an engine's answers" in refused(file)
+
+
+def test_an_array_that_is_cut(tmp_path: Path) -> None:
+    file = as_polygraphy(tmp_path / "dump.json")
+    text = json.loads(file.read_text())
+    held = text["lst"][0][1][0]["outputs"]["plan"]["values"]
+    held["array"] = held["array"][:40]
+    file.write_text(json.dumps(text))
+    assert "not the RunResults that polygraphy" in refused(file)
+
+
+def test_results_of_two_runners(tmp_path: Path) -> None:
+    assert "2 runners, expected one" in refused(as_polygraphy(tmp_path / "d.json", 2))
+
+
+def test_another_json_file(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('[{"startEnqMs": 1}]')
+    assert "not what trtexec --exportOutput writes" in refused(tmp_path)
+
+
+def test_values_that_are_fewer_than_their_shape(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(
+        '[{"name": "plan", "dimensions": "1x6x2", "values": [1, 2]}]'
+    )
+    assert "plan has 2 values for 1x6x2" in refused(tmp_path)
+
+
+def test_fewer_frames(tmp_path: Path, frames: CalibrationSet) -> None:
+    as_npz(tmp_path / "dump", ANSWERS[:2])
+    assert refused(tmp_path / "dump", frames).endswith(
+        f"answers to 2 frames, {frames.folder} has 3: the dump is of other frames"
+    )
+
+
+def test_frames_of_another_name(tmp_path: Path, frames: CalibrationSet) -> None:
+    as_npz(tmp_path / "dump")
+    (tmp_path / "dump" / "000002.npz").rename(tmp_path / "dump" / "000009.npz")
+    assert "000009 is answered and is no frame of" in refused(tmp_path / "dump", frames)
+
+
+@pytest.mark.parametrize("lacks", [0, 2])
+def test_a_frame_without_an_output(
+    lacks: int, tmp_path: Path, frames: CalibrationSet
+) -> None:
+    cut = [dict(each) for each in ANSWERS]
+    del cut[lacks]["score"]
+    as_npz(tmp_path / "dump", cut)
+    assert refused(tmp_path / "dump", frames) == (
+        f"{tmp_path}/dump/{lacks:06d}: score is missing; other frames have it"
+    )
+
+
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
+def test_any_file_is_read_or_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.json").write_bytes(content)
+    try:
+        EngineDump(tmp_path)
+    except FramesError as error:
+        assert "\n" not in str(error)  # noqa: PT017

@@ -1,0 +1,107 @@
+"""A small stack with state and pictures, an engine of it, and hosts that go wrong."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.session import Session
+
+Arrays: TypeAlias = dict[str, Any]
+Feed: TypeAlias = Callable[[Sequence[Frame], int], Arrays]
+State: TypeAlias = Callable[[Arrays, bool, list[Arrays]], Arrays]
+SCENES = (0, 4)
+COUNT = 8
+MEAN, STD = (100.0, 110.0, 120.0), (50.0, 60.0, 70.0)
+
+_TEXT = """
+<ir_version: 9, opset_import: ["" : 17]>
+stack (float[1,3,3,8,8] img, float[1,3,4,4] lidar2img, float[4] ego, float[1,16] prev)
+ => (float[1,4,2] plan, float[1,5,6] boxes, float[1,16] prev_out)
+<int64[2] by_camera = {{3, 192}}, int64[2] row = {{1, -1}},
+ int64[3] points = {{1, 4, 2}}, int64[3] agents = {{1, 5, 6}}, {weights}> {{
+    flat = Reshape(img, by_camera)
+    seen = MatMul(flat, w_seen)
+    own = Mul(seen, w_camera)
+    rows = Reshape(own, row)
+    matrices = Reshape(lidar2img, row)
+    status = Reshape(ego, row)
+    all = Concat<axis = 1>(rows, matrices, status, prev)
+    mixed = MatMul(all, w_all)
+    prev_out = Tanh(mixed)
+    planned = MatMul(prev_out, w_plan)
+    plan = Reshape(planned, points)
+    found = MatMul(prev_out, w_boxes)
+    boxes = Reshape(found, agents)
+}}
+"""
+_SHAPES = {
+    "w_seen": (192, 8), "w_camera": (3, 8), "w_all": (92, 16), "w_plan": (16, 8),
+    "w_boxes": (16, 30),
+}  # fmt: skip
+
+
+def stack() -> ir.Model:
+    """Return the stack, with random weights."""
+    drawn = np.random.default_rng(1)
+    weights = []
+    for name, shape in _SHAPES.items():
+        values = drawn.normal(0, 1 / np.sqrt(shape[0]), shape).reshape(-1)
+        sides = ",".join(map(str, shape))
+        listed = ", ".join(f"{value:.6f}" for value in values)
+        weights.append(f"float[{sides}] {name} = {{{listed}}}")
+    return ir.from_onnx_text(_TEXT.format(weights=", ".join(weights)))
+
+
+def frames() -> list[Frame]:
+    """Return two scenes of frames that move."""
+    drawn = np.random.default_rng(2)
+    return [
+        Frame(index, index in SCENES, {
+            "img": drawn.normal(0, 1, (1, 3, 3, 8, 8)).astype(np.float32),
+            "lidar2img": drawn.normal(0, 1, (1, 3, 4, 4)).astype(np.float32),
+            "ego": drawn.normal(0, 1, 4).astype(np.float32),
+        })
+        for index in range(COUNT)
+    ]  # fmt: skip
+
+
+def rightly(shown: Sequence[Frame], at: int) -> Arrays:
+    return shown[at].arrays
+
+
+def reset(first: Arrays, starts: bool, before: list[Arrays]) -> Arrays:
+    return first if starts else before[-1]
+
+
+def drive(
+    session: Session, shown: Sequence[Frame], feed: Feed = rightly, state: State = reset
+) -> list[Arrays]:
+    """Return what an engine answers that a host feeds."""
+    given, before = list[Arrays](), list[Arrays]()
+    first = session.first_state({})
+    for at, frame in enumerate(shown):
+        fed = {**feed(shown, at), **state(first, frame.starts_scene, before)}
+        found = {name: np.array(each) for name, each in session.run(fed).items()}
+        before.append({"prev": found["prev_out"]})
+        given.append(found)
+    return given
+
+
+def noisy(given: list[Arrays], decibels: float) -> list[Arrays]:
+    """Return answers with noise, as another program's arithmetic leaves it."""
+    drawn = np.random.default_rng(3)
+    return [
+        {
+            name: (
+                each
+                + drawn.normal(0, 1, each.shape)
+                * np.sqrt(np.mean(each**2))
+                * 10 ** (-decibels / 20)
+            ).astype(each.dtype)
+            for name, each in answers.items()
+        }
+        for answers in given
+    ]

@@ -1,0 +1,201 @@
+"""An engine's dump against its graph: what was lost, where, and who is to blame."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.runtime.session import Session
+from me2e_compress.workflows.compare_dump import compare_dump
+from tests.fidelity.hosts import Arrays, drive, frames, noisy, stack
+from tests.frames import record
+
+QUANTIZED = """
+<ir_version: 9, opset_import: ["" : 17]>
+small (float[1,8] x) => (float[1,8] y)
+<float scale = {0.5}, int8 zero = {0}> {
+    q = QuantizeLinear(x, scale, zero)
+    y = DequantizeLinear(q, scale, zero)
+}
+"""
+FLOAT = """
+<ir_version: 9, opset_import: ["" : 17]>
+small (float[1,8] x) => (float[1,8] y) { y = Identity(x) }
+"""
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    model = stack()
+    model.metadata_props["me2e.recurrent"] = json.dumps({"prev": "prev_out"})
+    ir.save(model, tmp_path / "m.onnx")
+    shown = [each.arrays for each in frames()]
+    record(tmp_path / "frames", shown, (0, 4))
+    return tmp_path
+
+
+def dumped(files: Path, answers: list[Arrays]) -> Path:
+    return record(files / "dump", answers)
+
+
+def answered(files: Path) -> list[Arrays]:
+    session = Session(files / "m.onnx")
+    return drive(session, list(CalibrationSet(files / "frames")))
+
+
+def test_what_is_left_is_the_compilers(files: Path) -> None:
+    dumped(files, noisy(answered(files), 30.0))
+
+    found = compare_dump(files / "m.onnx", files / "dump", files / "frames")
+
+    assert found.faults == ()
+    assert found.headline.startswith(
+        "compilation: no fault of the host that was tried explains what is left"
+    )
+    assert found.state == "the engine's own, so each frame is judged by itself"
+    for each in found.outputs:
+        assert each.compilation_db == pytest.approx(30.0, abs=3)
+        assert each.all_db == each.compilation_db
+        assert each.quantization_db is None
+        assert each.host_db is None
+    assert found.float_reason == "m.onnx is not quantized"
+
+
+def test_an_engine_that_answers_as_its_graph(files: Path) -> None:
+    dumped(files, answered(files))
+    found = compare_dump(files / "m.onnx", files / "dump", files / "frames")
+    assert found.headline.startswith("the engine answers as its graph does")
+
+
+def test_a_fault_is_told_apart_from_what_the_compiler_lost(files: Path) -> None:
+    shown = noisy(answered(files), 40.0)
+    scaled = [each | {"plan": each["plan"] * np.float32(2)} for each in shown]
+    dumped(files, scaled)
+
+    found = compare_dump(files / "m.onnx", files / "dump", files / "frames")
+
+    plan, boxes, _ = found.outputs
+    assert found.headline == "1 fault of the host named"
+    assert plan.compilation_db == pytest.approx(40.0, abs=3)
+    assert plan.host_db == pytest.approx(0.0, abs=0.1)  # as much noise as signal
+    assert plan.all_db == pytest.approx(0.0, abs=0.1)
+    assert boxes.host_db is None
+    (said,) = found.alerts()
+    assert said.startswith("host: output plan is the graph's times ")
+    assert found.status == "warning"
+
+
+def test_quantization_is_what_the_graph_lost_to_its_source(tmp_path: Path) -> None:
+    ir.save(ir.from_onnx_text(QUANTIZED), tmp_path / "small.onnx")
+    ir.save(ir.from_onnx_text(FLOAT), tmp_path / "source.onnx")
+    shown = np.array([[0.1, 0.7, 1.2, 2.1, -0.6, -1.7, 0.3, 1.1]], np.float32)
+    record(tmp_path / "frames", [{"x": shown}])
+    record(tmp_path / "dump", [{"y": np.round(shown / 0.5).astype(np.float32) / 2}])
+    small, dump, shown_at = (tmp_path / e for e in ("small.onnx", "dump", "frames"))
+
+    unknown = compare_dump(small, dump, shown_at)
+    given = compare_dump(small, dump, shown_at, float_graph=tmp_path / "source.onnx")
+    digest = graph.sha256_of(tmp_path / "source.onnx")
+    report = {"source": {"file": "source.onnx", "sha256": digest}}
+    (tmp_path / "small.report.json").write_text(json.dumps(report))
+    recorded = compare_dump(small, dump, shown_at)
+
+    assert unknown.outputs[0].quantization_db is None
+    assert "--float names no source" in unknown.float_reason
+    assert given.outputs == recorded.outputs
+    lost = given.outputs[0]
+    assert lost.compilation_db == np.inf
+    assert lost.quantization_db == lost.all_db
+    assert lost.quantization_db is not None
+    assert 15 < lost.quantization_db < 25
+
+
+def test_a_source_that_is_another_file_is_not_taken(tmp_path: Path) -> None:
+    ir.save(ir.from_onnx_text(QUANTIZED), tmp_path / "small.onnx")
+    ir.save(ir.from_onnx_text(FLOAT), tmp_path / "source.onnx")
+    record(tmp_path / "frames", [{"x": np.ones((1, 8), np.float32)}])
+    record(tmp_path / "dump", [{"y": np.ones((1, 8), np.float32)}])
+    report = {"source": {"file": "source.onnx", "sha256": "0" * 64}}
+    (tmp_path / "small.report.json").write_text(json.dumps(report))
+
+    small, dump, shown = (tmp_path / e for e in ("small.onnx", "dump", "frames"))
+    found = compare_dump(small, dump, shown)
+
+    assert found.float_graph is None
+    assert "is not here: give --float" in found.float_reason
+
+
+def test_state_comes_from_our_own_run_where_the_dump_has_none(files: Path) -> None:
+    kept = [{k: v for k, v in e.items() if k != "prev_out"} for e in answered(files)]
+    dumped(files, kept)
+    found = compare_dump(files / "m.onnx", files / "dump", files / "frames")
+    assert found.state == "of our own run, since the dump has none"
+    assert found.notes[0] == "not dumped: prev_out"
+
+
+def test_rounding_to_half_is_said(files: Path) -> None:
+    half = [{n: a.astype(np.float16) for n, a in e.items()} for e in answered(files)]
+    dumped(files, half)
+    found = compare_dump(files / "m.onnx", files / "dump", files / "frames")
+    assert found.faults == ()
+    assert found.notes == ("rounded to float16, no fault: plan, boxes, prev_out",)
+
+
+def test_tensors_inside_the_graph_are_left_out(files: Path) -> None:
+    inner = [each | {"mixed": each["prev_out"]} for each in answered(files)]
+    dumped(files, inner)
+    found = compare_dump(files / "m.onnx", files / "dump", files / "frames")
+    assert "not compared: 1 tensor inside the graph" in found.notes
+
+
+def refused(files: Path, error: type[Exception]) -> str:
+    with pytest.raises(error) as caught:
+        compare_dump(files / "m.onnx", files / "dump", files / "frames")
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_dump_of_another_graph(files: Path) -> None:
+    dumped(files, [{"wp": each["plan"]} for each in answered(files)])
+    assert refused(files, EvaluationError).endswith("the dump is of another graph")
+
+
+def test_a_tensor_that_the_graph_lacks(files: Path) -> None:
+    dumped(files, [each | {"wp": each["plan"]} for each in answered(files)])
+    assert "wp is no tensor of" in refused(files, EvaluationError)
+
+
+def test_an_output_of_another_shape(files: Path) -> None:
+    dumped(files, [each | {"plan": each["plan"][:, :1]} for each in answered(files)])
+    assert refused(files, EvaluationError) == (
+        f"{files}/dump: output plan is [1, 1, 2] in the dump at frame 0, [1, 4, 2] in"
+        " the graph"
+    )
+
+
+def test_an_output_that_is_not_finite(files: Path) -> None:
+    given = answered(files)
+    given[3]["boxes"][0, 2, 4] = np.inf
+    dumped(files, given)
+    assert refused(files, EvaluationError) == (
+        f"{files}/dump: output boxes of the dump is infinite at frame 3, [0, 2, 4]"
+    )
+
+
+def test_state_of_another_shape(files: Path) -> None:
+    given = [e | {"prev_out": e["prev_out"][:, :3]} for e in answered(files)]
+    dumped(files, given)
+    assert "output prev_out is [1, 3] in the dump" in refused(files, EvaluationError)
+
+
+def test_no_such_float_source(files: Path) -> None:
+    dumped(files, answered(files))
+    with pytest.raises(GraphError, match=r"none\.onnx: no such file"):
+        compare_dump(
+            files / "m.onnx", files / "dump", files / "frames", float_graph="none.onnx"
+        )
