@@ -26,7 +26,7 @@ PLAN_FLOOR_M = 0.5
 
 ALIVE = 0.01
 """Least movement, as a share of the uncompressed graph's, of an output that is not
-dead; int8 that works keeps more than a tenth (benchmarks/bench_liveness.py)."""
+dead; int8 recipes that work keep 0.038 or more (benchmarks/bench_liveness.py)."""
 
 MOST_EXCESS = 1e6
 """Excess of an output that should be zero and is not."""
