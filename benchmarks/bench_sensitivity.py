@@ -19,8 +19,8 @@ from pathlib import Path
 from time import process_time
 
 import numpy as np
-import numpy.typing as npt
 import onnx_ir as ir
+from scipy import stats
 
 from benchmarks.subject import Subject
 from benchmarks.subjects import make
@@ -130,12 +130,13 @@ def rows_of(case: Case, most: int) -> list[tuple[str, ...]]:
     told = partial(estimate, case.model, case.plan, grids, threads=1)
     found = {e.output: e.noise for e in told(case.frames) if e.noise is not None}
     ratio = per_frame_s(case, told) / per_frame_s(case, partial(_infer, case.model))
-    measured, rows = case.measured(most), []
+    measured, rows = case.measured(most), list[tuple[str, ...]]()
     for output in next(iter(found.values()), {}):
         names = [name for name in found if measured.get(name, {}).get(output)]
         ours = np.array([found[name][output] for name in names])
         theirs = np.array([measured[name][output] for name in names])
-        rank, quotient = spearman(ours, theirs), float(np.median(ours / theirs))
+        rank = float(stats.spearmanr(ours, theirs).statistic)
+        quotient = float(np.median(ours / theirs))
         counted = f"{len(names)} of {len(measured)}"
         rows.append(
             (case.subject.name, output, counted, f"{rank:.3f}", f"{quotient:.2f}",
@@ -157,12 +158,6 @@ def per_frame_s(case: Case, run: Callable[[list[Frame]], object]) -> float:
         run(frames)
         seconds.append(process_time() - start)
     return (seconds[1] - seconds[0]) / (len(case.frames) - 1)
-
-
-def spearman(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> float:
-    """Return the rank correlation of values without ties."""
-    ranks = [np.argsort(np.argsort(each)) for each in (a, b)]
-    return float(np.corrcoef(*ranks)[0, 1])
 
 
 if __name__ == "__main__":
