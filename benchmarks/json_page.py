@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.driving.adapter.port_uses import PortUse
 from me2e_compress.fidelity.compare import Fidelity
+from me2e_compress.fidelity.first_difference import FirstDifference
 from me2e_compress.fidelity.open_loop import OpenLoop
 from me2e_compress.manager import Step, Verification
 from me2e_compress.quantization.plan import Decision, QuantPlan
@@ -40,7 +41,7 @@ NAMED = (
     *(Ranges, PortUse, Fidelity, OpenLoop, Step, Verification, Decision, QuantPlan),
     *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity, Remedy, Rung),
     *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
-    *(Int8Outcome, WeightsRecord),
+    *(Int8Outcome, WeightsRecord, FirstDifference),
 )
 """Classes that the forms name; what their fields name is found."""
 HEAD = """\
