@@ -37,6 +37,10 @@ if TYPE_CHECKING:
         EvaluateResult,
         evaluate,
     )
+    from me2e_compress.workflows.first_difference import (
+        FirstDifferenceResult,
+        first_difference,
+    )
     from me2e_compress.workflows.frames import FramesOptions, record_frames
     from me2e_compress.workflows.inspect import inspect
     from me2e_compress.workflows.inspect_result import InspectResult
@@ -70,6 +74,7 @@ __all__ = [
     "EngineResult",
     "EvaluateOptions",
     "EvaluateResult",
+    "FirstDifferenceResult",
     "FramesOptions",
     "InspectResult",
     "LintOptions",

@@ -17,6 +17,8 @@ from me2e_compress.errors import (
 )
 from me2e_compress.fidelity.engine_values import first_difference_of_outputs
 from me2e_compress.fidelity.first_difference import FirstDifference, Source
+from me2e_compress.graph import provenance
+from me2e_compress.graph.provenance import Provenance
 from me2e_compress.manager import recipe
 from me2e_compress.manager.pass_manager import PassManager
 from me2e_compress.runtime.frames import Frame
@@ -225,7 +227,7 @@ def factor(*, moved: bool, last: str = "Exp") -> ir.Model:
     for each in model.graph:
         name = str(each.name)
         origins = (name, "scale") if moved and name in ("first", "bias") else (name,)
-        graph.provenance.stamp(each, graph.Provenance("head", origins))
+        provenance.stamp(each, Provenance("head", origins))
     if moved:  # the factor is in the weights now
         scaled = node(model, "scale")
         node(model, "last").replace_input_with(0, scaled.inputs[0])
@@ -302,7 +304,7 @@ def int8(model: ir.Model) -> ir.Model:
     model.graph.insert_before(linear, nodes)
     linear.replace_input_with(0, nodes[-1].outputs[0])
     for each in nodes:
-        graph.provenance.stamp(each, graph.Provenance("head", (str(each.name),)))
+        provenance.stamp(each, Provenance("head", (str(each.name),)))
     return model
 
 
