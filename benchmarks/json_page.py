@@ -17,6 +17,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.review import RangeFinding
 from me2e_compress.driving.adapter.port_uses import PortUse
 from me2e_compress.fidelity.compare import Fidelity
+from me2e_compress.fidelity.first_difference import FirstDifference
 from me2e_compress.fidelity.open_loop import OpenLoop
 from me2e_compress.fidelity.output_liveness import Liveness
 from me2e_compress.manager import Step, Verification
@@ -55,6 +56,7 @@ NAMED = (
     *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity, Remedy, Rung),
     *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
     *(Int8Outcome, RuleSummary, WeightsRecord, RangeFinding, DumpResult),
+    *(FirstDifference,),
 )
 """Classes that the forms name; what their fields name is found."""
 HEAD = """\

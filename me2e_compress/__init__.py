@@ -39,6 +39,10 @@ if TYPE_CHECKING:
         EvaluateResult,
         evaluate,
     )
+    from me2e_compress.workflows.first_difference import (
+        FirstDifferenceResult,
+        first_difference,
+    )
     from me2e_compress.workflows.frames import FramesOptions, record_frames
     from me2e_compress.workflows.inspect import inspect
     from me2e_compress.workflows.inspect_result import InspectResult
@@ -74,6 +78,7 @@ __all__ = [
     "EngineResult",
     "EvaluateOptions",
     "EvaluateResult",
+    "FirstDifferenceResult",
     "FramesOptions",
     "InspectResult",
     "LintOptions",
@@ -107,6 +112,7 @@ __all__ = [
     "compare_dump",
     "compress",
     "evaluate",
+    "first_difference",
     "graph",
     "inspect",
     "lint",
@@ -151,6 +157,7 @@ _ROOMS = {
     "workflows.compress": ("CompressOptions", "compress"),
     "workflows.compress_result": ("CompressResult",),
     "workflows.evaluate": ("EvaluateOptions", "EvaluateResult", "evaluate"),
+    "workflows.first_difference": ("FirstDifferenceResult", "first_difference"),
     "workflows.frames": ("FramesOptions", "record_frames"),
     "workflows.inspect": ("inspect",),
     "workflows.inspect_result": ("InspectResult",),

@@ -10,7 +10,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.observers import OBSERVERS
-from me2e_compress.calibration.probes import Counts, Extremes, Probe
+from me2e_compress.calibration.probes import Counts, Extremes
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
 from me2e_compress.calibration.statistics import (
@@ -27,6 +27,7 @@ from me2e_compress.calibration.stream import (
 )
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.probing import Probe
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import unsupported
 from me2e_compress.runtime.session import DTYPES

@@ -1,30 +1,13 @@
-"""Probes measure a tensor by nodes that are added to its graph."""
+"""The probes of a calibration: extremes, and histograms of magnitudes."""
 
 import dataclasses
-from typing import Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress.calibration.statistics import BINS
-from me2e_compress.graph import rewrite
-
-Reading: TypeAlias = tuple[list[ir.Node], list[ir.Value]]
-"""Nodes that measure a tensor, in order, and the 1-D values that they produce."""
-
-
-class Probe(Protocol):
-    """Measures tensors by nodes inserted after them."""
-
-    @property
-    def width(self) -> int:
-        """Number of values read per tensor."""
-        ...
-
-    def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
-        """Return the nodes that measure a float32 value, the ``at``-th watched one."""
-        ...
+from me2e_compress.runtime.probing import Reading, shared_constant
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +23,8 @@ class Extremes:
 
     def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
         """Build three reductions of the whole tensor."""
-        one = _shared(where, np.array([1], np.int64), "one")
-        least = _shared(where, np.array(1, np.float32), "least")
+        one = shared_constant(where, np.array([1], np.int64), "one")
+        least = shared_constant(where, np.array(1, np.float32), "least")
         low, high, total = (
             ir.node(op, [value], {"keepdims": 0})
             for op in ("ReduceMin", "ReduceMax", "ReduceSumSquare")
@@ -79,9 +62,11 @@ class Counts:
         Scaling by a power of two is exact, so shards agree on the bin of every element.
         """
         bins_per_unit = np.ldexp(np.float32(BINS), -self.exponents[at])
-        factor = _shared(where, np.asarray(bins_per_unit, np.float32), f"factor_{at}")
-        last = _shared(where, np.array(BINS - 1, np.float32), "last_bin")
-        row = _shared(where, np.array([-1], np.int64), "row")
+        factor = shared_constant(
+            where, np.asarray(bins_per_unit, np.float32), f"factor_{at}"
+        )
+        last = shared_constant(where, np.array(BINS - 1, np.float32), "last_bin")
+        row = shared_constant(where, np.array([-1], np.int64), "row")
         # Number the bins; the last one takes what lies beyond.
         magnitude = ir.node("Abs", [value])
         scaled = ir.node("Mul", [magnitude.outputs[0], factor])
@@ -105,10 +90,3 @@ class Counts:
 
 def _cast(value: ir.Value, to: ir.DataType) -> ir.Node:
     return ir.node("Cast", [value], {"to": to.value})
-
-
-def _shared(where: ir.Graph, array: npt.NDArray[np.generic], name: str) -> ir.Value:
-    """Return a constant of the probes, created at its first use."""
-    name = f"me2e_probe_{name}"
-    known = where.initializers.get(name)
-    return known if known is not None else rewrite.add_constant(where, array, name)

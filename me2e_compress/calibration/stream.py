@@ -11,15 +11,11 @@ import numpy.typing as npt
 import onnx_ir as ir
 import onnx_ir.passes.common as common
 
-from me2e_compress.calibration.probes import Probe
-from me2e_compress.errors import GraphError
 from me2e_compress.graph.nodes import makers_of, reads_of
 from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.probing import READINGS, Probe, insert_probes
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import DTYPES, Session, replay
-
-READINGS = "me2e_readings"
-"""Name of the output that the probes write: float32 [tensors x width of the probe]."""
 
 Readings: TypeAlias = npt.NDArray[np.float32]
 """Readings of the probes in one frame: float32 [tensors, width of the probe]."""
@@ -115,31 +111,6 @@ def probed_session(
         return run(scheduled, optimize=False)
 
 
-def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.Model:
-    """Return a copy of a graph with a probe right after each tensor's producer.
-
-    The last output of the copy is :data:`READINGS`.
-    """
-    copy = model.clone()
-    known = _values(copy)
-    if missing := [name for name in tensors if name not in known]:
-        raise GraphError(f"the graph has no tensor {missing[0]}")
-    # Measure each tensor right after its producer.
-    readings = [
-        reading
-        for at, name in enumerate(tensors)
-        for reading in _watch(copy.graph, known[name], probe, at)
-    ]
-    # Join all readings into one output.
-    joined = ir.node("Concat", readings, {"axis": 0}, name=READINGS)
-    joined.outputs[0].name = READINGS
-    joined.outputs[0].dtype = ir.DataType.FLOAT
-    joined.outputs[0].shape = ir.Shape([len(tensors) * probe.width])
-    copy.graph.append(joined)
-    copy.graph.outputs.append(joined.outputs[0])
-    return copy
-
-
 def schedule_probes(model: ir.Model) -> None:
     """Move the nodes of every probe to the earliest position, in place.
 
@@ -178,34 +149,6 @@ def schedule_probes(model: ir.Model) -> None:
     order += [node for node in nodes if node not in placed]
     model.graph.remove(nodes)
     model.graph.extend(order)
-
-
-def _values(model: ir.Model) -> dict[str, ir.Value]:
-    made = (value for node in model.graph for value in node.outputs)
-    return {str(value.name): value for value in (*model.graph.inputs, *made)}
-
-
-def _watch(
-    where: ir.Graph, value: ir.Value, probe: Probe, at: int
-) -> Sequence[ir.Value]:
-    nodes: list[ir.Node] = []
-    seen = value
-    if value.dtype not in (None, ir.DataType.FLOAT):
-        nodes.append(ir.node("Cast", [value], {"to": ir.DataType.FLOAT.value}))
-        seen = nodes[0].outputs[0]
-    # Names tell which tensor a probe measures.
-    measuring, readings = probe.read(where, seen, at)
-    nodes += measuring
-    for order, node in enumerate(nodes):
-        node.name = f"{READINGS}/{value.name}/{order}_{node.op_type}"
-        node.outputs[0].name = node.name
-    # A graph input is measured before anything else runs.
-    producer = value.producer()
-    if producer is not None:
-        where.insert_after(producer, nodes)
-    elif len(where):
-        where.insert_before(where[0], nodes)
-    return readings
 
 
 def _sources(node: ir.Node) -> set[ir.Value]:

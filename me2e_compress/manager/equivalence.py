@@ -9,7 +9,8 @@ from typing import TypeAlias
 
 import onnx_ir as ir
 
-from me2e_compress.errors import GraphError
+from me2e_compress.errors import GraphError, Me2eError
+from me2e_compress.fidelity.first_difference import Source
 from me2e_compress.graph.nodes import DRAWS, bodies_of, reads_of
 from me2e_compress.manager import runtime_levels
 from me2e_compress.manager.output_errors import errors, tolerances
@@ -113,6 +114,16 @@ def _without_optimizations(
     wrong = [name for name in found.judged if found.errors[name] > allowed[name]]
     remarks = runtime_levels.disagreements(graphs, wrong, allowed, inputs)
     return dataclasses.replace(plain, remarks=remarks)
+
+
+def where(before: ir.Model, after: ir.Model, inputs: VerificationInputs) -> str:
+    """Say after which node of a changed graph its values differ, if that is found."""
+    try:
+        source = Source.of(before, inputs.frames, inputs.provider)
+        first = source.first_difference(after).first
+    except Me2eError:
+        return ""
+    return "" if first is None else f"; values differ from {first.named} on"
 
 
 def skipped(passes: tuple[str, ...], why: str) -> Verification:

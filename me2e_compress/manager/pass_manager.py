@@ -187,12 +187,13 @@ class _Books:
         self.verifications.append(found)
         if equivalence.passed(found) or inputs is None:
             return
-        current, guilty = _bisect(runnable, model, inputs)
+        current, guilty, changed = _bisect(runnable, model, inputs)
         worst = max(found.judged, key=lambda name: found.errors[name])
         error = VerificationError(
             f"{current.name} promises the same outputs and changed {worst} by"
             f" {found.errors[worst]:.3g} of its range"
             f" (allowed {found.tolerances[worst]:.0e}, {found.inputs} inputs)"
+            f"{equivalence.where(guilty, changed, inputs)}"
         )
         raise self._with_reproducer(current, guilty, error)
 
@@ -270,15 +271,18 @@ class _Books:
 
 def _bisect(
     stretch: Stretch, last: ir.Model, inputs: VerificationInputs
-) -> tuple[Pass, ir.Model]:
-    """Find the first pass after which the outputs differ, in log2 trials."""
+) -> tuple[Pass, ir.Model, ir.Model]:
+    """Find the first pass after which the outputs differ, in log2 trials.
+
+    Returns it with the graph before and the graph after it.
+    """
     models = [*(model for _, model in stretch), last]
     good, bad = 0, len(stretch)
     while bad - good > 1:
         middle = (good + bad) // 2
         trial = equivalence.verify((), models[0], models[middle], inputs)
         good, bad = (middle, bad) if equivalence.passed(trial) else (good, middle)
-    return stretch[good]
+    return *stretch[good], models[bad]
 
 
 def _fails_alike(

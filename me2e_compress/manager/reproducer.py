@@ -9,6 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph.nodes import reads_of
+from me2e_compress.graph.part import part_of
 
 PIPELINE = "pipeline.txt"
 """Says what fails, and by that whose folder it is."""
@@ -65,16 +66,9 @@ def window(model: ir.Model, start: int, stop: int) -> ir.Model | None:
     crossing = [*inputs.values(), *outputs.values()]
     if not outputs or any(v.type is None or v.shape is None for v in crossing):
         return None
-    body = ir.convenience.extract(
-        model.graph, list(inputs.values()), list(outputs.values())
-    )
-    body.opset_imports.update(model.graph.opset_imports)
-    return ir.Model(
-        body,
-        ir_version=model.ir_version,
-        functions=[function.clone() for function in model.functions.values()],
-        metadata_props={"me2e.reproducer": "part of a graph"},
-    )
+    part = part_of(model, list(inputs.values()), list(outputs.values()))
+    part.metadata_props["me2e.reproducer"] = "part of a graph"
+    return part
 
 
 def _leaves(value: ir.Value, inside: set[ir.Node]) -> bool:

@@ -9,12 +9,8 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.probes import Extremes
 from me2e_compress.calibration.statistics import BINS
-from me2e_compress.calibration.stream import (
-    READINGS,
-    insert_probes,
-    probed_session,
-    schedule_probes,
-)
+from me2e_compress.calibration.stream import probed_session, schedule_probes
+from me2e_compress.runtime.probing import READINGS, insert_probes
 from me2e_compress.runtime.session import Session
 from tests.frames import record
 from tests.nets import conv_attention, image

@@ -123,6 +123,12 @@ def test_an_exact_pass_must_not_move_an_output_by_a_little(
         run(ir.from_onnx_text(LINEAR), context, passes.scales(1 + share))
 
 
+def test_the_place_is_named_where_a_pass_breaks_its_promise(context: Context) -> None:
+    words = r"\(allowed .* inputs\); values differ from node /backbone/Mul \(Mul\) on$"
+    with pytest.raises(VerificationError, match=words):
+        run(ir.from_onnx_text(LINEAR), context, passes.scales(1.05))
+
+
 def test_a_lossy_pass_starts_a_new_stretch(chain: ir.Model, context: Context) -> None:
     report = run(chain, context, passes.IDLE, passes.HALVES, passes.DROPS_RELU)
     assert [check.passes for check in report.verifications] == [

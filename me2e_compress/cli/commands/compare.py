@@ -7,10 +7,12 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
+from me2e_compress.errors import RecipeError
 from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import compare as workflow
 from me2e_compress.workflows import compare_dump as against_engine
+from me2e_compress.workflows.first_difference import first_difference
 
 
 def compare(
@@ -37,6 +39,13 @@ def compare(
         str | None,
         typer.Option("--float", help="the graph's float source, with --outputs"),
     ] = None,
+    where: Annotated[
+        bool,
+        typer.Option(
+            "--first-difference",
+            help="name the first module and node after which the second differs",
+        ),
+    ] = False,
     adapter: given.Adapter = None,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
@@ -46,6 +55,11 @@ def compare(
     Exit code 1 if an output of the second does not answer its inputs any more.
     """
     runs_on = provider_named(provider, plugins or ())
+    if where and (as_it_stands or outputs is not None):
+        raise RecipeError(
+            "--first-difference holds two graphs together, all nodes as they stand:"
+            " leave out --reference and --outputs"
+        )
     with listening() as listener:
         if outputs is not None and frames is None:
             dumped = against_engine.compare_dump(
@@ -57,6 +71,13 @@ def compare(
         if outputs is not None or frames is None:
             said = "M.onnx FRAMES --outputs DUMP" if frames else "A.onnx B.onnx FRAMES"
             raise typer.BadParameter(f"expected {said}", param_hint="FRAMES")
+        if where:
+            place = first_difference(
+                *(reference, candidate, frames, listener),
+                provider=runs_on, adapter=adapter,
+            )  # fmt: skip
+            show(place)
+            return
         found = workflow.compare(
             *(reference, candidate, frames, listener), as_it_stands=as_it_stands,
             alive=alive, provider=runs_on, adapter=adapter,
