@@ -405,6 +405,39 @@ def test_a_value_of_another_shape_differs(source: Source) -> None:
         source.first_difference(changed(change))
 
 
+EMPTY = """
+<ir_version: 9, opset_import: ["" : 17]>
+empty (float[1,8] x) => (float[1,8] y, int64[2,n] places) {
+    ["relu"] r = Relu(x)
+    ["places"] places = NonZero(r)
+    ["exp"] y = %s(r)
+}
+"""
+
+
+def test_tensors_without_elements_are_passed_by() -> None:
+    frames = [Frame(0, True, {"x": -np.ones((1, 8), np.float32)})]
+    source = Source.of(ir.from_onnx_text(EMPTY % "Exp"), frames)
+
+    found = source.first_difference(ir.from_onnx_text(EMPTY % "Sigmoid"))
+
+    assert [each.nodes for each in found.places] == [("exp",)]
+
+
+def test_what_changes_its_shape_from_frame_to_frame_is_held_too() -> None:
+    frames = [
+        Frame(0, True, {"x": np.ones((1, 8), np.float32)}),
+        Frame(1, True, {"x": np.arange(8, dtype=np.float32)[None]}),
+    ]
+    source = Source.of(ir.from_onnx_text(EMPTY % "Exp"), frames)
+
+    found = source.first_difference(
+        ir.from_onnx_text((EMPTY % "Exp").replace("NonZero(r)", "NonZero(x)"))
+    )
+
+    assert (found.compared, found.different) == (3, 0)
+
+
 def test_python_refuses_no_frames(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match="most_frames is 0"):
         first_difference("a.onnx", "b.onnx", tmp_path, most_frames=0)
