@@ -32,6 +32,7 @@ from tests.nets import conv_attention, image
 FRAMES = [Frame(at, at == 0, dict(image(at))) for at in range(2)]
 
 Change = Callable[[ir.Model], object]
+Outputs = dict[str, npt.NDArray[np.generic]]
 
 
 @pytest.fixture(scope="module")
@@ -303,8 +304,8 @@ def int8(model: ir.Model) -> ir.Model:
     nodes[0].replace_input_with(0, mixed)
     model.graph.insert_before(linear, nodes)
     linear.replace_input_with(0, nodes[-1].outputs[0])
-    for each in nodes:
-        provenance.stamp(each, Provenance("head", (str(each.name),)))
+    for made in nodes:
+        provenance.stamp(made, Provenance("head", (str(made.name),)))
     return model
 
 
@@ -323,13 +324,12 @@ def test_a_lossy_graph_is_judged_by_decibels_and_its_modules_are_told(
     assert head.after_db < 20
 
 
-def outputs(
-    model: ir.Model, names: tuple[str, ...]
-) -> list[dict[str, npt.NDArray[np.generic]]]:
+def outputs(model: ir.Model, names: tuple[str, ...]) -> list[Outputs]:
     copy = model.clone()
     made = {value.name: value for each in copy.graph for value in each.outputs}
     copy.graph.outputs.extend(made[name] for name in names)
-    session, memory, found = Session(copy, optimize=False), {}, []
+    session, found = Session(copy, optimize=False), list[Outputs]()
+    memory: Mapping[str, npt.NDArray[np.generic]] = {}
     for frame in FRAMES:
         memory = memory or session.first_state({})
         found.append(session.run({**frame.arrays, **memory}))
