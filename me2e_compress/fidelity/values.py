@@ -41,9 +41,13 @@ class Values:
                 if value.name and value not in constant and _can_differ(value):
                     self.by_name[value.name] = value
                     self.source[value.name] = self._source(node, value.name)
-        self.watched = tuple(dict.fromkeys(self.source.values()))
-        self._row = {name: at for at, name in enumerate(self.watched)}
-        self.sketches: Sketches = np.empty((0, len(self.watched), WIDTH))
+        self._row: dict[str, int] = {}
+        self.sketches: Sketches = np.empty((0, 0, WIDTH))
+
+    @property
+    def watched(self) -> tuple[str, ...]:
+        """The values that have a sketch of their own."""
+        return tuple(dict.fromkeys(self.source[name] for name in self.by_name))
 
     def _source(self, node: ir.Node, name: str) -> str:
         data = node.inputs[0] if node.inputs else None
@@ -72,7 +76,11 @@ class Values:
             return self._run(frames, provider, fed)
 
     def _run(self, frames: Sequence[Frame], provider: Provider, fed: Fed | None) -> Fed:
-        probed = insert_probes(self.model, self.watched, Sketch())
+        # measured shapes may be those of tensors without elements
+        self.by_name = {k: v for k, v in self.by_name.items() if _can_differ(v)}
+        watched = self.watched
+        self._row = {name: at for at, name in enumerate(watched)}
+        probed = insert_probes(self.model, watched, Sketch())
         session = Session(
             probed, optimize=False, frugal=True, release=True, provider=provider
         )
@@ -81,7 +89,7 @@ class Values:
             feeds.append(given)
             readings.append(found[READINGS])
         stacked = np.stack(readings).astype(np.float64)
-        self.sketches = stacked.reshape(len(frames), len(self.watched), WIDTH)
+        self.sketches = stacked.reshape(len(frames), len(watched), WIDTH)
         return feeds
 
     def unshaped(self) -> list[str]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from pathlib import Path
 
 import onnx_ir as ir
@@ -98,17 +99,18 @@ class FirstDifferenceResult(Result):
 
 
 def _told(first: Place, found: FirstDifference) -> str:
+    begin = f"first below {found.floor_db:g} dB" if found.lossy else "first difference"
     module = f"module {first.module}, " if first.module else ""
-    alone = (
-        ""
-        if first.own_db is None
-        else f"; alone, on the first graph's values, {first.own_db:.1f} dB"
-    )
+    # of equal inputs the nodes are wrong, or only what they read was
+    own = first.own_db
+    alone = f"{own:.1f} dB" if own is not None else "not measured"
+    if own is not None and own >= found.floor_db:
+        alone = "right" if own == math.inf else f"{own:.1f} dB: the loss adds up"
     more = len([each for each in found.places if each.reaches]) - 1
     others = f"; {counted(more, 'other place')} beside it" if more else ""
     return (
-        f"first difference: {module}{first.named}: {first.value} is at"
-        f" {first.sqnr_db:.1f} dB{alone}{others}"
+        f"{begin}: {module}{first.named}: {first.value} is at {first.sqnr_db:.1f} dB;"
+        f" alone, on the first graph's values: {alone}{others}"
     )
 
 

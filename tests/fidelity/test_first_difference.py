@@ -32,6 +32,7 @@ from tests.nets import conv_attention, image
 FRAMES = [Frame(at, at == 0, dict(image(at))) for at in range(2)]
 
 Change = Callable[[ir.Model], object]
+Outputs = dict[str, npt.NDArray[np.generic]]
 
 
 @pytest.fixture(scope="module")
@@ -303,8 +304,8 @@ def int8(model: ir.Model) -> ir.Model:
     nodes[0].replace_input_with(0, mixed)
     model.graph.insert_before(linear, nodes)
     linear.replace_input_with(0, nodes[-1].outputs[0])
-    for each in nodes:
-        provenance.stamp(each, Provenance("head", (str(each.name),)))
+    for made in nodes:
+        provenance.stamp(made, Provenance("head", (str(made.name),)))
     return model
 
 
@@ -323,13 +324,12 @@ def test_a_lossy_graph_is_judged_by_decibels_and_its_modules_are_told(
     assert head.after_db < 20
 
 
-def outputs(
-    model: ir.Model, names: tuple[str, ...]
-) -> list[dict[str, npt.NDArray[np.generic]]]:
+def outputs(model: ir.Model, names: tuple[str, ...]) -> list[Outputs]:
     copy = model.clone()
     made = {value.name: value for each in copy.graph for value in each.outputs}
     copy.graph.outputs.extend(made[name] for name in names)
-    session, memory, found = Session(copy, optimize=False), {}, []
+    session, found = Session(copy, optimize=False), list[Outputs]()
+    memory: Mapping[str, npt.NDArray[np.generic]] = {}
     for frame in FRAMES:
         memory = memory or session.first_state({})
         found.append(session.run({**frame.arrays, **memory}))
@@ -403,6 +403,39 @@ def test_a_value_of_another_shape_differs(source: Source) -> None:
 
     with pytest.raises(GraphError):  # onnxruntime itself refuses the product behind it
         source.first_difference(changed(change))
+
+
+EMPTY = """
+<ir_version: 9, opset_import: ["" : 17]>
+empty (float[1,8] x) => (float[1,8] y, int64[2,n] places) {
+    ["relu"] r = Relu(x)
+    ["places"] places = NonZero(r)
+    ["exp"] y = %s(r)
+}
+"""
+
+
+def test_tensors_without_elements_are_passed_by() -> None:
+    frames = [Frame(0, True, {"x": -np.ones((1, 8), np.float32)})]
+    source = Source.of(ir.from_onnx_text(EMPTY % "Exp"), frames)
+
+    found = source.first_difference(ir.from_onnx_text(EMPTY % "Sigmoid"))
+
+    assert [each.nodes for each in found.places] == [("exp",)]
+
+
+def test_what_changes_its_shape_from_frame_to_frame_is_held_too() -> None:
+    frames = [
+        Frame(0, True, {"x": np.ones((1, 8), np.float32)}),
+        Frame(1, True, {"x": np.arange(8, dtype=np.float32)[None]}),
+    ]
+    source = Source.of(ir.from_onnx_text(EMPTY % "Exp"), frames)
+
+    found = source.first_difference(
+        ir.from_onnx_text((EMPTY % "Exp").replace("NonZero(r)", "NonZero(x)"))
+    )
+
+    assert (found.compared, found.different) == (3, 0)
 
 
 def test_python_refuses_no_frames(tmp_path: Path) -> None:
