@@ -74,7 +74,6 @@ class Stage(Draws):
         self._next_id = 1
         # the second road
         self.ego_lanes: list[tuple[LaneIndex, float]] = []
-        self.conflict: list[Car | Walker] = []
         self.clear: dict[LaneIndex, tuple[float, float]] = {}
         """Lanes into the map on which nobody begins between two stations."""
         self.schedule: Schedule | None = None

@@ -72,10 +72,10 @@ def invader(stage: Stage, street: Street) -> Script:
     """
     chain = street.oncoming()
     total = sum(stage.network.length(index) for index in chain)
-    where = stage.place("meet_m", 55.0, 75.0)
     if stage.schedule is not None:
-        yield from _invaders(stage, chain, where)
+        yield from _invaders(stage, chain)
         return
+    where = stage.uniform("meet_m", 55.0, 75.0)
     away = stage.uniform("away_m", 50.0, 60.0)
     kind = ActorKind(stage.choice("invader", ("car", "van")))
     # an oncoming car, offset into the ego's lane
@@ -107,7 +107,7 @@ INVADING = 0.4
 """Share of the oncoming cars of the second road that drive partly in the ego's lane."""
 
 
-def _invaders(stage: Stage, chain: list[LaneIndex], where: float) -> Script:
+def _invaders(stage: Stage, chain: list[LaneIndex]) -> Script:
     """Drive oncoming traffic, a share of it partly in the ego's lane."""
     gap, random = stage.uniform("oncoming_gap_s", 4.0, 7.0), stage.random("invaders")
     cars = stream(stage, "oncoming", [chain], Traffic(gap))
@@ -115,7 +115,7 @@ def _invaders(stage: Stage, chain: list[LaneIndex], where: float) -> Script:
     for car in invaders:
         car.offset_m = LANE_WIDTH_M - float(random.uniform(1.4, 2.0))
         car.behaviour = replace(car.behaviour, sees_ego=False)
-    yield from encounter(stage, invaders, where, "invader")
+    yield from encounter(stage, invaders, None, "invader")
 
 
 def emergency_behind(stage: Stage, street: Street) -> Script:
@@ -175,7 +175,6 @@ def _emergency_comes(stage: Stage, lanes: list[LaneIndex]) -> Script:
     car = stage.coming(lanes, 0.0, 15.0, 18.0, ActorKind.EMERGENCY, mind)
     if stage.schedule is not None:
         stage.schedule.add(at, car)
-    stage.conflict.append(car)
     held = [0.0]
 
     def judge() -> Event | None:

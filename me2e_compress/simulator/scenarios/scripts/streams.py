@@ -18,8 +18,9 @@ HEEDLESS, SLOW = 0.12, 0.15
 choice."""
 TURNING = 0.4
 """Share of traffic that turns at a junction."""
-TOGETHER_M = 25.0
-"""The ego and others meet if they are this close to the place of the conflict."""
+EGO_M, OTHER_M = 20.0, 10.0
+"""The ego and another meet if each is this close to the place of the conflict; the ego
+waits before it."""
 EGO_ROOM_M = 14.0
 """Nobody begins nearer to the ego, bumper to bumper."""
 
@@ -149,18 +150,21 @@ def across(
 
 
 def encounter(
-    stage: Stage, cars: Sequence[Car | Walker], route_s: float, name: str
+    stage: Stage, others: Sequence[Car | Walker], route_s: float | None, name: str
 ) -> Script:
-    """Note that the ego and one of some others are at a place together."""
-    stage.conflict += cars
-    place = stage.route_pose(route_s)
+    """Note that the ego and one of some others are at a place together.
+
+    Without a place: wherever they meet.
+    """
+    place = None if route_s is None else stage.route_pose(route_s)
     while True:
         yield
-        if abs(stage.ahead_m(route_s)) > TOGETHER_M:
+        at = place or stage.ego.pose
+        if route_s is not None and abs(stage.ahead_m(route_s)) > EGO_M:
             continue
-        for body in cars:
+        for body in others:
             x, y = body.position
-            near = math.hypot(x - place.x, -y - place.y) < TOGETHER_M
+            near = math.hypot(x - at.x, -y - at.y) < OTHER_M
             if near and body.road is not None:
                 stage.fire(name, body)
                 return
