@@ -4,6 +4,8 @@ import math
 from collections.abc import Collection
 from enum import StrEnum
 
+from highway_env.vehicle.objects import RoadObject
+
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import Roadmap, RoutePath
 from me2e_compress.simulator.privileged import (
@@ -160,10 +162,7 @@ class World:
         )
 
     def privileged(self, actors: Collection[int] | None = None) -> Privileged:
-        """Return what only a privileged policy may see: intents and signal phases.
-
-        With ``actors``, only the intents of those.
-        """
+        """Return intents, of all or only of some actors, and signal phases."""
         phases = (phase_of(regulator) for regulator in self._stage.regulators)
         return Privileged(
             tuple(
@@ -264,7 +263,7 @@ class World:
                 event = self._stage.event(EventKind.ACTOR_COLLISION, words, b)
             self._stage.events.append(event)
 
-    def _collide(self, body: Car | Walker | StaticObject) -> None:
+    def _collide(self, body: RoadObject) -> None:
         """Note a collision of the ego's; the route ends, or both bodies stand."""
         self.collided.setdefault(self.time_us, self.scene())
         if self.first_collision is None:
