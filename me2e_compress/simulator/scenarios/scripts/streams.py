@@ -18,7 +18,7 @@ HEEDLESS, SLOW = 0.12, 0.15
 choice."""
 TURNING = 0.4
 """Share of traffic that turns at a junction."""
-EGO_M, OTHER_M = 20.0, 10.0
+EGO_M, OTHER_M = 25.0, 10.0
 """The ego and another meet if each is this close to the place of the conflict; the ego
 waits before it."""
 EGO_ROOM_M = 14.0
