@@ -1,9 +1,11 @@
 """Routes and their manifest: a JSON list of objects."""
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from pydantic import TypeAdapter
 
@@ -19,6 +21,15 @@ SHIPPED = Path(__file__).with_name("routes_220.json")
 """The routes that ship: 44 scenario types, 5 variants each."""
 
 
+ROADS = (1, 2)
+"""Generations of roads. On the first, actors wait for the ego and nobody else is about;
+on the second, arrivals and signals follow plans that are drawn before the route begins,
+and there is traffic on every road."""
+DIGEST = "set_sha256"
+"""Key of a set of the second road, in its first record: what its routes were when they
+were admitted."""
+
+
 @dataclass(frozen=True)
 class Route:
     """One route: a scenario type and everything that decides how it unfolds.
@@ -30,6 +41,7 @@ class Route:
         seed: Decides every parameter that is not given.
         parameters: Values by name; what is given here is not drawn from the seed, so
             editing one changes that one and nothing else.
+        road: Which of `ROADS` it lies on.
     """
 
     id: str
@@ -37,8 +49,14 @@ class Route:
     ability: str
     seed: int
     parameters: dict[str, Parameter] = field(default_factory=dict)
+    road: int = 1
 
     def __post_init__(self) -> None:
+        if self.road not in ROADS:
+            raise EvaluationError(
+                f"route {self.id}: road {self.road}: there are"
+                f" {' and '.join(map(str, ROADS))}"
+            )
         if not is_route_id(self.id):
             raise EvaluationError(
                 f"route id {self.id!r}: only letters, digits, '_' and '-' are allowed"
@@ -60,6 +78,13 @@ class Route:
         """Every ability that the scenario type counts under."""
         return SCENARIO_ABILITIES[self.scenario]
 
+    def record(self) -> dict[str, Any]:
+        """Return it as files and digests hold it: those of the first road name none."""
+        record = asdict(self)
+        if self.road == 1:
+            del record["road"]
+        return record
+
 
 def is_route_id(text: str) -> bool:
     """Return whether a text can be the id of a route, and so part of a file name."""
@@ -69,14 +94,39 @@ def is_route_id(text: str) -> bool:
 _MANIFEST = TypeAdapter(list[Route])
 
 
-def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
-    """Read a manifest.
+_FIRST = TypeAdapter(list[dict[str, Any]])
+
+
+def load_routes(path: Path = SHIPPED, road: int | None = None) -> tuple[Route, ...]:
+    """Read a manifest; with ``road``, only one of that road.
 
     Raises:
-        EvaluationError: The file is missing, not a manifest, or repeats an id.
+        EvaluationError: The file is missing, not a manifest, or repeats an id; its
+            routes lie on several roads, or on another than was asked for; or it is of
+            the second road and was changed after it was made.
     """
     with documents.reading(path, EvaluationError, "not routes"):
-        routes = _MANIFEST.validate_json(documents.content(path), strict=True)
+        content = documents.content(path)
+        routes = _MANIFEST.validate_json(content, strict=True)
+        records = _FIRST.validate_json(content)
+    # one road, and a set of the second one as it was admitted
+    roads = sorted({route.road for route in routes})
+    if len(roads) > 1:
+        first = next(route for route in routes if route.road != routes[0].road)
+        raise EvaluationError(
+            f"{path}: mixes roads: {first.id} lies on road {first.road},"
+            f" {routes[0].id} on road {routes[0].road}"
+        )
+    if road is not None and roads != [road]:
+        found = roads[0] if roads else "none"
+        raise EvaluationError(
+            f"{path}: its routes lie on road {found}; road {road} was asked for"
+        )
+    if roads == [2] and records[0].get(DIGEST) != digest_of(routes):
+        raise EvaluationError(
+            f"{path}: was changed after its routes were admitted (its {DIGEST} does not"
+            " fit them); make a set with: me2e-compress routes --road 2"
+        )
     # ids are unique
     seen: dict[str, int] = {}
     for index, route in enumerate(routes):
@@ -88,10 +138,19 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
     return tuple(routes)
 
 
+def digest_of(routes: Sequence[Route]) -> str:
+    """Return the sha256 of the definitions of some routes."""
+    definitions = json.dumps([route.record() for route in routes], sort_keys=True)
+    return hashlib.sha256(definitions.encode()).hexdigest()
+
+
 def save_routes(routes: Sequence[Route], path: Path) -> None:
     """Write a manifest atomically, one route a line."""
-    records = [asdict(route) for route in routes]
-    records[:1] = [IN_JSON | each for each in records[:1]]  # a list has no other place
+    records = [route.record() for route in routes]
+    mark: dict[str, Any] = dict(IN_JSON)
+    if routes and routes[0].road == 2:
+        mark[DIGEST] = digest_of(routes)
+    records[:1] = [mark | each for each in records[:1]]  # a list has no other place
     lines = ",\n".join(map(json.dumps, records))
     try:
         write_bytes(path, f"[\n{lines}\n]\n".encode())

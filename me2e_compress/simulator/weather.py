@@ -60,3 +60,20 @@ class Weather:
 
 
 CLEAR = Weather()
+
+
+DRAWN = ("clear",) * 8 + ("rain", "night", "fog", "dirt")
+"""Weather of the second road: a third of its routes have some."""
+
+
+def drawn_weather(kind: str, strength: float, seed: int) -> Weather:
+    """Return weather of `DRAWN`; the strength is 0 to 1."""
+    if kind == "rain":
+        return Weather(rain=0.3 + 0.7 * strength, seed=seed)
+    if kind == "night":
+        return Weather(night=0.5 + 0.5 * strength)
+    if kind == "fog":
+        return Weather(fog_m=round(150.0 - 90.0 * strength, 1))
+    if kind == "dirt":
+        return Weather(brightness=1.0 - 0.4 * strength, noise=12.0 * strength)
+    return CLEAR

@@ -1,7 +1,10 @@
 """One route, stepped frame by frame."""
 
 import math
+from collections.abc import Collection
 from enum import StrEnum
+
+from highway_env.vehicle.objects import RoadObject
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import Roadmap, RoutePath
@@ -12,9 +15,19 @@ from me2e_compress.simulator.privileged import (
 )
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.builders import Builder, stage_of
-from me2e_compress.simulator.scene import Actor, Control, Event, EventKind, Scene
+from me2e_compress.simulator.scene import (
+    Actor,
+    Control,
+    Event,
+    EventKind,
+    Scene,
+    SignalKind,
+)
 from me2e_compress.simulator.traffic.bodies import StaticObject, Walker
 from me2e_compress.simulator.traffic.cars import Car
+from me2e_compress.simulator.traffic.contacts import Contacts
+from me2e_compress.simulator.traffic.right_of_way import RightOfWay
+from me2e_compress.simulator.traffic.schedule import Schedule
 from me2e_compress.simulator.traffic.traffic_road import TrafficRoad
 
 DT_US = 50_000
@@ -46,6 +59,8 @@ class World:
         dt_us: Frame length in microseconds. A finer one takes controls more often;
             actors still decide every 0.1 s.
         builder: Sets the stage instead of the registered scenario type: for new types.
+        drive_on: Go on after a collision, as CARLA does: both bodies stand, and neither
+            moves farther into the other.
 
     Attributes:
         path: The ego's route.
@@ -54,10 +69,18 @@ class World:
         outside_m: Metres between the ego's centre and the nearest lane, 0 inside.
         outside_distance_m: Metres driven while that exceeded `TOLERANCE_M`.
         reason: Why the world has ended; None before that.
+        collided: Scenes of the ego's collisions, by time in microseconds.
+        first_collision: When the ego first collided, and its two distances then.
+        weather: What the route says; a clear day on the first road.
     """
 
     def __init__(
-        self, route: Route, *, dt_us: int = DT_US, builder: Builder | None = None
+        self,
+        route: Route,
+        *,
+        dt_us: int = DT_US,
+        builder: Builder | None = None,
+        drive_on: bool = False,
     ) -> None:
         if not 0 < dt_us <= DECISION_US:
             raise EvaluationError(
@@ -81,8 +104,27 @@ class World:
         self._met = set[tuple[int, int]]()
         self._next_decision_us = 0
         self.reason: EndReason | None = None
+        # collisions
+        self.collided: dict[int, Scene] = {}
+        self.first_collision: tuple[int, float, float] | None = None
+        self._drive_on, self._contacts = drive_on, Contacts()
+        self.weather = stage.weather
+        if stage.schedule is not None:
+            self._set_rules(stage.schedule)
         self._take_stage()
         self._road.refresh()
+
+    def _set_rules(self, schedule: Schedule) -> None:
+        """Let lights and right of way decide, for others and at the ego's signs."""
+        stage = self._stage
+        rules = RightOfWay(stage.network, schedule.lines, stage.ego_lanes)
+        self._road.rules = rules
+        meets = [begin for begin, _ in rules.priority_over_ego()]
+        for sign in stage.regulators:
+            if sign.kind is SignalKind.GIVE_WAY and sign.line_s is not None:
+                sign.nearest_s = rules.soonest_s
+                sign.conflict_s = min(meets, default=math.inf)
+        schedule.show(0)
 
     @property
     def time_us(self) -> int:
@@ -119,11 +161,15 @@ class World:
             tuple(signal.snapshot() for signal in self._stage.regulators),
         )
 
-    def privileged(self) -> Privileged:
-        """Return what only a privileged policy may see: intents and signal phases."""
+    def privileged(self, actors: Collection[int] | None = None) -> Privileged:
+        """Return intents, of all or only of some actors, and signal phases."""
         phases = (phase_of(regulator) for regulator in self._stage.regulators)
         return Privileged(
-            tuple(intent_of(body) for body in self._stage.bodies),
+            tuple(
+                intent_of(body)
+                for body in self._stage.bodies
+                if actors is None or body.id in actors
+            ),
             tuple(phase for phase in phases if phase is not None),
         )
 
@@ -144,11 +190,18 @@ class World:
         if stage.time_us >= self._next_decision_us:
             self._next_decision_us += DECISION_US
             stage.scripts = [s for s in stage.scripts if next(s, stage) is not stage]
+            if stage.schedule is not None:
+                here = [stage.ego, *stage.bodies, *stage.static_objects]
+                stage.bodies += stage.schedule.due(stage.time_us, here)
             self._take_stage()
+            self._road.ego_s = stage.ego_s
             self._road.act()
         # every frame: bodies move, then the rules are checked
+        self._contacts.before(stage.ego)
         self._road.step(self.dt_us / 1e6)
         stage.time_us += self.dt_us
+        if stage.schedule is not None:
+            stage.schedule.show(stage.time_us)
         self._follow_route()
         self._check_lanes()
         self._check_signals()
@@ -193,18 +246,33 @@ class World:
 
     def _check_collisions(self) -> None:
         for a, b in self._road.touching():
-            if (a.id, b.id) in self._met:
+            if a.id == 0 and self._drive_on:
+                self._contacts.resist(self._stage.ego, b)
+                if not self._contacts.counts(self.time_us, self._stage.ego, b.id):
+                    continue
+            elif (a.id, b.id) in self._met:
                 continue
             self._met.add((a.id, b.id))
             if a.id == 0 and a.speed < STANDING_MPS:
                 event = self._stage.event(EventKind.STRUCK, "the standing ego", b)
             elif a.id == 0:
                 event = self._stage.event(EventKind.COLLISION, "the ego", b)
-                self.reason = EndReason.COLLISION
+                self._collide(b)
             else:
                 words = f"actor {a.id}"
                 event = self._stage.event(EventKind.ACTOR_COLLISION, words, b)
             self._stage.events.append(event)
+
+    def _collide(self, body: RoadObject) -> None:
+        """Note a collision of the ego's; the route ends, or both bodies stand."""
+        self.collided.setdefault(self.time_us, self.scene())
+        if self.first_collision is None:
+            passed = self.progress_m, self.outside_distance_m
+            self.first_collision = self.time_us, *passed
+        if not self._drive_on:
+            self.reason = EndReason.COLLISION
+            return
+        self._stage.ego.speed = body.speed = 0.0
 
     def _reach_goal(self) -> None:
         self.reason = EndReason.GOAL

@@ -111,7 +111,7 @@ class Condition(ConditionOptions):
             "dt_ms": self.dt_ms,
             "weather": self.weather,
             "against": self.against or None,
-        }
+        } | ({"drive_on": True} if self.drive_on else {})
 
     @property
     def _names_a_file(self) -> bool:
@@ -144,6 +144,7 @@ class Condition(ConditionOptions):
             "every control late (fifo)": self.latency_model != "drop",
             f"a step of {self.dt_ms:g} ms": self.dt_ms != 50.0,
             f"weather {self.weather}": self.weather,
+            "driving on after collisions": self.drive_on,
         }
         return [words for words, true in said.items() if true]
 

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.extras import need_extra
-from me2e_compress.simulator.routes import load_routes, pick_routes, save_routes
+from me2e_compress.simulator.routes import (
+    ROADS,
+    load_routes,
+    pick_routes,
+    save_routes,
+)
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES, VARIANTS
 from me2e_compress.workflows.checks import check_count
 from me2e_compress.workflows.claims import writing
@@ -29,6 +36,8 @@ class RoutesOptions:
         scenarios: ``all``, or ``NAME,NAME``.
         workers: scenario types at a time.
         force: replace outputs that we did not write, too.
+        road: 1, or 2: longer routes with traffic, whose arrivals and signals were drawn
+            before they begin.
     """
 
     seed: int = 0
@@ -36,9 +45,13 @@ class RoutesOptions:
     scenarios: str = "all"
     workers: int = 1
     force: bool = False
+    road: int = 1
 
     def __post_init__(self) -> None:
         check_count("--seed", self.seed)
+        if self.road not in ROADS:
+            there = " and ".join(map(str, ROADS))
+            raise EvaluationError(f"--road {self.road}: there are {there}")
         for name in self.names:
             if name not in SCENARIO_ABILITIES:
                 there = ", ".join(sorted(SCENARIO_ABILITIES))
@@ -85,7 +98,7 @@ class RoutesResult(Result):
                 one.scenario,
                 str(len(one.routes)),
                 str(one.tried),
-                "; ".join(dict.fromkeys(one.refusals)),
+                _by_reason(one.refusals),
             )
             for one in self.harvests
         ]
@@ -110,6 +123,15 @@ class RoutesResult(Result):
         return {**counts, "scenarios": self.records()}
 
 
+def _by_reason(refusals: Sequence[str]) -> str:
+    """Return each reason once, with how often it was given if more than once."""
+    counts = Counter(refusals)
+    return "; ".join(
+        f"{reason} ({times} times)" if times > 1 else reason
+        for reason, times in counts.items()
+    )
+
+
 def make_routes(
     output: str | Path,
     options: RoutesOptions | None = None,
@@ -128,7 +150,9 @@ def _made(output: Path, options: RoutesOptions, listener: Listener) -> RoutesRes
     # report each scenario type as soon as its routes are admitted
     names = options.names
     harvests: list[ScenarioRoutes] = []
-    made = generate(options.seed, names, options.variants, options.workers)
+    made = generate(
+        options.seed, names, options.variants, options.workers, options.road
+    )
     for harvest in made:
         harvests.append(harvest)
         done = len(harvests)
@@ -189,14 +213,20 @@ class ExaminationResult(Result):
 
 
 def examine_routes(
-    manifest: str | Path, pick: str = "all", listener: Listener = SILENT
+    manifest: str | Path,
+    pick: str = "all",
+    listener: Listener = SILENT,
+    road: int | None = None,
 ) -> ExaminationResult:
-    """Examine a set of routes again; `pick` is ``all``, a number or ``ID,ID``."""
+    """Examine a set of routes again; `pick` is ``all``, a number or ``ID,ID``.
+
+    With ``road``, a set of another road is refused.
+    """
     need_extra("highway", "examining routes")
     from me2e_compress.evaluators.highway.generate import examine
 
     manifest, verdicts = Path(manifest), []
-    picked = pick_routes(load_routes(manifest), pick)
+    picked = pick_routes(load_routes(manifest, road), pick)
     for route in picked:
         verdicts.append(examine(route))
         listener.on_progress("examining", len(verdicts), len(picked), route.id)

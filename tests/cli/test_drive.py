@@ -1,6 +1,7 @@
 """``evaluate``, ``score``, ``profile`` and ``routes``: the closed loop."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -178,3 +179,30 @@ def test_a_set_is_put_through_the_gate_again(cli: Cli, tmp_path: Path) -> None:
     found = cli.document("routes --examine easy.json", code=1)
     assert found["status"] == "refused"
     assert list(found["refused"]) == ["test"]
+
+
+def test_sets_of_the_wrong_road_are_one_line(cli: Cli, tmp_path: Path) -> None:
+    save_routes([route_of(STOP, 1)], tmp_path / "old.json")
+    new = replace(route_of(STOP, 1), road=2)
+    save_routes([new], tmp_path / "new.json")
+    text = (tmp_path / "new.json").read_text()
+    (tmp_path / "edited.json").write_text(text.replace('"seed": 1', '"seed": 2'))
+
+    for line, words in (
+        ("routes --examine old.json --road 2", "lie on road 1; road 2 was asked for"),
+        ("routes --examine new.json --road 1", "lie on road 2; road 1 was asked for"),
+        ("routes -o x.json --road 3", "--road 3: there are 1 and 2"),
+        ("evaluate blind:8 -o out --routes edited.json", "edited.json: was changed"),
+    ):
+        assert words in cli.refused(line)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_route_of_the_second_road_is_driven_on(cli: Cli, tmp_path: Path) -> None:
+    save_routes([replace(route_of(STOP, 1), road=2)], tmp_path / "new.json")
+
+    report = cli.document("evaluate blind:12 -o out --routes new.json --drive-on")
+
+    assert report["routes"]["driven"] == 1
+    manifest = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    assert manifest["drive_on"] is True

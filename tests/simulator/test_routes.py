@@ -1,6 +1,7 @@
 import json
 import stat
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.routes import (
     SHIPPED,
     Route,
+    digest_of,
     load_routes,
     pick_routes,
     save_routes,
@@ -135,3 +137,57 @@ def test_picking_all_some_or_named_routes() -> None:
 def test_picking_what_is_not_there(which: str, words: str) -> None:
     with pytest.raises(EvaluationError, match=words):
         pick_routes(ROUTES, which)
+
+
+SECOND = tuple(replace(route, road=2) for route in ROUTES[:2])
+
+
+def test_a_set_of_the_second_road_says_so_and_comes_back(tmp_path: Path) -> None:
+    file = tmp_path / "routes.json"
+    save_routes(SECOND, file)
+
+    assert load_routes(file) == load_routes(file, road=2) == SECOND
+    records = json.loads(file.read_text())
+    assert [record["road"] for record in records] == [2, 2]
+    assert records[0]["set_sha256"] == digest_of(SECOND)
+
+
+def test_the_first_road_is_written_and_fingerprinted_as_ever(tmp_path: Path) -> None:
+    save_routes(load_routes(), tmp_path / "again.json")
+
+    assert "road" not in (tmp_path / "again.json").read_text()
+    assert digest_of(load_routes()).startswith("6018b3c6e79521d8")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (('"lanes": 2', '"lanes": 3'), "changed after its routes were admitted"),
+        (('"set_sha256": "', '"set_sha256": "0'), "changed after its routes"),
+        (('"seed": 1, ', '"seed": 8, '), "changed after its routes were admitted"),
+        ((', "road": 2}]', "}]"), "r1 lies on road 1, r0 on road 2"),
+        (('"road": 2', '"road": 3'), "road 3: there are 1 and 2"),
+    ],
+)
+def test_a_set_of_the_second_road_that_was_edited_is_refused(
+    tmp_path: Path, change: tuple[str, str], words: str
+) -> None:
+    file = tmp_path / "routes.json"
+    save_routes(SECOND, file)
+    text = file.read_text().replace("}\n]", "}]").replace(*change)
+    file.write_text(text)
+
+    with pytest.raises(EvaluationError) as caught:
+        load_routes(file)
+
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_set_of_the_other_road_is_refused(tmp_path: Path) -> None:
+    save_routes(SECOND, tmp_path / "new.json")
+
+    with pytest.raises(EvaluationError, match="lie on road 1; road 2 was asked for"):
+        load_routes(SHIPPED, road=2)
+    with pytest.raises(EvaluationError, match="lie on road 2; road 1 was asked for"):
+        load_routes(tmp_path / "new.json", road=1)

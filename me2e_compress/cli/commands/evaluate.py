@@ -42,6 +42,9 @@ Step = Annotated[float, typer.Option(help="step of the world")]
 Stage = Annotated[
     str, typer.Option(help="changes the plan on the host: collision-optimizer")
 ]
+DriveOn = Annotated[
+    bool, typer.Option("--drive-on", help="go on after a collision, as Bench2Drive")
+]
 Weather = Annotated[str, typer.Option(help="fog_m=80,night=0.5 ...")]
 Limit = Annotated[float, typer.Option(help="seconds until a decision counts as hung")]
 Render = Annotated[str | None, typer.Option(help="draw this route as GIF and PNG")]
@@ -62,6 +65,7 @@ def evaluate(
     adapter: given.Adapter = None,
     host_stage: Stage = "",
     weather: Weather = "",
+    drive_on: DriveOn = False,
     frame_limit: Limit = FRAME_LIMIT_S,
     engine: given.Engine = "local",
     render: Render = None,
@@ -88,6 +92,7 @@ def evaluate(
         routes=routes, latency=latency, latency_scale=latency_scale,
         latency_model=latency_model, in_order=in_order, seed=seed, workers=workers,
         dt_ms=dt_ms, adapter=adapter, host_stage=host_stage, weather=weather,
+        drive_on=drive_on,
         frame_limit_s=frame_limit, engine=engine_name, address=address, render=render,
         provider=runs, force=force,
         evaluator=evaluator,

@@ -17,6 +17,10 @@ Examine = Annotated[
     Path | None, typer.Option(help="examine this manifest instead of making one")
 ]
 Scenarios = Annotated[str, typer.Option(help="scenario types: all, or NAME,NAME")]
+Road = Annotated[
+    int | None,
+    typer.Option(help="1, or 2: traffic, signal plans, arrivals by chance"),
+]
 Picked = Annotated[
     str, typer.Option("--routes", "--pick", help=f"{given.ROUTES}; with --examine")
 ]
@@ -30,6 +34,7 @@ def routes(
     ] = VARIANTS,
     scenarios: Scenarios = "all",
     workers: given.Workers = 1,
+    road: Road = None,
     examine: Examine = None,
     picked: Picked = "all",
     force: given.Force = False,
@@ -37,13 +42,15 @@ def routes(
     """Make a fresh set of admitted routes, or examine an existing set again."""
     if examine is not None:
         with listening() as listener:
-            examined = workflow.examine_routes(examine, picked, listener)
+            examined = workflow.examine_routes(examine, picked, listener, road)
         show(examined)
         examined.check()
         return
     if output is None:
         raise typer.BadParameter("a new set needs -o ROUTES.json", param_hint="-o")
-    options = workflow.RoutesOptions(seed, variants, scenarios, workers, force)
+    options = workflow.RoutesOptions(
+        seed, variants, scenarios, workers, force, road or 1
+    )
     with listening() as listener:
         made = workflow.make_routes(output, options, listener)
     show(made)

@@ -24,6 +24,7 @@ class Conditions:
             what a finer one changes. Frames are recorded every 50 ms regardless.
         image_size: Rows and columns of each camera.
         latency_model: Whether a latency drops decisions or delays every control.
+        drive_on: Whether a route goes on after a collision, as in Bench2Drive.
     """
 
     latency: LatencySource = field(default_factory=FixedLatency)
@@ -31,6 +32,7 @@ class Conditions:
     image_size: tuple[int, int] = (96, 160)
     weather: Weather = CLEAR
     latency_model: LatencyModel = LatencyModel.DROP
+    drive_on: bool = False
 
     def __post_init__(self) -> None:
         if self.latency.lacks_trace:
@@ -55,13 +57,17 @@ class ConditionOptions:
         in_order: replay a trace in its order, which keeps bursts.
         dt_ms: time step of the simulation, in milliseconds; results at different steps
             are not compared.
-        weather: ``fog_m=80,night=0.5,dropped=BACK+FRONT``; empty is a clear day.
+        weather: ``fog_m=80,night=0.5,dropped=BACK+FRONT``; empty is a clear day, or
+            what a route of the second road says.
+        drive_on: go on after a collision, as Bench2Drive does; every collision then
+            multiplies the score.
     """
 
     latency_model: str = "drop"
     in_order: bool = False
     dt_ms: float = 50.0
     weather: str = ""
+    drive_on: bool = False
 
     @functools.cached_property
     def settings(self) -> Conditions:
@@ -74,6 +80,7 @@ class ConditionOptions:
             dt_us=_step_us(self.dt_ms),
             weather=_weather_of(self.weather),
             latency_model=_latency_model_named(self.latency_model),
+            drive_on=self.drive_on,
         )
 
 

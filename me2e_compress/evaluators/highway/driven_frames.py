@@ -98,7 +98,7 @@ def _look(
     # the expert drives, the model looks on
     rig = CameraRig(*policy.image_size)
     texture = paint_texture(world.roadmap, world.path.points)
-    cameras = Cameras(texture, rig) if policy.needs_images else None
+    cameras = Cameras(texture, rig, world.weather) if policy.needs_images else None
     driver = ObservationBuilder(world, expert, rig, None)
     passenger = ObservationBuilder(world, policy, rig, cameras)
     # record every half second, from the first moment on

@@ -14,6 +14,7 @@ from me2e_compress.metrics.episode import (
     EgoFrame,
     Ending,
     Episode,
+    FirstCollision,
     InferenceRecord,
 )
 from me2e_compress.metrics.infraction import (
@@ -85,6 +86,7 @@ class EpisodeRecorder:
             decisions=tuple(self.decisions),
             junction_m=junction_m(world.path),
             conflicts=self.conflicts.result(),
+            first_collision=_first_collision(world, ending),
         )
 
 
@@ -99,8 +101,24 @@ def completion_percent(world: World) -> float:
 
     It has two digits, as in the leaderboard; only reaching the goal makes it 100.
     """
-    share = 100.0 * world.progress_m / world.path.goal_m
-    return min(max(round(share, 2), 0.0), 99.99)
+    return _percent(world.progress_m, world.path.goal_m)
+
+
+def _percent(passed_m: float, goal_m: float) -> float:
+    return min(max(round(100.0 * passed_m / goal_m, 2), 0.0), 99.99)
+
+
+def _first_collision(world: World, ending: Ending) -> FirstCollision | None:
+    """Return where the route would have ended if it went on after a collision."""
+    if world.first_collision is None or ending is Ending.COLLISION:
+        return None
+    time_us, passed_m, outside_m = world.first_collision
+    outside = _outside_percent(outside_m, passed_m)
+    return FirstCollision(time_us, _percent(passed_m, world.path.goal_m), outside)
+
+
+def _outside_percent(outside_m: float, passed_m: float) -> float:
+    return min(100.0, 100.0 * outside_m / max(passed_m, outside_m, 1e-9))
 
 
 def junction_m(path: RoutePath) -> float | None:
@@ -177,11 +195,8 @@ def _infraction(kind: InfractionKind, event: Event, world: World) -> Infraction:
 
 
 def _judged(collision: Infraction, event: Event, world: World) -> Infraction:
-    """Add the type of contact, and whether the ego was at fault.
-
-    The world ends at a collision, so its present state is that of the collision.
-    """
-    scene = world.scene()
+    """Add the type of contact, and whether the ego was at fault."""
+    scene = world.collided[event.time_us]
     for actor in scene.actors:
         if actor.id == event.actor_id:
             contact = contact_of(scene.ego, actor)
@@ -196,7 +211,7 @@ def _outside(world: World) -> Infraction | None:
     if first is None:
         return None
     outside_m = world.outside_distance_m
-    percent = min(100.0, 100.0 * outside_m / max(world.progress_m, outside_m, 1e-9))
+    percent = _outside_percent(outside_m, world.progress_m)
     return Infraction(
         InfractionKind.OUTSIDE_ROUTE_LANES,
         *(first.time_us, first.x, first.y),

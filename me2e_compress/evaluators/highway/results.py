@@ -15,13 +15,13 @@ from me2e_compress.metrics.episode import Episode
 from me2e_compress.registry import documents
 from me2e_compress.registry.marks import IN_JSON
 from me2e_compress.runtime.atomic import write_json
-from me2e_compress.simulator.routes import Route, is_route_id
+from me2e_compress.simulator.routes import Route, digest_of, is_route_id
 from me2e_compress.version import __version__
 
 MANIFEST = "evaluation.json"
 ROUTES = "routes"
-BEFORE = {"latency_model": "drop"}
-"""Defaults for folders from before their manifest had the key."""
+BEFORE = {"latency_model": "drop", "drive_on": False}
+"""Defaults for folders whose manifest lacks the key."""
 MEASURED = "latency_samples"
 """Key of a manifest: number of samples that latencies were drawn from. It is
 derived data, and not compared."""
@@ -31,8 +31,9 @@ LARGEST_SET = 1_000_000
 
 def fingerprint(job: Job, routes: Sequence[Route], set_size: int) -> dict[str, Any]:
     """Return everything that decides the bytes of the results."""
-    definitions = json.dumps([asdict(route) for route in routes], sort_keys=True)
+    went_on = {"drive_on": True} if job.conditions.drive_on else {}
     return {
+        **went_on,
         "version": __version__,
         "policy": job.driver.fingerprint(),
         "latency": job.conditions.latency.to_json(),
@@ -42,7 +43,7 @@ def fingerprint(job: Job, routes: Sequence[Route], set_size: int) -> dict[str, A
         "weather": json.loads(json.dumps(asdict(job.conditions.weather))),
         "frame_limit_s": job.frame_limit_s,
         "set_size": set_size,
-        "routes_sha256": hashlib.sha256(definitions.encode()).hexdigest(),
+        "routes_sha256": digest_of(routes),
         "routes": [route.id for route in routes],
     }
 

@@ -37,6 +37,7 @@ from me2e_compress.simulator.cameras import (
 from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Control, Ego, Scene
+from me2e_compress.simulator.weather import CLEAR
 from me2e_compress.simulator.world import EndReason, World
 
 BLOCKED_MPS = 0.1
@@ -53,7 +54,8 @@ class EndingRules:
     """Decides when one route is over; constants of Bench2Drive's atomic_criteria.py.
 
     * the goal is reached, or the ego collides: the world itself ends there. CARLA
-      drives on after a collision, so its driving scores multiply more penalties;
+      drives on after a collision, so its driving scores multiply more penalties, and
+      so do ours if the conditions say so;
     * deviation: 30 m from the route, or more than 30 % of its length driven at least 15
       m away from it;
     * blocked: at most 0.1 m/s for 60 s;
@@ -145,7 +147,9 @@ class _Drive:
         self, route: Route, policy: Policy, conditions: Conditions, listeners: Listeners
     ) -> None:
         self.route, self.policy, self.listeners = route, policy, listeners
-        self.world = world = World(route, dt_us=conditions.dt_us)
+        self.world = world = World(
+            route, dt_us=conditions.dt_us, drive_on=conditions.drive_on
+        )
         self.recorder, self.rules = EpisodeRecorder(world), EndingRules()
         self.clock = control_clock(
             conditions.latency_model, Control(0.0, 0.0), conditions.dt_us
@@ -155,7 +159,9 @@ class _Drive:
         self.cameras = None
         if policy.needs_images or listeners.on_moment is not None:
             texture = paint_texture(world.roadmap, world.path.points)
-            self.cameras = Cameras(texture, rig, conditions.weather)
+            given = conditions.weather
+            weather = world.weather if given == CLEAR else given
+            self.cameras = Cameras(texture, rig, weather)
         needed = self.cameras if policy.needs_images else None
         self.observer = ObservationBuilder(world, policy, rig, needed)
         self.plan: tuple[Ego, Plan] | None = None

@@ -5,6 +5,7 @@ from functools import partial
 from typing import TypeVar
 
 from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scenarios.background import populate
 from me2e_compress.simulator.scenarios.layouts.circle import roundabout
 from me2e_compress.simulator.scenarios.layouts.crossings import (
     crosswalk_junction,
@@ -127,7 +128,9 @@ BUILDERS: dict[str, Builder] = {
         partial(signal_junction, moves=LEFT), flows.platoon_to_enter
     ),
     # another road user appears suddenly
-    "BlockedIntersection": scenario(partial(junction, moves=MOVES), leads.blocked_exit),
+    "BlockedIntersection": scenario(
+        partial(junction, moves=MOVES, lights=True), leads.blocked_exit
+    ),
     "DynamicObjectCrossing": scenario(two_way, crossers.walker_behind_van),
     "HardBreakRoute": scenario(single_lane, leads.hard_brake),
     "OppositeVehicleTakingPriority": scenario(
@@ -141,7 +144,7 @@ BUILDERS: dict[str, Builder] = {
     "ParkingCrossingPedestrian": scenario(parking_street, crossers.walker_between_cars),
     "StaticCutIn": scenario(multilane, leads.queue_cut_in),
     "VehicleTurningRoute": scenario(
-        partial(junction, moves=TURNS), crossers.cyclists_on_exit
+        partial(junction, moves=TURNS, lights=True), crossers.cyclists_on_exit
     ),
     "VehicleTurningRoutePedestrian": scenario(
         partial(crosswalk_junction, moves=TURNS), crossers.pedestrians_on_exit
@@ -179,5 +182,6 @@ def stage_of(route: Route, builder: Builder | None = None) -> Stage:
     """
     stage = Stage(route)
     (builder or BUILDERS[route.scenario])(stage)
+    populate(stage)
     stage.complete()
     return stage

@@ -1,5 +1,6 @@
 """Bodies that follow no lane: the ego, pedestrians, static objects."""
 
+import bisect
 import math
 
 import numpy as np
@@ -125,16 +126,18 @@ class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
         self.diagonal = math.hypot(self.LENGTH, self.WIDTH)
         self.id, self.kind, self.line = id, kind, line
         self.top_speed_mps = speed_mps
-        self.going = False
+        self.going = self.crosses = False
         self.walked_m = 0.0
         self.braking, self.indicator = False, 0
         legs = np.hypot(*np.diff(line, axis=0).T)
         self._arc = np.concatenate([[0.0], np.cumsum(legs)])
+        self._ends = self._arc.tolist()
+        self._columns = line[:, 0].tolist(), line[:, 1].tolist()
 
     @property
     def done(self) -> bool:
         """Whether the end of the line is reached."""
-        return self.walked_m >= float(self._arc[-1])
+        return bool(self.walked_m >= self._ends[-1])
 
     def act(self, action: object = None) -> None:
         """Do nothing: only `going` matters."""
@@ -144,16 +147,23 @@ class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
         target = self.top_speed_mps if self.going and not self.done else 0.0
         change = 2 * max(self.top_speed_mps, 1.0) * dt
         self.speed += min(max(target - self.speed, -change), change)
-        self.walked_m = min(self.walked_m + self.speed * dt, float(self._arc[-1]))
+        self.walked_m = min(self.walked_m + self.speed * dt, self._ends[-1])
         if self.done:
             self.speed = 0.0
-        x = float(np.interp(self.walked_m, self._arc, self.line[:, 0]))
-        y = float(np.interp(self.walked_m, self._arc, self.line[:, 1]))
-        leg = int(np.searchsorted(self._arc, self.walked_m, side="right")) - 1
-        leg = min(max(leg, 0), len(self.line) - 2)
-        step = self.line[leg + 1] - self.line[leg]
-        self.heading = -math.atan2(step[1], step[0])
+        x, y, course = self._place()
+        self.heading = -course
         self.position = flip(x, y)
+
+    def _place(self) -> tuple[float, float, float]:
+        """Return where it is on its line, and the direction there, in plain floats."""
+        ends, (xs, ys) = self._ends, self._columns
+        leg = min(max(bisect.bisect_right(ends, self.walked_m) - 1, 0), len(ends) - 2)
+        dx, dy = xs[leg + 1] - xs[leg], ys[leg + 1] - ys[leg]
+        course = math.atan2(dy, dx)
+        if self.walked_m >= ends[-1]:
+            return xs[-1], ys[-1], course
+        length, along = ends[leg + 1] - ends[leg], self.walked_m - ends[leg]
+        return dx / length * along + xs[leg], dy / length * along + ys[leg], course
 
     def rest(self) -> Floats:
         """Return [M, 2], the rest of its line from its position on."""

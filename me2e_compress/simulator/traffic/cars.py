@@ -47,6 +47,14 @@ class Behaviour:
     """False for actors that ignore the ego."""
     obeys_limits: bool = True
     """False for emergency vehicles."""
+    obeys_rules: bool = True
+    """False for those who pass red lights and priority traffic."""
+    gap_s: float = 1.2
+    """Time to spare before priority traffic."""
+    changes_lanes: bool = False
+    """Whether MOBIL decides, every second, if a lane beside is better."""
+    politeness: float = 0.0
+    """MOBIL's weight of what a lane change costs others; highway-env has 0."""
 
 
 class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
@@ -104,6 +112,10 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         self.offset_m = 0.0
         """How far left of the lane's centre it drives."""
         self.braking, self.indicator = False, 0
+        self.until_change = id % 10
+        """Decisions until it looks for a better lane."""
+        self.joins: list[LaneIndex] | None = None
+        """The chain that it joins where its own ends."""
 
     @property
     def pose(self) -> Pose:
@@ -154,6 +166,7 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         if wanted is None:
             lead, gap = self.road.lead(self) or (None, math.inf)
             wanted = self.idm(lead, gap, self.allowed_mps(s))
+            wanted = self.road.ruled(self, s, wanted)
         wanted = min(max(wanted, -self.behaviour.hardest_mps2), self.COMFORT_ACC_MAX)
         self.action = {"acceleration": wanted, "steering": self._steering(s, r)}
         self.braking = wanted < -0.7 or self.speed < 0.2
@@ -171,6 +184,12 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
             return free
         wanted = max(self.desired_gap(self, leader), self.DISTANCE_WANTED)
         return float(free - self.COMFORT_ACC_MAX * (wanted / max(gap_m, 0.3)) ** 2)
+
+    def idm_stop(self, gap_m: float) -> float:
+        """Return IDM's acceleration (m/s2) towards a line at which it must stop."""
+        brake = 2 * math.sqrt(-self.COMFORT_ACC_MAX * self.COMFORT_ACC_MIN)
+        wanted = 0.5 + self.speed * self.TIME_WANTED / 2 + self.speed**2 / brake
+        return float(self.COMFORT_ACC_MAX * (1 - (wanted / max(gap_m, 0.3)) ** 2))
 
     def allowed_mps(self, lane_s: float) -> float:
         """Return the wanted speed, lowered for a limit or a curve here or ahead."""

@@ -95,6 +95,10 @@ class Network:
     def __init__(self) -> None:
         self.graph = RoadNetwork()
         self.shoulders: list[LaneIndex] = []
+        self.ranks: dict[LaneIndex, int] = {}
+        """Lanes inside junctions; those of a lower rank have priority."""
+        self.closed: list[LaneIndex] = []
+        """Lanes that end, or begin, in the middle of a road."""
         self._centres: dict[LaneIndex, Floats] = {}
 
     def straight(

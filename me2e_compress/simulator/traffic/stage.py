@@ -1,15 +1,13 @@
 """The setup of a scenario, and what its scripts see while it runs."""
 
 import math
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 
-import numpy as np
 from highway_env.vehicle.objects import RoadObject
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import Floats, Point, RoutePath
-from me2e_compress.simulator.routes import Parameter, Route
+from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import (
     ActorKind,
     Event,
@@ -23,6 +21,7 @@ from me2e_compress.simulator.traffic.bodies import (
     Walker,
 )
 from me2e_compress.simulator.traffic.cars import Behaviour, Car
+from me2e_compress.simulator.traffic.draws import Draws
 from me2e_compress.simulator.traffic.legs import Leg, build_path
 from me2e_compress.simulator.traffic.network import (
     LANE_WIDTH_M,
@@ -30,27 +29,34 @@ from me2e_compress.simulator.traffic.network import (
     Network,
     Pose,
 )
+from me2e_compress.simulator.traffic.schedule import Schedule
 from me2e_compress.simulator.traffic.signals import Regulator
+from me2e_compress.simulator.weather import CLEAR, DRAWN, drawn_weather
 
 Script = Iterator[None]
 """One actor script: resumed at every decision, it yields until the next one."""
 GOAL_M = 150.0
+"""Length of a route; on the second road, without what is drawn before and after."""
+LEAD_M, AFTER_M = (25.0, 90.0), (25.0, 160.0)
+"""Metres of the second road before the places of a scenario, and after them."""
+TRAFFIC = "traffic"
+"""The parameter that, with the seed, decides all arrivals of the second road."""
 SLOWEST_MPS = 1.0
 """Below this speed, the ego's arrival is estimated with this speed."""
 
 
-class Stage:
+class Stage(Draws):
     """Everything a scenario is made of.
 
     Layouts lay out the network and the route, scripts put actors on it; both do so
-    before the first frame. Afterwards scripts are resumed at every decision. Parameters
-    are drawn by name: the value depends on the route's seed and the name alone, not on
-    what was drawn before, and a value in the route's manifest wins.
+    before the first frame. Afterwards scripts are resumed at every decision.
+
+    On the second road there is a schedule: what the first road's scripts let depend on
+    the ego is drawn before the route begins, and routes are longer.
     """
 
     def __init__(self, route: Route) -> None:
-        self.route = route
-        self.parameters: dict[str, Parameter] = {}
+        super().__init__(route)
         # set by layouts and scripts
         self.network = Network()
         self.scripts: list[Script] = []
@@ -66,7 +72,26 @@ class Stage:
         self._path: RoutePath | None = None
         self._ego: EgoVehicle | None = None
         self._next_id = 1
-        self._complete = False
+        # the second road
+        self.ego_lanes: list[tuple[LaneIndex, float]] = []
+        self.clear: dict[LaneIndex, tuple[float, float]] = {}
+        """Lanes into the map on which nobody begins between two stations."""
+        self.schedule: Schedule | None = None
+        self.light_across_m = (0.0, 0.0)
+        """Where people who cross at a light begin and end, metres left of the route."""
+        self.weather = CLEAR
+        self.goal_m = GOAL_M
+        if route.road == 2:
+            self.schedule = Schedule()
+            self.lead_m = self.uniform("lead_m", *LEAD_M)
+            low, high = AFTER_M
+            spread = self.uniform("after_share", 0.0, 1.0)
+            self.goal_m += self.lead_m + round(low + (high - low) * spread**2, 3)
+            self._traffic = self.integer(TRAFFIC, 0, 2**31 - 1)
+            kind, strength = self.choice("weather", DRAWN), 0.0
+            if kind != "clear":
+                strength = self.uniform("weather_strength", 0.2, 1.0)
+            self.weather = drawn_weather(kind, strength, route.seed % 2**31)
 
     @property
     def path(self) -> RoutePath:
@@ -87,37 +112,10 @@ class Stage:
         """Seconds since the route began."""
         return self.time_us / 1e6
 
-    def uniform(self, name: str, low: float, high: float) -> float:
-        """Draw a parameter between two bounds, to the millimetre."""
-        drawn = round(float(self._random(name).uniform(low, high)), 3)
-        return float(self._given(name, drawn))
-
-    def integer(self, name: str, low: int, high: int) -> int:
-        """Draw an integer parameter between two bounds, both included."""
-        return int(self._given(name, int(self._random(name).integers(low, high + 1))))
-
-    def choice(self, name: str, options: Sequence[str]) -> str:
-        """Draw one of several words."""
-        drawn = options[int(self._random(name).integers(len(options)))]
-        value = str(self._given(name, drawn))
-        if value not in options:
-            raise EvaluationError(
-                f"route {self.route.id}: parameter {name} is {value!r}; "
-                f"there are {', '.join(options)}"
-            )
-        return value
-
-    def complete(self) -> None:
-        """Check that the route gives no parameter that nothing drew."""
-        self._complete = True
-        unasked = [
-            name for name in self.route.parameters if name not in self.parameters
-        ]
-        if unasked:
-            raise EvaluationError(
-                f"route {self.route.id}: {self.route.scenario} has no parameter "
-                f"{', '.join(unasked)} here; there are {', '.join(self.parameters)}"
-            )
+    @property
+    def more_m(self) -> float:
+        """How much longer than the first road's the route is."""
+        return self.goal_m - GOAL_M
 
     def play(self, script: Script) -> None:
         """Add a script.
@@ -130,12 +128,17 @@ class Stage:
 
     def drive(self, legs: Sequence[Leg], speed_mps: float) -> None:
         """Set the ego's route and put the ego at its beginning."""
-        self._path = build_path(self.network, legs, GOAL_M)
-        if self._path.length_m < GOAL_M:
+        self._path = build_path(self.network, legs, self.goal_m)
+        if self._path.length_m < self.goal_m:
             raise EvaluationError(
                 f"{self.route.scenario}: the route is {self._path.length_m:.0f} m "
-                f"long, its goal {GOAL_M:.0f} m away"
+                f"long, its goal {self.goal_m:.0f} m away"
             )
+        for leg in legs:
+            if leg.lane in self.network.ranks:
+                x, y = self.network.centre(leg.lane)[0]
+                begin, _ = self._path.project(float(x), float(y))
+                self.ego_lanes.append((leg.lane, begin))
         (x, y), heading = self._path.points[0], self._path.headings[0]
         self._ego = EgoVehicle(Pose(float(x), float(y), float(heading)), speed_mps)
 
@@ -149,12 +152,24 @@ class Stage:
         behaviour: Behaviour | None = None,
     ) -> Car:
         """Put a car on a chain of lanes, at an arc length from its beginning."""
-        lanes, s = self.network.rest(chain, s_m)
-        car = Car(
-            self._id(), self.network, lanes, s, speed_mps, target_mps, kind, behaviour
-        )
+        car = self.coming(chain, s_m, speed_mps, target_mps, kind, behaviour)
         self.bodies.append(car)
         return car
+
+    def coming(
+        self,
+        chain: Sequence[LaneIndex],
+        s_m: float,
+        speed_mps: float,
+        target_mps: float | None = None,
+        kind: ActorKind = ActorKind.CAR,
+        behaviour: Behaviour | None = None,
+    ) -> Car:
+        """Build a car that is not there yet."""
+        lanes, s = self.network.rest(chain, s_m)
+        return Car(
+            self._id(), self.network, lanes, s, speed_mps, target_mps, kind, behaviour
+        )
 
     def walker(self, kind: ActorKind, line: Floats, speed_mps: float) -> Walker:
         """Put a walker at the beginning of a line; `going` starts it."""
@@ -187,6 +202,7 @@ class Stage:
         number = len(self.regulators) + 1
         line_s = s if on_route else None
         regulator = Regulator(number, kind, line, line_s, state, width_m=width_m)
+        regulator.tail_alone = self.schedule is not None
         self.regulators.append(regulator)
         return regulator
 
@@ -234,23 +250,6 @@ class Stage:
             None if body is None else body.id,
             None if body is None else body.kind,
         )
-
-    def _given(self, name: str, drawn: Parameter) -> Parameter:
-        if self._complete:
-            raise EvaluationError(
-                f"{self.route.scenario}: parameter {name} is drawn after the setup"
-            )
-        value = self.route.parameters.get(name, drawn)
-        if isinstance(value, str) != isinstance(drawn, str):
-            raise EvaluationError(
-                f"route {self.route.id}: parameter {name} is {value!r}, "
-                f"expected a value like {drawn!r}"
-            )
-        self.parameters[name] = value
-        return value
-
-    def _random(self, name: str) -> np.random.Generator:
-        return np.random.default_rng([self.route.seed, zlib.crc32(name.encode())])
 
     def _id(self) -> int:
         self._next_id += 1

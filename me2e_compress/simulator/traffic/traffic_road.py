@@ -1,17 +1,22 @@
 """highway-env's road with one vectorised query a decision instead of n squared."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from highway_env.road.road import Road
 from highway_env.vehicle.objects import RoadObject
 
 from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.traffic.bodies import Walker
 from me2e_compress.simulator.traffic.cars import LOOK_AHEAD_M, Car
+from me2e_compress.simulator.traffic.lane_changes import consider
 from me2e_compress.simulator.traffic.lanes import LaneTable
 from me2e_compress.simulator.traffic.network import LaneIndex, Network
+from me2e_compress.simulator.traffic.right_of_way import RightOfWay
 
+FORESEEN_S = (1.0, 2.0, 3.0)
+"""When drivers foresee people who cross, seconds from now."""
 BESIDE_M = 0.25
 """Two bodies closer than this sideways are in each other's way."""
 
@@ -31,54 +36,110 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         self._row: dict[int, int] = {}
         self._s: Floats = np.zeros((0, 0))
         self._r: Floats = np.zeros((0, 0))
-        self._half: Floats = np.zeros(0)
-        self._ego: npt.NDArray[np.bool_] = np.zeros(0, bool)
+        self._half = list[float]()
+        self._ego = list[bool]()
+        self._lanes: dict[int, list[tuple[float, float, int]]] = {}
+        self.rules: RightOfWay | None = None
+        self.ego_s = 0.0
 
     def refresh(self) -> None:
         """Update the positions from which the queries below answer."""
         self._bodies = [*self.vehicles, *self.objects]
-        self._row = {id(body): i for i, body in enumerate(self._bodies)}
+        self._lanes = {}
         points = np.array([body.position for body in self._bodies])
+        if self.rules is not None:
+            points = self._with_crossers(points)
+        self._row = {id(body): i for i, body in enumerate(self.vehicles)}
         self._s, self._r = self.table.coordinates(points)
-        self._half = np.array([body.WIDTH / 2 for body in self._bodies])
-        self._ego = np.array([body.id == 0 for body in self._bodies])
+        self._half = [body.WIDTH / 2 for body in self._bodies]
+        self._ego = [body.id == 0 for body in self._bodies]
+
+    def _with_crossers(self, points: Floats) -> Floats:
+        """Add where people who cross will be: drivers stop for them in time."""
+        found = [points]
+        for walker in self.vehicles:
+            if isinstance(walker, Walker) and walker.crosses and walker.speed > 0.3:
+                for ahead_s in FORESEEN_S:
+                    self._bodies.append(walker)
+                    found.append((walker.position + walker.velocity * ahead_s)[None])
+        return np.concatenate(found)
 
     def seat(self, car: Car, index: LaneIndex) -> tuple[float, float]:
         """Return a car's arc length and right offset in a lane, at the last refresh."""
         row, column = self._row[id(car)], self.table.column[index]
         return float(self._s[row, column]), float(self._r[row, column])
 
-    def lead(self, car: Car) -> tuple[RoadObject, float] | None:
-        """Return the next body in a car's way, and the gap between the bumpers (m)."""
-        row = self._row[id(car)]
-        offset = -self._s[row, self.table.column[car.lanes[car.leg]]]
-        for k, index in enumerate(car.lanes[car.leg :]):
-            # bodies in the way on this lane of the chain
+    def lead(
+        self, car: Car, chain: Sequence[LaneIndex] | None = None
+    ) -> tuple[RoadObject, float] | None:
+        """Return the next body in a car's way, and the gap between the bumpers (m).
+
+        With a ``chain``, of which the first lane is beside the present one, as if the
+        car were on it.
+        """
+        row, lanes = self._row[id(car)], chain or car.lanes[car.leg :]
+        offset = -float(self._s[row, self.table.column[lanes[0]]])
+        beside, blind = car.WIDTH / 2 + BESIDE_M, not car.behaviour.sees_ego
+        for k, index in enumerate(lanes):
+            # the first body in the way on this lane of the chain
             column = self.table.column[index]
-            s, r = self._s[:, column], self._r[:, column]
-            room = self._half + (car.WIDTH / 2 + BESIDE_M)
-            blocking = np.abs(r + car.offset_m) < room
-            if k == 0:
-                blocking |= np.abs(r - r[row]) < room
-            blocking &= (s >= 0) & (s <= self.table.length[column]) & (s + offset > 0)
-            blocking[row] = False
-            if not car.behaviour.sees_ego:
-                blocking &= ~self._ego
-            # the nearest of them, else look into the next lane
-            if blocking.any():
-                ahead = np.where(blocking, s, np.inf)
-                nearest = int(np.argmin(ahead))
-                body = self._bodies[nearest]
-                centres = float(ahead[nearest] + offset)
-                return body, centres - (car.LENGTH + body.LENGTH) / 2
-            offset += self.table.length[column]
+            here = k == 0 and chain is None
+            own = float(self._r[row, column]) if here else 0.0
+            for s, r, other in self._on_lane(column):
+                if other == row or s + offset <= 0 or (blind and self._ego[other]):
+                    continue
+                room = self._half[other] + beside
+                if abs(r + car.offset_m) < room or (here and abs(r - own) < room):
+                    body = self._bodies[other]
+                    return body, s + offset - (car.LENGTH + body.LENGTH) / 2
+            # else look into the next lane
+            offset += float(self.table.length[column])
             if offset > LOOK_AHEAD_M:
                 break
         return None
 
+    def _on_lane(self, column: int) -> list[tuple[float, float, int]]:
+        """Return (arc length, right offset, row) of the bodies along a lane."""
+        if column not in self._lanes:
+            s, r = self._s[:, column], self._r[:, column]
+            along = np.flatnonzero((s >= 0) & (s <= self.table.length[column]))
+            columns = (s[along].tolist(), r[along].tolist(), along.tolist())
+            found = zip(*columns, strict=True)
+            self._lanes[column] = sorted(found, key=lambda each: each[0])
+        return self._lanes[column]
+
+    def follower(self, car: Car, index: LaneIndex) -> tuple[RoadObject, float] | None:
+        """Return who is behind a car in another lane, and the gap (m)."""
+        row, column = self._row[id(car)], self.table.column[index]
+        at, last = float(self._s[row, column]), None
+        for s, r, other in self._on_lane(column):
+            if s >= at:
+                break
+            if other != row and abs(r) < self._half[other] + 1.0:
+                last = s, other
+        if last is None:
+            return None
+        body = self._bodies[last[1]]
+        return body, at - last[0] - (car.LENGTH + body.LENGTH) / 2
+
+    def ruled(self, car: Car, lane_s: float, wanted_mps2: float) -> float:
+        """Return the acceleration that rules make of the one that a car wants.
+
+        The car may change lanes then. Without rules nothing changes.
+        """
+        if self.rules is None:
+            return wanted_mps2
+        stop_m = self.rules.stop_m(car, lane_s)
+        if stop_m < math.inf:
+            wanted_mps2 = min(wanted_mps2, car.idm_stop(stop_m))
+        return consider(car, lane_s, wanted_mps2)
+
     def act(self) -> None:
         """Let every car decide on the same positions."""
         self.refresh()
+        if self.rules is not None:
+            cars = [body for body in self.vehicles if isinstance(body, Car)]
+            self.rules.refresh(cars, self.vehicles[0], self.ego_s)
         super().act()
 
     def step(self, dt: float) -> None:
@@ -102,6 +163,10 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         pairs = list[tuple[RoadObject, RoadObject]]()
         first, second = (side.tolist() for side in np.nonzero(np.triu(near, 1)))
         for i, j in zip(first, second, strict=True):
+            if self.rules is not None and all(
+                isinstance(each, Walker) for each in (bodies[i], bodies[j])
+            ):
+                continue  # people step aside for each other
             if overlap(bodies[i], bodies[j]):
                 pairs.append((bodies[i], bodies[j]))
         return pairs

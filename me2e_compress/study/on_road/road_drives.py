@@ -158,7 +158,7 @@ def _decisive(study: Study) -> dict[str, Any]:
         "version": __version__,
         "model": graph.sha256_of(Path(reference.policy)),
         "frames": CalibrationSet(study.frames).fingerprint,
-        "routes": [asdict(each) for each in study.routes],
+        "routes": [each.record() for each in study.routes],
         "condition": condition.to_json(),
         "timing": asdict(study.timing),
         "seed": study.seed,

@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway import generate as room
 from me2e_compress.evaluators.highway.generate import (
     Admission,
     DryRun,
@@ -14,7 +15,7 @@ from me2e_compress.evaluators.highway.generate import (
 )
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.simulator.routes import load_routes, pick_routes
+from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.simulator.world import World
 from tests.simulator.world.driving import route_of
 
@@ -97,3 +98,58 @@ def test_every_type_and_attempt_has_a_seed_of_its_own() -> None:
 
     assert len(seeds) == 4
     assert seed_of(1, "Accident", 0) not in seeds
+
+
+def second() -> Route:
+    return Route("test", "Accident", "Overtaking", 0, road=2)
+
+
+@pytest.mark.parametrize(
+    ("expert", "blind", "again", "words"),
+    [
+        (SOLVED, (SOLVED, FAILED, FAILED), SOLVED, None),
+        (None, (SOLVED, LATE), None, "no infraction at 4 and 8 m/s"),
+        (SOLVED, (FAILED,) * 3, FAILED, "with other traffic the expert commits"),
+        (SOLVED, (FAILED,) * 3, LATE, "with other traffic the expert ends after 75 s"),
+        (replace(SOLVED, triggered=False), (FAILED,) * 3, SOLVED, "never happened"),
+        (SOLVED, (FAILED,) * 3, replace(SOLVED, triggered=False), None),
+        (None, (replace(FAILED, actors_crashed=True),), None, "two actors collide"),
+    ],
+)
+def test_why_a_route_of_the_second_road_is_refused(
+    expert: DryRun | None,
+    blind: tuple[DryRun, ...],
+    again: DryRun | None,
+    words: str | None,
+) -> None:
+    verdict = Admission(second(), expert, blind, again)
+
+    assert verdict.admitted == (words is None)
+    assert str(words) in str(verdict.refusal)
+
+
+def test_the_gate_of_the_second_road_drives_as_little_as_it_must(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    driven = list[tuple[str, object]]()
+    outcomes = [FAILED, SOLVED, SOLVED, FAILED, SOLVED, FAILED, SOLVED, FAILED]
+
+    def drive(route: Route, policy: object) -> DryRun:
+        driven.append((type(policy).__name__, route.parameters.get("traffic")))
+        assert getattr(policy, "cameras_only", True)
+        return outcomes[len(driven) - 1]
+
+    monkeypatch.setattr(room, "dry_run", drive)
+
+    assert "blind" in str(examine(second()).refusal)
+    assert "with other traffic" in str(examine(second()).refusal)
+    assert [name for name, _ in driven] == ["Blind"] * 6 + ["Expert"] * 2
+    assert driven[-1][1] != driven[-2][1]
+
+
+@pytest.mark.slow
+def test_a_harvest_of_the_second_road_is_the_same_for_any_workers() -> None:
+    once = list(generate(3, ("Accident",), 1, road=2))
+
+    assert list(generate(3, ("Accident",), 1, workers=2, road=2)) == once
+    assert once[0].routes[0].road == 2

@@ -23,7 +23,7 @@ from me2e_compress.evaluators.highway.expert.speed_limits import (
     obey,
     slowed,
 )
-from me2e_compress.evaluators.highway.observe import scene_and_world
+from me2e_compress.evaluators.highway.observe import scene_and_world, seen
 from me2e_compress.evaluators.highway.reentry import slope_of
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
 from me2e_compress.simulator.privileged import Privileged
@@ -110,9 +110,11 @@ def decide(
 class Expert:
     """Drives by `decide`, and keeps its target lane and the signs it obeyed.
 
-    ``last`` is the last decision, for labels and pictures; None before the first.
+    ``last`` is the last decision, for labels and pictures; None before the first. With
+    ``cameras_only`` it knows nothing of actors and signals that no camera shows.
     """
 
+    cameras_only: bool = False
     needs_images: bool = field(default=False, init=False)
     privileged: bool = field(default=True, init=False)
     last: ExpertDecision | None = field(default=None, init=False)
@@ -129,5 +131,8 @@ class Expert:
         if self._top is None or self._path is not world.path:
             self._path, self._top = world.path, ceiling(world.path)
         memory = Memory() if self.last is None else self.last.memory
-        self.last = decide(scene, world.privileged(), world.path, self._top, memory)
+        if self.cameras_only:
+            scene = seen(scene)
+        known = world.privileged([actor.id for actor in scene.actors])
+        self.last = decide(scene, known, world.path, self._top, memory)
         return self.last.waypoints

@@ -58,7 +58,7 @@ def roundabout(stage: Stage) -> Regulator:
     sideways = half_lane + ENTRY_M
     reach = math.sqrt((RING_M + ENTRY_M) ** 2 - sideways**2)
     tangent = math.atan2(sideways, reach)
-    approach = stage.uniform("approach_m", 45.0, 60.0)
+    approach = stage.place("approach_m", 45.0, 60.0)
     centre = origin(stage).moved(approach + reach)
     for arm in ARMS:
         _arm(stage, centre, arm, reach, tangent)
@@ -84,10 +84,11 @@ def _arm(stage: Stage, centre: Pose, name: str, reach: float, tangent: float) ->
     angle = ARMS.index(name) * math.pi / 2
     out = centre.turned(angle)
     # lanes out and in
-    away, far = out.moved(reach, -half_lane), out.moved(reach + ARM_M, half_lane)
-    net.straight(f"{name}.out", f"{name}.end", away, ARM_M, road)
+    length = ARM_M + stage.more_m
+    away, far = out.moved(reach, -half_lane), out.moved(reach + length, half_lane)
+    net.straight(f"{name}.out", f"{name}.end", away, length, road)
     towards = net.straight(
-        f"{name}.far", f"{name}.in", far.turned(math.pi), ARM_M, road
+        f"{name}.far", f"{name}.in", far.turned(math.pi), length, road
     )
     # entry and exit arcs, and the ring up to the next arm
     turn = math.pi / 2 - tangent
@@ -99,3 +100,7 @@ def _arm(stage: Stage, centre: Pose, name: str, reach: float, tangent: float) ->
     after = ARMS[(ARMS.index(name) + 1) % len(ARMS)]
     quarter = math.pi / 2 - 2 * tangent
     net.arc(f"{name}.on", f"{after}.off", joined, RING_M, quarter, ring)
+    # the ring has priority over who enters
+    net.ranks[f"{name}.in", f"{name}.on", 0] = 5
+    for lane in ((f"{name}.off", f"{name}.on"), (f"{name}.on", f"{after}.off")):
+        net.ranks[(*lane, 0)] = 0

@@ -20,7 +20,7 @@ from me2e_compress.simulator.traffic.network import (
     Pose,
     Section,
 )
-from me2e_compress.simulator.traffic.signals import Regulator
+from me2e_compress.simulator.traffic.signals import Regulator, SignalPlan
 from me2e_compress.simulator.traffic.stage import Stage
 
 ARMS = ("ahead", "left", "back", "right")
@@ -53,6 +53,7 @@ class Crossing:
     move: str
     approach_m: float
     signals: dict[str, Regulator]
+    arm_m: float = ARM_M
 
     @property
     def sign(self) -> Regulator | None:
@@ -86,13 +87,18 @@ def junction(
     arms: Sequence[str] = ARMS,
     lanes: int = 1,
     limit_mps: float = 13.0,
+    lights: bool = False,
 ) -> Crossing:
-    """Lay a junction without lights; ``sign`` stands on the ego's arm.
+    """Lay a junction; ``sign`` stands on the ego's arm.
 
-    The ego's move is drawn if there are several ``moves``.
+    The ego's move is drawn if there are several ``moves``. Without a sign, traffic from
+    its sides gives way. On the second road there may be ``lights``.
     """
+    if lights and stage.schedule is not None:
+        return signal_junction(stage, moves, None)
     move = moves[0] if len(moves) == 1 else stage.choice("move", moves)
-    crossing = _crossing(stage, move, arms, lanes, limit_mps)
+    minor = ("left", "right") if sign is None else ("back", "ahead")
+    crossing = _crossing(stage, move, arms, lanes, limit_mps, minor)
     if sign is not None:
         line = _stop_line(crossing, "back")
         width = lanes * LANE_WIDTH_M
@@ -101,10 +107,17 @@ def junction(
 
 
 def signal_junction(
-    stage: Stage, moves: Sequence[str], ego_light: SignalState = SignalState.GREEN
+    stage: Stage,
+    moves: Sequence[str],
+    ego_light: SignalState | None = SignalState.GREEN,
 ) -> Crossing:
-    """Lay a junction with lights; cross traffic has red where the ego has green."""
-    crossing = junction(stage, moves)
+    """Lay a junction with lights; cross traffic has red where the ego has green.
+
+    On the second road a plan decides, and ``ego_light`` is what a driver of
+    `USUAL_MPS` finds; None for any.
+    """
+    move = moves[0] if len(moves) == 1 else stage.choice("move", moves)
+    crossing = _crossing(stage, move, ARMS, 1, 13.0, ())
     green = ego_light is SignalState.GREEN
     cross = SignalState.RED if green else SignalState.GREEN
     for arm in ARMS:
@@ -112,12 +125,40 @@ def signal_junction(
         crossing.signals[arm] = stage.regulate(
             SignalKind.TRAFFIC_LIGHT, _stop_line(crossing, arm), state
         )
+    if stage.schedule is not None:
+        _planned(stage, crossing, ego_light)
     return crossing
+
+
+GREEN_S = (9.0, 15.0)
+USUAL_MPS = 9.0
+"""The speed for which a plan is said to show a driver red or green."""
+FOUND_S = {SignalState.GREEN: (1.0, 6.0), SignalState.RED: (-9.0, -3.0)}
+"""Seconds after green at which the usual driver arrives."""
+
+
+def _planned(stage: Stage, crossing: Crossing, found: SignalState | None) -> None:
+    """Draw the plan of a junction's lights."""
+    lights, schedule = crossing.signals, stage.schedule
+    if schedule is None:
+        return
+    green = (stage.uniform("green_s", *GREEN_S), stage.uniform("cross_s", *GREEN_S))
+    groups = (lights["back"], lights["ahead"]), (lights["left"], lights["right"])
+    plan = SignalPlan(groups, green, 0.0)
+    if found is None:
+        offset = stage.uniform("offset_s", 0.0, plan.cycle_s)
+    else:
+        since = stage.uniform("found_s", *FOUND_S[found])
+        offset = since - (crossing.approach_m - SETBACK_M) / USUAL_MPS
+    schedule.plans.append(SignalPlan(groups, green, offset))
+    for arm in ARMS:
+        at = crossing.arm_m - SETBACK_M - 1.0
+        schedule.lines[f"{arm}.far", f"{arm}.in", 0] = [(at, lights[arm])]
 
 
 def crosswalk_junction(stage: Stage, moves: Sequence[str]) -> Crossing:
     """Lay a junction with a crosswalk on the arm that the ego turns into."""
-    crossing = junction(stage, moves)
+    crossing = junction(stage, moves, lights=True)
     half = crossing.lanes * LANE_WIDTH_M
     places = ((0.5, half), (3.5, half), (3.5, -half), (0.5, -half))
     stage.add_crosswalk([crossing.arm(crossing.move, *at) for at in places])
@@ -131,19 +172,26 @@ def _stop_line(crossing: Crossing, arm: str) -> Pose:
 
 
 def _crossing(
-    stage: Stage, move: str, arms: Sequence[str], lanes: int, limit_mps: float
+    stage: Stage,
+    move: str,
+    arms: Sequence[str],
+    lanes: int,
+    limit_mps: float,
+    minor: Sequence[str],
 ) -> Crossing:
     # the junction's size and position
-    approach = stage.uniform("approach_m", 55.0, 70.0)
+    approach = stage.place("approach_m", 55.0, 70.0)
     half = HALF_M + (lanes - 1) * LANE_WIDTH_M
     centre = origin(stage).moved(approach + half)
-    crossing = Crossing(centre, half, lanes, move, approach, {})
+    arm_m = ARM_M + stage.more_m
+    crossing = Crossing(centre, half, lanes, move, approach, {}, arm_m)
     section = Section(lanes=lanes, limit_mps=limit_mps)
     # arms, then a connection for each pair
     for arm in arms:
         _arm(stage.network, crossing, arm, section)
     for start, end in itertools.permutations(arms, 2):
         _connect(stage.network, crossing, start, end, limit_mps)
+        _rank(stage.network, start, end, start in minor)
     # the ego's route
     incoming, inside, outgoing = crossing.way("back", move)
     begin = stage.network.length(incoming) - approach
@@ -155,9 +203,18 @@ def _crossing(
 def _arm(network: Network, crossing: Crossing, name: str, section: Section) -> None:
     half_lane = LANE_WIDTH_M / 2
     away = crossing.arm(name, 0.0, -half_lane)
-    network.straight(f"{name}.out", f"{name}.end", away, ARM_M, section)
-    towards = crossing.arm(name, ARM_M, half_lane).turned(math.pi)
-    network.straight(f"{name}.far", f"{name}.in", towards, ARM_M, section)
+    length = crossing.arm_m
+    network.straight(f"{name}.out", f"{name}.end", away, length, section)
+    towards = crossing.arm(name, length, half_lane).turned(math.pi)
+    network.straight(f"{name}.far", f"{name}.in", towards, length, section)
+
+
+def _rank(network: Network, start: str, end: str, minor: bool) -> None:
+    """Rank a way through: straight on before right before left, then minor roads."""
+    turn = (ARMS.index(end) - ARMS.index(start)) % 4
+    rank = {2: 0, 1: 1, 3: 2}[turn] + (3 if minor else 0)
+    for lane in range(len(network.graph.graph[f"{start}.in"][f"{end}.out"])):
+        network.ranks[f"{start}.in", f"{end}.out", lane] = rank
 
 
 def _connect(

@@ -4,14 +4,12 @@ import math
 from dataclasses import dataclass, replace
 
 from me2e_compress.simulator.plane_geometry import Command, LaneMarking
+from me2e_compress.simulator.scenarios.layouts.road import BEFORE_M, Street, lay_road
 from me2e_compress.simulator.scenarios.layouts.streets import (
-    BEFORE_M,
-    STRAIGHT,
     TOTAL_M,
-    Street,
-    lay_road,
     origin,
     start_speed,
+    straight,
 )
 from me2e_compress.simulator.scene import ActorKind
 from me2e_compress.simulator.traffic.legs import Leg
@@ -52,18 +50,21 @@ def on_ramp(stage: Stage, ego_on_ramp: bool) -> Ramp:
     """Lay a ramp that joins from the right and runs beside the main road."""
     start, section = origin(stage), Section(2, limit_mps=LIMIT_MPS)
     # main road
-    main = replace(lay_road(stage.network, "m", start, STRAIGHT, section), lane=1)
+    main = replace(
+        lay_road(stage.network, "m", start, straight(stage), section), lane=1
+    )
     single = replace(section, lanes=1)
     beside = replace(single, left=LaneMarking.DASHED)
     # ramp: straight, an S-bend, then the acceleration lane
     angle = math.acos(1 - RAMP_APART_M / (2 * RAMP_RADIUS_M))
     apart = -2 * LANE_WIDTH_M - RAMP_APART_M
-    net, length = stage.network, BEFORE_M + stage.uniform("ramp_m", 15.0, 25.0)
+    net, length = stage.network, BEFORE_M + stage.place("ramp_m", 15.0, 25.0)
     pose = net.straight("p0", "p1", start.moved(0.0, apart), length, single)
     pose = net.arc("p1", "p2", pose, RAMP_RADIUS_M, angle, single)
     pose = net.arc("p2", "p3", pose, RAMP_RADIUS_M, -angle, single)
     lane_m = stage.uniform("acceleration_lane_m", 65.0, 80.0)
     pose = net.straight("p3", "p4", pose, lane_m, beside)
+    net.closed.append(("p3", "p4", 0))
     block_end(stage, pose)
     ramp: list[LaneIndex] = [(f"p{k}", f"p{k + 1}", 0) for k in range(4)]
     # the ego's route
@@ -88,19 +89,22 @@ def off_ramp(stage: Stage) -> Ramp:
     """Lay an exit on the right; the ego starts in the left lane of the main road."""
     start, section = origin(stage), Section(2, limit_mps=LIMIT_MPS)
     # main road
-    main = replace(lay_road(stage.network, "m", start, STRAIGHT, section), lane=1)
+    main = replace(
+        lay_road(stage.network, "m", start, straight(stage), section), lane=1
+    )
     single = replace(section, lanes=1)
     beside = replace(single, left=LaneMarking.DASHED)
     # ramp: a lane beside the main road, then an S-bend away from it
     angle = math.acos(1 - RAMP_APART_M / (2 * RAMP_RADIUS_M))
-    first = stage.uniform("change_m", 40.0, 55.0)
+    first = stage.place("change_m", 40.0, 55.0)
     opens = BEFORE_M + first + CHANGE_M
     net = stage.network
     pose = start.moved(opens, -2 * LANE_WIDTH_M)
     pose = net.straight("q0", "q1", pose, 55.0, beside)
+    net.closed.append(("q0", "q1", 0))
     pose = net.arc("q1", "q2", pose, RAMP_RADIUS_M, -angle, single)
     pose = net.arc("q2", "q3", pose, RAMP_RADIUS_M, angle, single)
-    net.straight("q3", "q4", pose, 150.0, single)
+    net.straight("q3", "q4", pose, 150.0 + stage.more_m, single)
     ramp: list[LaneIndex] = [(f"q{k}", f"q{k + 1}", 0) for k in range(4)]
     # the ego changes lanes twice, into the ramp
     left, right = main.ahead(0)[0], main.ahead()[0]
@@ -119,10 +123,12 @@ def lane_drop(stage: Stage) -> Ramp:
     """Lay a two-lane road whose right lane, the ego's, ends."""
     start, section = origin(stage), Section(2, limit_mps=LIMIT_MPS)
     # the road, with barriers where its right lane ends
-    ends = BEFORE_M + stage.uniform("ends_m", 85.0, 95.0)
+    ends = BEFORE_M + stage.place("ends_m", 85.0, 95.0)
     net = stage.network
     after = net.straight("d0", "d1", start, ends, section)
-    net.straight("d1", "d2", after, TOTAL_M - ends, replace(section, lanes=1))
+    left = TOTAL_M + stage.more_m - ends
+    net.straight("d1", "d2", after, left, replace(section, lanes=1))
+    net.closed.append(("d0", "d1", 1))
     block_end(stage, after.moved(0.0, -LANE_WIDTH_M))
     # the ego changes to the left before that
     change = ends - CHANGE_M - 20.0
@@ -139,9 +145,9 @@ def lane_drop(stage: Stage) -> Ramp:
 def four_lanes(stage: Stage) -> Street:
     """Lay four lanes one way, which the ego crosses from the left to the right."""
     section = Section(4, limit_mps=LIMIT_MPS)
-    road = lay_road(stage.network, "r", origin(stage), STRAIGHT, section)
+    road = lay_road(stage.network, "r", origin(stage), straight(stage), section)
     s, legs = BEFORE_M, list[Leg]()
-    stay = stage.uniform("first_m", 32.0, 38.0)
+    stay = stage.place("first_m", 32.0, 38.0)
     for lane in range(4):
         command = Command.CHANGE_RIGHT if lane else Command.FOLLOW
         leave = s + stay if lane < 3 else None

@@ -5,11 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
-from me2e_compress.simulator.scenarios.layouts.streets import Street
+from me2e_compress.simulator.scenarios.layouts.road import Street
+from me2e_compress.simulator.scenarios.scripts.streams import encounter
 from me2e_compress.simulator.scenarios.scripts.synchronise import steps_out
 from me2e_compress.simulator.scene import ActorKind
 from me2e_compress.simulator.traffic.bodies import Walker
 from me2e_compress.simulator.traffic.network import LANE_WIDTH_M
+from me2e_compress.simulator.traffic.schedule import HORIZON_S
 from me2e_compress.simulator.traffic.stage import Script, Stage
 
 HALF_LANE_M = LANE_WIDTH_M / 2
@@ -17,7 +19,7 @@ HALF_LANE_M = LANE_WIDTH_M / 2
 
 def walker_behind_van(stage: Stage, _: Street) -> Script:
     """Send a pedestrian out from behind a van that stands at the kerb."""
-    s = stage.uniform("crossing_m", 60.0, 85.0)
+    s = stage.place("crossing_m", 60.0, 85.0)
     speed = stage.uniform("walk_mps", 1.5, 2.5)
     van = stage.route_pose(s - 5.0, -(HALF_LANE_M + 1.1))
     stage.static_object(ActorKind.VAN, van)
@@ -28,7 +30,7 @@ def walker_behind_van(stage: Stage, _: Street) -> Script:
 
 def walker_between_cars(stage: Stage, _: Street) -> Script:
     """Send a pedestrian out between two parked cars."""
-    s = stage.uniform("crossing_m", 60.0, 85.0)
+    s = stage.place("crossing_m", 60.0, 85.0)
     speed = stage.uniform("walk_mps", 1.4, 2.2)
     for aside in (-16.5, -10.0, -3.3, 3.3, 9.9):
         pose = stage.route_pose(s + aside, -(HALF_LANE_M + 1.3))
@@ -41,6 +43,9 @@ def walker_between_cars(stage: Stage, _: Street) -> Script:
 def walkers_on_zebra(stage: Stage, _: Street) -> Script:
     """Send two to four people over the crosswalk from both sides."""
     s = float(stage.parameters["crosswalk_m"])
+    if stage.schedule is not None:
+        yield from encounter(stage, walkers_at_light(stage), s, "walkers_on_zebra")
+        return
     count = stage.integer("walkers", 2, 4)
     walkers = list[Walker]()
     for k in range(count):
@@ -53,6 +58,36 @@ def walkers_on_zebra(stage: Stage, _: Street) -> Script:
     for walker in walkers:
         walker.going = True
     stage.fire("walkers_on_zebra", walkers[0])
+
+
+WALKERS_A_CYCLE = 2.0
+"""Mean number of people who cross at a light, each time it lets them."""
+LATE = 0.2
+"""Share of them who cross at any time of their phase, even as it ends."""
+
+
+def walkers_at_light(stage: Stage) -> list[Walker]:
+    """Draw people who cross while a light holds back the traffic."""
+    random, schedule = stage.random("at_light"), stage.schedule
+    s, found = float(stage.parameters["light_m"]), list[Walker]()
+    if schedule is None:
+        return found
+    plan, across = schedule.plans[-1], stage.light_across_m
+    start = plan.begins_s(1)
+    while start < HORIZON_S:
+        for _ in range(int(random.poisson(WALKERS_A_CYCLE))):
+            late = random.random() < LATE
+            at = start + random.uniform(0.0, plan.green_s[1] if late else 2.0)
+            ends = across if random.random() < 0.5 else across[::-1]
+            aside = s + random.uniform(-1.2, 1.2)
+            speed = float(random.uniform(1.2, 1.8))
+            walker = _across_route(stage, aside, speed, *ends)
+            stage.bodies.remove(walker)
+            walker.going = walker.crosses = True
+            schedule.add(float(at), walker)
+            found.append(walker)
+        start += plan.cycle_s
+    return found
 
 
 def pedestrians_on_exit(stage: Stage, crossing: Crossing) -> Script:

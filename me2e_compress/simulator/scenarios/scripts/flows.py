@@ -3,7 +3,8 @@
 from me2e_compress.simulator.scenarios.layouts.circle import ring_way
 from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
 from me2e_compress.simulator.scenarios.layouts.ramps import Ramp
-from me2e_compress.simulator.scenarios.layouts.streets import BEFORE_M, Street
+from me2e_compress.simulator.scenarios.layouts.road import BEFORE_M, Street
+from me2e_compress.simulator.scenarios.scripts.streams import across
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
     arrive_together,
     meeting,
@@ -58,8 +59,12 @@ def _from_a_side(stage: Stage, crossing: Crossing) -> list[LaneIndex]:
 
 def flows_from_both_sides(stage: Stage, crossing: Crossing) -> Script:
     """Drive a platoon from the left and, a little later, cars from the right."""
-    late = stage.uniform("late_m", 8.0, 16.0)
     other = crossing.way("right", "left", crossing.lanes - 1)
+    if stage.schedule is not None:
+        chain = crossing.way("left", "right", crossing.lanes - 1)
+        yield from _platoon(stage, chain, 1, "flows_from_both_sides")
+        return
+    late = stage.uniform("late_m", 8.0, 16.0)
     # cars from the right, which come a little later
     route_s, station = meeting(stage, other)
     begin, speed = max(station - route_s - late, 0.0), float(stage.ego.speed)
@@ -73,6 +78,10 @@ def flows_from_both_sides(stage: Stage, crossing: Crossing) -> Script:
 
 def near_and_far_flow(stage: Stage, crossing: Crossing) -> Script:
     """Drive fast traffic from the left to cross, slower from the right to join."""
+    if stage.schedule is not None:
+        chain = crossing.way("left", "right", 1)
+        yield from _platoon(stage, chain, 1, "near_and_far_flow")
+        return
     far = crossing.way("right", "left")
     route_s, station = meeting(stage, far)
     late = stage.uniform("late_m", 20.0, 30.0)
@@ -97,7 +106,7 @@ def exit_lane_flow(stage: Stage, ramp: Ramp) -> Script:
 
 def side_flows(stage: Stage, street: Street) -> Script:
     """Keep a car beside the ego at its first change, others in the lanes beyond."""
-    for lane in (2, 3):
+    for lane in (2, 3) if stage.schedule is None else ():
         ahead = stage.uniform(f"lane_{lane}_m", 8.0, 25.0) * (lane * 2 - 5)
         s = BEFORE_M + 20.0 + ahead
         stage.car(street.ahead(lane), s, float(stage.ego.speed), behaviour=DENSE)
@@ -109,6 +118,9 @@ def bay_flow(stage: Stage, street: Street) -> Script:
     """Drive cars past the parking bay that the ego wants to leave."""
     chain = street.ahead()
     route_s, _ = meeting(stage, chain)
+    if stage.schedule is not None:
+        yield from across(stage, chain, route_s, "bay_flow")
+        return
     begin = BEFORE_M - stage.uniform("behind_m", 3.0, 6.0)
     lead = stage.car(chain, begin, 3.0, behaviour=HEEDLESS)
     for k in range(stage.integer("followers", 1, 3)):
@@ -130,8 +142,14 @@ def _platoon(
     name: str,
     sign: Regulator | None = None,
 ) -> Script:
-    """Drive a row of cars, the first timed to meet the ego, and then by IDM."""
+    """Drive a row of cars, the first timed to meet the ego, and then by IDM.
+
+    On the second road cars come by all the time.
+    """
     route_s, station = meeting(stage, chain)
+    if stage.schedule is not None:
+        yield from across(stage, chain, route_s, name)
+        return
     ratio = stage.uniform("flow_ratio", 0.9, 1.05)
     gap = stage.uniform("flow_gap_m", 11.0, 15.0)
     speed = float(stage.ego.speed)
@@ -158,7 +176,13 @@ def _beside(
     name: str,
     cars: int,
 ) -> Script:
-    """Keep a car beside the ego until shortly before it changes lanes."""
+    """Keep a car beside the ego until shortly before it changes lanes.
+
+    On the second road cars come by all the time.
+    """
+    if stage.schedule is not None:
+        yield from across(stage, chain, change_s, name)
+        return
     speed = float(stage.ego.speed)
     aside = stage.uniform("beside_m", -1.5, 1.5)
     # the first car adapts to the ego, the others follow

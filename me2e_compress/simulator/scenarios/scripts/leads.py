@@ -1,10 +1,20 @@
 """Cars before the ego: braking, pulling out, cutting in, crawling."""
 
+from collections.abc import Sequence
+
 from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
 from me2e_compress.simulator.scenarios.layouts.ramps import Ramp
-from me2e_compress.simulator.scenarios.layouts.streets import BEFORE_M, Street
+from me2e_compress.simulator.scenarios.layouts.road import BEFORE_M, Street
+from me2e_compress.simulator.scenarios.scripts.streams import (
+    Traffic,
+    encounter,
+    near,
+    stream,
+)
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
+    approach,
     hold,
+    keep_clear,
     patience,
     release,
     stand,
@@ -26,10 +36,14 @@ AWAY_MPS = 10.0
 def hard_brake(stage: Stage, street: Street) -> Script:
     """Keep the car ahead at its distance, then brake it to a stop and wait."""
     gap = stage.uniform("gap_m", 13.0, 18.0)
-    where = stage.uniform("brake_m", 35.0, 60.0)
+    where = stage.place("brake_m", 35.0, 60.0)
     hardest = stage.uniform("brake_mps2", 5.0, 7.0)
     speed = float(stage.ego.speed)
     car = stage.car(street.ahead(), BEFORE_M + gap + 5.0, speed)
+    keep_clear(stage, street.ahead(), where + 30.0)
+    if stage.schedule is not None:
+        yield from _brake_at(stage, car, where, hardest)
+        return
     # keep the distance until the place of braking
     while stage.ahead_m(where) > 0:
         error = stage.gap_m(car) - gap
@@ -46,34 +60,45 @@ def hard_brake(stage: Stage, street: Street) -> Script:
     release(car, AWAY_MPS)
 
 
+def _brake_at(stage: Stage, car: Car, route_s: float, hardest: float) -> Script:
+    """Brake a car that drives by IDM, once the ego passes a place, for a while."""
+    stands = stage.uniform("stands_s", 2.0, 6.0)
+    car.target_speed = stage.uniform("lead_mps", 8.0, 10.0)
+    yield from near(stage, route_s)
+    stage.fire("hard_brake", car)
+    car.forced_mps2 = -hardest
+    yield from hold(stage, car.speed / hardest + stands)
+    release(car, AWAY_MPS)
+
+
 def pull_out(stage: Stage, street: Street) -> Script:
     """Move a parked car out in front of the ego, at a crawl."""
-    s = stage.uniform("pull_out_m", 55.0, 75.0)
-    lead_s = stage.uniform("lead_s", 3.0, 3.6)
+    s = stage.place("pull_out_m", 55.0, 75.0)
+    lead_s = _lead_s(stage)
     for aside in (-13.0, -6.5, 14.0, 20.5):
         _park(stage, s + aside)
     car = stage.car(street.shoulder(), BEFORE_M + s, 0.0)
     stand(car)
-    while stage.arrival_s(s - 2.0) > lead_s:
-        yield
+    yield from approach(stage, s - 2.0, lead_s)
     yield from _cut_in(stage, car, street.ahead(), 1, "pull_out", 2.2)
 
 
 def queue_cut_in(stage: Stage, street: Street) -> Script:
     """Move a car out of a standing queue in the next lane."""
-    s = stage.uniform("cut_in_m", 55.0, 75.0)
-    lead_s = stage.uniform("lead_s", 3.0, 3.6)
+    s = stage.place("cut_in_m", 55.0, 75.0)
+    lead_s = _lead_s(stage)
     lane = street.other_lane()
     chain = street.ahead(lane)
     # a standing queue with room ahead of the car that leaves it
+    for index in (lane, street.lane):
+        keep_clear(stage, street.ahead(index), s)
     cutter: Car | None = None
     for aside in (-14.0, -7.0, 0.0, 11.0, 18.0):
         car = stage.car(chain, BEFORE_M + s + aside, 0.0)
         stand(car)
         cutter = car if aside == 0.0 else cutter
     # leave when the ego is near in time
-    while stage.arrival_s(s - 2.0) > lead_s:
-        yield
+    yield from approach(stage, s - 2.0, lead_s)
     if cutter is not None:
         side = 1 if street.lane < lane else -1
         yield from _cut_in(stage, cutter, street.ahead(), side, "queue_cut_in", 2.2)
@@ -81,6 +106,14 @@ def queue_cut_in(stage: Stage, street: Street) -> Script:
 
 def ramp_cut_in(stage: Stage, ramp: Ramp) -> Script:
     """Merge a car from the on-ramp right in front of the ego, at a crawl."""
+    if stage.schedule is not None:
+        gap = stage.uniform("ramp_gap_s", 3.0, 5.5)
+        traffic = Traffic(gap, joins=tuple(ramp.main.ahead()))
+        cars = stream(stage, "ramp_cut_in", [ramp.ramp], traffic)
+        joint = stage.network.pose(ramp.ramp[-1], 30.0)
+        s, _ = stage.path.project(joint.x, joint.y)
+        yield from encounter(stage, cars, s, "ramp_cut_in")
+        return
     gap = stage.uniform("gap_m", 9.0, 13.0)
     car = stage.car(ramp.ramp, 75.0, float(stage.ego.speed))
     stand_off = 0.0
@@ -98,8 +131,12 @@ def ramp_cut_in(stage: Stage, ramp: Ramp) -> Script:
 def slow_queue(stage: Stage, ramp: Ramp) -> Script:
     """Fill the lane that the ego must enter with crawling cars.
 
-    They speed up a while after the ego has come in among or behind them.
+    They speed up a while after the ego has come in among or behind them; on the second
+    road at a time that is drawn.
     """
+    if stage.schedule is not None:
+        yield from _slow_stream(stage, ramp)
+        return
     speed = stage.uniform("queue_mps", 1.6, 2.2)
     spacing = stage.uniform("queue_spacing_m", 8.5, 10.0)
     first = BEFORE_M + ramp.merge_s + 30.0
@@ -120,19 +157,46 @@ def slow_queue(stage: Stage, ramp: Ramp) -> Script:
         car.target_speed = 7.0
 
 
+def _slow_stream(stage: Stage, ramp: Ramp) -> Script:
+    """Drive dense, slow traffic that speeds up at some time."""
+    slow = stage.uniform("slow_mps", 3.0, 4.5)
+    gap = stage.uniform("slow_gap_s", 3.4, 4.6)
+    until = stage.uniform("slow_until_s", 25.0, 50.0)
+    traffic = Traffic(gap, (slow, slow + 0.5), platoons=0.1)
+    cars = stream(stage, "slow_queue", [ramp.main.ahead()], traffic)
+    stage.play(_speed_up(stage, cars, until))
+    yield from encounter(stage, cars, ramp.merge_s, "slow_queue")
+
+
+def _speed_up(stage: Stage, cars: Sequence[Car], until_s: float) -> Script:
+    """Let cars drive faster from a time on."""
+    yield from hold(stage, until_s)
+    for car in cars:
+        car.target_speed += 5.0
+
+
 def queue_at_light(stage: Stage, crossing: Crossing) -> Script:
-    """Hold a queue ahead of the ego at a light that has turned green."""
+    """Hold a queue ahead of the ego at a light that has turned green.
+
+    On the second road the light itself holds it.
+    """
     line = crossing.signals["back"].line_s or crossing.approach_m
     count = stage.integer("queue", 1, 3)
     chain = crossing.way("back", crossing.move)
     begin = stage.network.length(chain[0]) - crossing.approach_m
-    queue = [stage.car(chain, begin + line - 3.5 - 7.0 * k, 0.0) for k in range(count)]
-    for car in queue:
+    moving = None if stage.schedule is None else AWAY_MPS
+    queue = [
+        stage.car(chain, begin + line - 3.5 - 7.0 * k, 0.0, moving)
+        for k in range(count)
+    ]
+    for car in queue if stage.schedule is None else ():
         stand(car)
     tail = line - 3.5 - 7.0 * (count - 1) - 2.5
     while stage.ahead_m(tail) > 35.0:
         yield
     stage.fire("queue_at_light", queue[-1])
+    if stage.schedule is not None:
+        return
     yield from patience(stage, tail, 12.0, 0.5)
     for car in queue:
         release(car, AWAY_MPS)
@@ -145,25 +209,52 @@ def blocked_exit(stage: Stage, crossing: Crossing) -> Script:
     into = stage.uniform("into_m", 1.0, 5.0)
     truck = stage.car(chain[2:], into + 2.0, 0.0, kind=ActorKind.TRUCK)
     stand(truck)
+    if stage.schedule is not None:
+        stage.play(_leave(stage, truck, stage.uniform("leaves_s", 18.0, 40.0)))
     pose = truck.pose
     s, _ = stage.path.project(pose.x, pose.y)
     while stage.ahead_m(s) > 40.0:
         yield
     stage.fire("blocked_exit", truck)
+    if stage.schedule is not None:
+        return
     yield from patience(stage, s - truck.LENGTH / 2, 30.0, 1.5)
     release(truck, AWAY_MPS)
+
+
+def _leave(stage: Stage, car: Car, at_s: float) -> Script:
+    """Let a standing car drive off at a time."""
+    yield from hold(stage, at_s)
+    release(car, AWAY_MPS)
+
+
+def _lead_s(stage: Stage) -> float:
+    """Draw how long before the ego's arrival a car sets off, where that decides.
+
+    On the second road, how long it crawls afterwards.
+    """
+    if stage.schedule is None:
+        return stage.uniform("lead_s", 3.0, 3.6)
+    stage.uniform("crawl_s", 4.0, 9.0)
+    return 0.0
 
 
 def _cut_in(
     stage: Stage, car: Car, lanes: list[LaneIndex], side: int, name: str, crawl: float
 ) -> Script:
-    """Move into the ego's lane, crawl there, drive off."""
+    """Move into the ego's lane, crawl there, drive off.
+
+    How long it crawls depends on the ego, or is drawn on the second road.
+    """
+    crawl_s = CRAWL_S
+    if stage.schedule is not None:
+        crawl_s = float(stage.parameters["crawl_s"])
     stage.fire(name, car)
     # change lanes at a crawl
     target, _ = stage.network.rest(lanes, _s_along(stage, lanes, car.pose))
     car.change_lane(target, side)
     release(car, crawl)
-    until = stage.time_s + CRAWL_S
+    until = stage.time_s + crawl_s
     waited = 0.0
     # crawl until the ego has followed for a while, or passed
     while waited < 2.0 and stage.time_s < until:
@@ -172,6 +263,8 @@ def _cut_in(
             car.forced_mps2 = -5.0
         else:
             car.forced_mps2 = None
+        if stage.schedule is not None:
+            continue
         close = 0 < stage.gap_m(car) < 12.0 and stage.ego.speed < crawl + 0.7
         waited = waited + 0.1 if close or stage.gap_m(car) < -9 else 0.0
     car.indicator = 0

@@ -1,8 +1,10 @@
 """Things in the way: accidents, road works, parked cars, doors, slow cyclists."""
 
-from me2e_compress.simulator.scenarios.layouts.streets import BEFORE_M, Street
+from me2e_compress.simulator.scenarios.layouts.road import BEFORE_M, Street
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
     NEAR_M,
+    approach,
+    keep_clear,
     met,
 )
 from me2e_compress.simulator.scene import ActorKind
@@ -18,9 +20,10 @@ def free_side(stage: Stage) -> float:
     return 1.0 if left > LANE_WIDTH_M else -1.0
 
 
-def crashed_cars(stage: Stage, _: Street) -> Script:
+def crashed_cars(stage: Stage, street: Street) -> Script:
     """Place two crashed cars askew in the lane, and a police van before them."""
-    s = stage.uniform("obstacle_m", 62.0, 80.0)
+    s = stage.place("obstacle_m", 62.0, 80.0)
+    keep_clear(stage, street.ahead(), s)
     for k, name in enumerate(("first", "second")):
         askew = stage.uniform(f"{name}_askew_rad", -0.35, 0.35)
         aside = -0.4 * free_side(stage)
@@ -30,9 +33,10 @@ def crashed_cars(stage: Stage, _: Street) -> Script:
     yield from met(stage, s, "crashed_cars")
 
 
-def construction(stage: Stage, _: Street) -> Script:
+def construction(stage: Stage, street: Street) -> Script:
     """Close the lane for a few metres with cones and barriers."""
-    s = stage.uniform("obstacle_m", 62.0, 80.0)
+    s = stage.place("obstacle_m", 62.0, 80.0)
+    keep_clear(stage, street.ahead(), s)
     length = stage.uniform("works_m", 8.0, 14.0)
     for k in range(4):
         stage.static_object(
@@ -45,9 +49,10 @@ def construction(stage: Stage, _: Street) -> Script:
     yield from met(stage, s, "construction")
 
 
-def parked_car(stage: Stage, _: Street) -> Script:
+def parked_car(stage: Stage, street: Street) -> Script:
     """Stop a car or van in the lane, its hazard lights on."""
-    s = stage.uniform("obstacle_m", 62.0, 85.0)
+    s = stage.place("obstacle_m", 62.0, 85.0)
+    keep_clear(stage, street.ahead(), s)
     kind = ActorKind(stage.choice("obstacle", ("parked", "van", "truck")))
     aside = stage.uniform("aside_m", 0.0, 0.6) * -free_side(stage)
     stage.static_object(kind, stage.route_pose(s, aside))
@@ -60,6 +65,7 @@ def slow_cyclists(stage: Stage, street: Street) -> Script:
     speed = stage.uniform("cyclist_mps", 1.8, 2.4)
     first = stage.uniform("cyclist_gap_m", 26.0, 34.0)
     last: Car | None = None
+    keep_clear(stage, street.ahead(), first + 60.0)
     for k in range(count):
         s = BEFORE_M + first + 4.5 * k
         rider = stage.car(street.ahead(), s, speed, speed, ActorKind.BICYCLE)
@@ -72,15 +78,17 @@ def slow_cyclists(stage: Stage, street: Street) -> Script:
     stage.fire("slow_cyclists", last)
 
 
-def opening_door(stage: Stage, _: Street) -> Script:
+def opening_door(stage: Stage, street: Street) -> Script:
     """Open the door of one of a row of parked cars into the lane."""
-    s = stage.uniform("door_m", 60.0, 80.0)
+    s = stage.place("door_m", 60.0, 80.0)
+    keep_clear(stage, street.ahead(), s)
     side = -(LANE_WIDTH_M / 2 + 1.05)
     for k in range(-2, 3):
         stage.static_object(ActorKind.PARKED, stage.route_pose(s + 6.5 * k, side))
-    lead_s = stage.uniform("door_lead_s", 2.8, 3.4)
-    while stage.arrival_s(s) > lead_s:
-        yield
+    lead_s = 0.0
+    if stage.schedule is None:
+        lead_s = stage.uniform("door_lead_s", 2.8, 3.4)
+    yield from approach(stage, s, lead_s)
     hinge = side + 1.95 / 2
     door = stage.static_object(
         ActorKind.DOOR, stage.route_pose(s + 0.6, hinge + 0.6), (0.2, 1.2, 1.2)
@@ -88,13 +96,14 @@ def opening_door(stage: Stage, _: Street) -> Script:
     stage.fire("opening_door", door)
 
 
-def spun_car(stage: Stage, _: Street) -> Script:
+def spun_car(stage: Stage, street: Street) -> Script:
     """Lower the grip before a car that stands across the lane.
 
     Substitutes for Bench2Drive's ControlLoss, which adds noise to the controls: that
     would penalise the driver for the noise.
     """
-    s = stage.uniform("spun_m", 80.0, 92.0)
+    s = stage.place("spun_m", 80.0, 92.0)
+    keep_clear(stage, street.ahead(), s)
     grip = stage.uniform("grip_mps2", 3.0, 4.0)
     begin = s - stage.uniform("slick_m", 35.0, 45.0)
     askew = stage.uniform("askew_rad", 0.4, 0.7)
@@ -111,7 +120,12 @@ def spun_car(stage: Stage, _: Street) -> Script:
 
 
 def neighbours(stage: Stage, street: Street) -> Script:
-    """Drive a car ahead and one well behind in the lane beside the ego's."""
+    """Drive a car ahead and one well behind in the lane beside the ego's.
+
+    The second road has traffic without it.
+    """
+    if stage.schedule is not None:
+        return
     chain = street.ahead(street.other_lane())
     for name, low, high in (("ahead", 35.0, 50.0), ("behind", -45.0, -30.0)):
         s = BEFORE_M + stage.uniform(f"{name}_m", low, high)
@@ -121,7 +135,12 @@ def neighbours(stage: Stage, street: Street) -> Script:
 
 
 def oncoming_cars(stage: Stage, street: Street) -> Script:
-    """Drive a few cars in the other direction, and then none."""
+    """Drive a few cars in the other direction, and then none.
+
+    The second road has traffic without it.
+    """
+    if stage.schedule is not None:
+        return
     count = stage.integer("oncoming", 1, 3)
     chain = street.oncoming()
     total = sum(stage.network.length(index) for index in chain)

@@ -1,7 +1,14 @@
 """Lights, signs, and vehicles that take or demand priority."""
 
+from dataclasses import replace
+
 from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
-from me2e_compress.simulator.scenarios.layouts.streets import BEFORE_M, Street
+from me2e_compress.simulator.scenarios.layouts.road import BEFORE_M, Street
+from me2e_compress.simulator.scenarios.scripts.streams import (
+    Traffic,
+    encounter,
+    stream,
+)
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
     hold,
     met,
@@ -10,6 +17,7 @@ from me2e_compress.simulator.scenarios.scripts.synchronise import (
 )
 from me2e_compress.simulator.scene import ActorKind, Event, EventKind, SignalState
 from me2e_compress.simulator.traffic.cars import Behaviour
+from me2e_compress.simulator.traffic.network import LANE_WIDTH_M, LaneIndex
 from me2e_compress.simulator.traffic.stage import Script, Stage
 
 YELLOW_S = 2.0
@@ -18,10 +26,18 @@ ALL_RED_S = 1.0
 
 
 def red_light(stage: Stage, crossing: Crossing) -> Script:
-    """Keep the light red until the ego has waited; a few cars cross meanwhile."""
+    """Keep the light red until the ego has waited; a few cars cross meanwhile.
+
+    On the second road the light follows its plan.
+    """
     light = crossing.signals["back"]
     line_s = light.line_s or crossing.approach_m
     ways = (("left", "right"), ("right", "left"))
+    if stage.schedule is not None:
+        while stage.ahead_m(line_s) > 35.0:
+            yield
+        stage.fire("red_light")
+        return
     # cross traffic
     for k, (start, end) in enumerate(ways):
         chain = crossing.way(start, end)
@@ -50,9 +66,15 @@ def stop_sign(stage: Stage, crossing: Crossing) -> Script:
 
 
 def invader(stage: Stage, street: Street) -> Script:
-    """Drive an oncoming car partly in the ego's lane."""
+    """Drive an oncoming car partly in the ego's lane.
+
+    On the second road, a share of the oncoming cars.
+    """
     chain = street.oncoming()
     total = sum(stage.network.length(index) for index in chain)
+    if stage.schedule is not None:
+        yield from _invaders(stage, chain)
+        return
     where = stage.uniform("meet_m", 55.0, 75.0)
     away = stage.uniform("away_m", 50.0, 60.0)
     kind = ActorKind(stage.choice("invader", ("car", "van")))
@@ -81,14 +103,32 @@ def invader(stage: Stage, street: Street) -> Script:
     car.forced_mps2, car.offset_m = None, 0.0
 
 
+INVADING = 0.4
+"""Share of the oncoming cars of the second road that drive partly in the ego's lane."""
+
+
+def _invaders(stage: Stage, chain: list[LaneIndex]) -> Script:
+    """Drive oncoming traffic, a share of it partly in the ego's lane."""
+    gap, random = stage.uniform("oncoming_gap_s", 4.0, 7.0), stage.random("invaders")
+    cars = stream(stage, "oncoming", [chain], Traffic(gap))
+    invaders = [car for car in cars if random.random() < INVADING]
+    for car in invaders:
+        car.offset_m = LANE_WIDTH_M - float(random.uniform(1.4, 2.0))
+        car.behaviour = replace(car.behaviour, sees_ego=False)
+    yield from encounter(stage, invaders, None, "invader")
+
+
 def emergency_behind(stage: Stage, street: Street) -> Script:
     """Drive an emergency vehicle up from behind that wants to pass.
 
     Judged as scenario_runner does (YieldToEmergencyVehicleTest): at the end of the
     route it must be ahead of the ego.
     """
-    gap = stage.uniform("behind_m", 18.0, 26.0)
     lanes = street.ahead()
+    if stage.schedule is not None:
+        yield from _emergency_comes(stage, lanes)
+        return
+    gap = stage.uniform("behind_m", 18.0, 26.0)
     car = stage.car(
         lanes,
         BEFORE_M - gap,
@@ -114,3 +154,41 @@ def emergency_behind(stage: Stage, street: Street) -> Script:
     while stage.gap_m(car) < 0:
         yield
     passed[0] = True
+
+
+HELD_UP_M, HELD_UP_S = 20.0, 5.0
+"""The ego has not yielded if the vehicle was this close behind for this long, and still
+is behind at the end: on the second road it may come too late to be let by."""
+
+
+def _emergency_comes(stage: Stage, lanes: list[LaneIndex]) -> Script:
+    """Let an emergency vehicle come from behind at a time that is drawn."""
+    at = stage.uniform("comes_s", 0.5, 8.0)
+    mind = Behaviour(
+        3.5,
+        headway_s=0.5,
+        jam_gap_m=4.0,
+        obeys_limits=False,
+        obeys_rules=False,
+        changes_lanes=True,
+    )
+    car = stage.coming(lanes, 0.0, 15.0, 18.0, ActorKind.EMERGENCY, mind)
+    if stage.schedule is not None:
+        stage.schedule.add(at, car)
+    held = [0.0]
+
+    def judge() -> Event | None:
+        if held[0] < HELD_UP_S or car.road is None or stage.gap_m(car) > 0:
+            return None
+        return stage.event(EventKind.YIELD_EMERGENCY, "it was held up", car)
+
+    stage.at_goal.append(judge)
+    fired = False
+    while True:
+        yield
+        if car.road is None or not -HELD_UP_M < stage.gap_m(car) < 0:
+            continue
+        held[0] += 0.1
+        if not fired:
+            fired = True
+            stage.fire("emergency_behind", car)

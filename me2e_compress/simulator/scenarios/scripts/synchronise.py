@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.scenarios.layouts.road import BEFORE_M
+from me2e_compress.simulator.scenarios.scripts.streams import near
 from me2e_compress.simulator.traffic.bodies import Walker
 from me2e_compress.simulator.traffic.cars import Car
 from me2e_compress.simulator.traffic.network import LaneIndex, Network
@@ -106,9 +108,18 @@ def steps_out(stage: Stage, walker: Walker, route_s: float, reach_m: float) -> S
     It crosses the ego's route at ``route_s``, ``reach_m`` from where it stands.
     """
     needed = reach_m / walker.top_speed_mps + 0.25
-    while stage.arrival_s(route_s) > needed:
-        yield
+    walker.crosses = True
+    yield from approach(stage, route_s, needed)
     walker.going = True
+
+
+def approach(stage: Stage, route_s: float, arrival_s: float) -> Script:
+    """Wait until the ego is near in time, or in space on the second road."""
+    if stage.schedule is not None:
+        yield from near(stage, route_s)
+        return
+    while stage.arrival_s(route_s) > arrival_s:
+        yield
 
 
 def met(stage: Stage, route_s: float, name: str) -> Script:
@@ -151,3 +162,8 @@ def stand(car: Car) -> None:
 def release(car: Car, target_mps: float) -> None:
     """Let a car drive by IDM."""
     car.forced_mps2, car.target_speed = None, target_mps
+
+
+def keep_clear(stage: Stage, chain: Sequence[LaneIndex], until_s: float) -> None:
+    """Let no traffic begin on a lane between the ego and a place of its route."""
+    stage.clear[chain[0]] = (BEFORE_M - 8.0, BEFORE_M + until_s + 30.0)

@@ -1,0 +1,192 @@
+"""Traffic of the second road: drawn before the route begins, whatever the ego does."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from me2e_compress.simulator.scene import ActorKind
+from me2e_compress.simulator.traffic.bodies import Walker
+from me2e_compress.simulator.traffic.cars import Behaviour, Car
+from me2e_compress.simulator.traffic.network import LaneIndex
+from me2e_compress.simulator.traffic.schedule import arrival_times, is_free
+from me2e_compress.simulator.traffic.stage import Script, Stage
+
+HEEDLESS, SLOW = 0.12, 0.15
+"""Shares of drivers who follow closely and take short gaps, and of slow ones: our
+choice."""
+TURNING = 0.4
+"""Share of traffic that turns at a junction."""
+EGO_M, OTHER_M = 25.0, 10.0
+"""The ego and another meet if each is this close to the place of the conflict; the ego
+waits before it."""
+EGO_ROOM_M = 14.0
+"""Nobody begins nearer to the ego, bumper to bumper."""
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Who drives on a lane.
+
+    Attributes:
+        gap_s: Mean time between two cars.
+        speed: Lowest and highest wanted speed; None for about the limit.
+        platoons: Share of arrivals that lead a platoon.
+        reckless: Share of drivers who obey neither lights nor signs.
+        joins: The chain that they join where their lane ends.
+    """
+
+    gap_s: float
+    speed: tuple[float, float] | None = None
+    platoons: float = 0.25
+    reckless: float = 0.0
+    joins: tuple[LaneIndex, ...] = ()
+
+
+def stream(
+    stage: Stage, name: str, chains: Sequence[Sequence[LaneIndex]], traffic: Traffic
+) -> list[Car]:
+    """Draw the cars that come by one lane and take one of several chains from there.
+
+    Those that came before the route began are on the lane already.
+    """
+    random, network, entry = stage.random(name), stage.network, chains[0][0]
+    schedule = stage.schedule
+    if schedule is None:
+        return []
+    schedule.claimed.append(entry)
+    low, high = traffic.speed or (0.0, 0.0)
+    usual = (low + high) / 2 or 0.85 * float(network.lane(entry).speed_limit)
+    free_m = _before_junction(stage, chains[0]) - 12.0
+    weights = np.array([_weight(stage, chain, chains) for chain in chains])
+    clear = stage.clear.get(entry, (0.0, 0.0))
+    cars = list[Car]()
+    for time_s in arrival_times(
+        random, traffic.gap_s, -free_m / usual, traffic.platoons
+    ):
+        chain = chains[int(random.choice(len(chains), p=weights / weights.sum()))]
+        at = max(-time_s, 0.0) * usual
+        car = _driver(stage, random, chain, at, traffic)
+        if time_s >= 0.0:
+            schedule.add(time_s, car)
+        elif not clear[0] < at < clear[1] and _has_room(stage, car):
+            stage.bodies.append(car)
+        else:
+            continue
+        cars.append(car)
+    return cars
+
+
+def _driver(
+    stage: Stage,
+    random: np.random.Generator,
+    chain: Sequence[LaneIndex],
+    s_m: float,
+    traffic: Traffic,
+) -> Car:
+    """Draw one driver with a vehicle."""
+    limit = float(stage.network.lane(chain[0]).speed_limit)
+    heedless, slow, kind, reckless = random.random(4)
+    wanted = limit * random.uniform(0.85, 1.0)
+    if traffic.speed is not None:
+        wanted = random.uniform(*traffic.speed)
+    elif slow < SLOW:
+        wanted *= random.uniform(0.6, 0.75)
+    mind = Behaviour(
+        acceleration_mps2=float(random.uniform(1.5, 3.0)),
+        jam_gap_m=float(random.uniform(2.0, 3.5)),
+        headway_s=float(random.uniform(1.0, 1.8)),
+        gap_s=float(random.uniform(1.0, 2.0)),
+        obeys_rules=bool(reckless >= traffic.reckless),
+        changes_lanes=not traffic.joins,
+        politeness=float(random.uniform(0.0, 0.3)),
+    )
+    if heedless < HEEDLESS:
+        mind = replace(mind, headway_s=0.7, jam_gap_m=1.8, gap_s=0.5)
+    vehicle = ActorKind.VAN if kind < 0.12 else ActorKind.CAR
+    vehicle = ActorKind.TRUCK if kind > 0.93 else vehicle
+    wanted = float(wanted)
+    car = stage.coming(chain, s_m, wanted, wanted, vehicle, mind)
+    car.joins = list(traffic.joins) or None
+    return car
+
+
+def _before_junction(stage: Stage, chain: Sequence[LaneIndex]) -> float:
+    """Return the length of a chain up to the first junction."""
+    length = 0.0
+    for index in chain:
+        if index in stage.network.ranks:
+            break
+        length += stage.network.length(index)
+    return length
+
+
+def _weight(
+    stage: Stage, chain: Sequence[LaneIndex], chains: Sequence[Sequence[LaneIndex]]
+) -> float:
+    """Return how often a chain is taken: most go straight on."""
+    ranks = [stage.network.ranks.get(index, 0) for index in chain]
+    turns = any(rank % 3 for rank in ranks)
+    return TURNING / len(chains) if turns else 1.0 - TURNING
+
+
+def _has_room(stage: Stage, car: Car) -> bool:
+    x, y = car.position
+    ex, ey = stage.ego.position
+    if math.hypot(x - ex, y - ey) < EGO_ROOM_M + (car.LENGTH + stage.ego.LENGTH) / 2:
+        return False
+    return is_free(car, [*stage.bodies, *stage.static_objects])
+
+
+def across(
+    stage: Stage, chain: Sequence[LaneIndex], route_s: float, name: str
+) -> Script:
+    """Drive traffic that the ego's route crosses or joins; see `encounter`."""
+    reckless = 0.6 if name == "crossing_car" else 0.0
+    gap = stage.uniform(f"{name}_gap_s", 4.0, 7.0)
+    cars = stream(stage, name, [chain], Traffic(gap, reckless=reckless))
+    yield from encounter(stage, cars, route_s, name)
+
+
+def encounter(
+    stage: Stage, others: Sequence[Car | Walker], route_s: float | None, name: str
+) -> Script:
+    """Note that the ego and one of some others are at a place together.
+
+    Without a place: wherever they meet.
+    """
+    place = None if route_s is None else stage.route_pose(route_s)
+    while True:
+        yield
+        at = place or stage.ego.pose
+        if route_s is not None and abs(stage.ahead_m(route_s)) > EGO_M:
+            continue
+        for body in others:
+            x, y = body.position
+            near = math.hypot(x - at.x, -y - at.y) < OTHER_M
+            if near and body.road is not None:
+                stage.fire(name, body)
+                return
+
+
+TRIGGERED = (
+    *("DynamicObjectCrossing", "HardBreakRoute", "ParkingCrossingPedestrian"),
+    *("ParkingCutIn", "StaticCutIn", "VehicleOpensDoorTwoWays"),
+    *("CrossingBicycleFlow", "VehicleTurningRoute", "VehicleTurningRoutePedestrian"),
+)
+"""Types in which somebody waits for the ego, as in scenario_runner."""
+TRIGGER_M, DELAY_S = (14.0, 32.0), (0.0, 1.5)
+"""Where the ego sets off what waits for it, and how long that still waits.
+scenario_runner's actors start when the ego is within a distance; ours is drawn."""
+
+
+def near(stage: Stage, route_s: float) -> Script:
+    """Wait until the ego's front is near a place, and a little longer."""
+    metres = stage.uniform("trigger_m", *TRIGGER_M)
+    delay = stage.uniform("delay_s", *DELAY_S)
+    while stage.ahead_m(route_s) - stage.ego.LENGTH / 2 > metres:
+        yield
+    until = stage.time_s + delay
+    while stage.time_s < until:
+        yield

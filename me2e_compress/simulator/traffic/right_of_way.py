@@ -1,0 +1,248 @@
+"""Who may enter a junction: lights, and gaps in the traffic that has priority.
+
+highway-env's own rule (`RegulatedRoad`) copies the whole road to look ahead, and knows
+no lights. Here conflicts of lanes are found once, from their centre lines, and drivers
+accept a gap if the times at which both would be in the conflict do not overlap.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from me2e_compress.simulator.scene import SignalState
+from me2e_compress.simulator.traffic.bodies import EgoVehicle
+from me2e_compress.simulator.traffic.cars import Car
+from me2e_compress.simulator.traffic.network import LaneIndex, Network
+from me2e_compress.simulator.traffic.signals import Regulator
+
+TOUCH_M = 2.6
+"""Lanes whose centres come closer than this are in conflict: a car and a margin."""
+REACH_M = 70.0
+"""How far from a junction others are looked for; 5 s at 14 m/s."""
+DECIDE_M = 30.0
+"""How far from a junction a driver decides whether to enter."""
+START_MPS2 = 2.0
+"""Acceleration with which a driver expects anybody to enter."""
+YELLOW_MPS2 = 3.0
+"""A yellow light stops who can brake no harder than this."""
+HARDEST_MPS2 = 6.0
+"""A red light stops who can brake no harder than this."""
+LINE_M = 4.0
+"""Where who waits without a line stops, metres before a junction."""
+RECKLESS = -1
+"""Rank of those who obey nothing: everybody else lets them pass."""
+
+
+@dataclass(frozen=True)
+class Conflict:
+    """Where a lane inside a junction is shared with another: arc lengths on both."""
+
+    other: LaneIndex
+    mine: tuple[float, float]
+    theirs: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class User:
+    """A body that is on a lane inside a junction or will be.
+
+    ``at_m`` is where its centre is on that lane; negative before it. ``bound`` tells
+    that a red light holds it back.
+    """
+
+    id: int
+    at_m: float
+    speed_mps: float
+    length_m: float
+    rank: int
+    bound: bool
+
+
+class RightOfWay:
+    """Rules of all junctions of a network.
+
+    Args:
+        network: Finished, with the ranks of its lanes.
+        lines: Stop lines with lights, by lane: arc length and light.
+        ego_lanes: Lanes inside junctions on the ego's route, and where each begins.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        lines: dict[LaneIndex, list[tuple[float, Regulator]]],
+        ego_lanes: Sequence[tuple[LaneIndex, float]],
+    ) -> None:
+        self.network, self.lines, self.ego_lanes = network, lines, ego_lanes
+        self.conflicts = conflicts_of(network)
+        self._users: dict[LaneIndex, list[User]] = {}
+
+    def refresh(self, cars: Iterable[Car], ego: EgoVehicle, ego_s_m: float) -> None:
+        """Note who is where, before drivers decide."""
+        self._users = {}
+        for lane, begin in self.ego_lanes:
+            at = ego_s_m - begin
+            if -REACH_M < at < self.network.length(lane) + 10.0:
+                self._note(lane, 0, at, float(ego.speed), ego.LENGTH, False, False)
+        for car in cars:
+            self._note_car(car)
+
+    def _note_car(self, car: Car) -> None:
+        start = -car.road.seat(car, car.lanes[car.leg])[0]
+        reckless, bound = not car.behaviour.obeys_rules, False
+        for index in car.lanes[car.leg :]:
+            if start > REACH_M:
+                break
+            if index in self.network.ranks:
+                speed = float(car.speed)
+                self._note(index, car.id, -start, speed, car.LENGTH, reckless, bound)
+            elif index in self.lines and not reckless:
+                bound |= any(
+                    start + s > 0 and light.state is SignalState.RED
+                    for s, light in self.lines[index]
+                )
+            start += self.network.length(index)
+
+    def _note(
+        self,
+        lane: LaneIndex,
+        id: int,
+        at_m: float,
+        speed: float,
+        length: float,
+        reckless: bool,
+        bound: bool,
+    ) -> None:
+        rank = RECKLESS if reckless else self.network.ranks[lane]
+        user = User(id, at_m, speed, length, rank, bound)
+        self._users.setdefault(lane, []).append(user)
+
+    def stop_m(self, car: Car, lane_s: float) -> float:
+        """Return the metres from a car's front to where it must stop, else infinity."""
+        if not car.behaviour.obeys_rules:
+            return math.inf
+        front = -lane_s - car.LENGTH / 2
+        for index in car.lanes[car.leg :]:
+            if front > DECIDE_M:
+                break
+            # lights on this lane
+            for s, light in self.lines.get(index, ()):
+                gap = front + s
+                if gap > -0.5 and _stops(light, max(gap, 0.1), float(car.speed)):
+                    return max(gap, 0.1)
+            # a junction that begins here
+            if index in self.network.ranks and front > 0.0:
+                line = max(front - LINE_M, 0.1)
+                hard = car.speed**2 / (2 * line) > HARDEST_MPS2
+                if not hard and self._must_wait(car, index, front):
+                    return line
+            front += self.network.length(index)
+        return math.inf
+
+    def _must_wait(self, car: Car, lane: LaneIndex, front_m: float) -> bool:
+        """Return whether somebody with priority, or inside, meets the car."""
+        speed, rank = float(car.speed), self.network.ranks[lane]
+        for conflict in self.conflicts.get(lane, ()):
+            users = self._users.get(conflict.other)
+            if not users:
+                continue
+            enters = _seconds(front_m + conflict.mine[0], speed)
+            leaves = _seconds(front_m + conflict.mine[1] + car.LENGTH, speed)
+            for user in users:
+                if user.id == car.id:
+                    continue
+                nose, tail = user.at_m + user.length_m / 2, user.at_m
+                tail -= user.length_m / 2
+                if tail > conflict.theirs[1] or (user.bound and nose < 0.0):
+                    continue
+                mine = (rank, round(front_m), car.id)
+                theirs = (user.rank, round(-nose), user.id)
+                if nose < 0.0 and theirs > mine:
+                    continue
+                if nose > conflict.theirs[0]:
+                    return True
+                comes = _seconds(conflict.theirs[0] - nose, user.speed_mps)
+                goes = _seconds(conflict.theirs[1] - tail, user.speed_mps)
+                spare = car.behaviour.gap_s
+                if enters < goes + spare / 2 and comes < leaves + spare:
+                    return True
+        return False
+
+    def priority_over_ego(self) -> list[tuple[float, Conflict]]:
+        """Return the conflicts in which others have priority over the ego.
+
+        Each with the arc length of the ego's route at which it begins.
+        """
+        ranks = self.network.ranks
+        return [
+            (begin + conflict.mine[0], conflict)
+            for lane, begin in self.ego_lanes
+            for conflict in self.conflicts.get(lane, ())
+            if ranks[conflict.other] < ranks[lane]
+        ]
+
+    def soonest_s(self) -> float:
+        """Return the seconds until somebody with priority is where the ego goes.
+
+        Who is there already is before the ego, and leaves.
+        """
+        soonest = math.inf
+        for _, conflict in self.priority_over_ego():
+            for user in self._users.get(conflict.other, ()):
+                nose, tail = user.at_m + user.length_m / 2, user.at_m
+                tail -= user.length_m / 2
+                if user.id == 0 or tail > conflict.theirs[0]:
+                    continue
+                left = max(conflict.theirs[0] - nose, 0.0)
+                soonest = min(soonest, left / max(user.speed_mps, 1.0))
+        return soonest
+
+
+def conflicts_of(network: Network) -> dict[LaneIndex, list[Conflict]]:
+    """Find the pairs of lanes inside junctions that share ground.
+
+    Lanes that leave one place, or follow each other, are no conflict: there drivers
+    keep their distance.
+    """
+    found: dict[LaneIndex, list[Conflict]] = {}
+    for a in network.ranks:
+        mine = network.centre(a)
+        for b in network.ranks:
+            if a[0] == b[0] or a[1] == b[0] or b[1] == a[0]:
+                continue
+            theirs = network.centre(b)
+            away = np.hypot(
+                mine[:, None, 0] - theirs[None, :, 0],
+                mine[:, None, 1] - theirs[None, :, 1],
+            )
+            close = away < TOUCH_M
+            if close.any():
+                spans = []
+                mine_too, theirs_too = np.max(close, axis=1), np.max(close, axis=0)
+                for lane, touched in ((a, mine_too), (b, theirs_too)):
+                    share = network.length(lane) / (len(touched) - 1)
+                    at = np.flatnonzero(touched)
+                    spans.append((float(at[0]) * share, float(at[-1]) * share))
+                found.setdefault(a, []).append(Conflict(b, spans[0], spans[1]))
+    return found
+
+
+def _stops(light: Regulator, gap_m: float, speed: float) -> bool:
+    braking = speed**2 / (2 * gap_m)
+    if light.state is SignalState.YELLOW:
+        return braking < YELLOW_MPS2
+    return light.state is SignalState.RED and braking < HARDEST_MPS2 + 2.0
+
+
+def _seconds(distance_m: float, speed: float) -> float:
+    """Return the time for a distance, accelerating gently from a speed to 8 m/s."""
+    if distance_m <= 0.0:
+        return 0.0
+    top = max(speed, 8.0)
+    ramp_m = (top * top - speed * speed) / (2 * START_MPS2)
+    if ramp_m >= distance_m:
+        reached = math.sqrt(speed * speed + 2 * START_MPS2 * distance_m)
+        return (reached - speed) / START_MPS2
+    return (top - speed) / START_MPS2 + (distance_m - ramp_m) / top

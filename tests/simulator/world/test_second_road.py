@@ -1,0 +1,235 @@
+import math
+from collections.abc import Iterator
+from statistics import median
+
+import pytest
+
+from me2e_compress.evaluators.highway.generate import propose, with_other_traffic
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scenarios.builders import stage_of
+from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.simulator.scenarios.scripts.streams import TRIGGERED
+from me2e_compress.simulator.scene import Control, EventKind, SignalKind, SignalState
+from me2e_compress.simulator.traffic.cars import Car
+from me2e_compress.simulator.traffic.network import Pose
+from me2e_compress.simulator.traffic.schedule import HORIZON_S, arrival_times
+from me2e_compress.simulator.traffic.signals import (
+    ALL_RED_S,
+    YELLOW_S,
+    Regulator,
+    SignalPlan,
+)
+from me2e_compress.simulator.traffic.stage import Stage
+from me2e_compress.simulator.traffic.traffic_road import overlap
+from me2e_compress.simulator.weather import CLEAR, DRAWN, drawn_weather
+from me2e_compress.simulator.world import World
+from tests.simulator.world.driving import trace
+
+BRAKE, GO = Control(-8.0, 0.0), Control(1.0, 0.0)
+NEAR_M = 80.0
+
+
+def second(scenario: str, seed: int = 3) -> Route:
+    return propose(scenario, seed, "test", road=2)
+
+
+@pytest.fixture(scope="module")
+def stages() -> dict[str, Stage]:
+    return {
+        name: stage_of(Route("test", name, abilities[0], number, road=2))
+        for number, (name, abilities) in enumerate(SCENARIO_ABILITIES.items())
+    }
+
+
+def moving_near(stage: Stage) -> int:
+    x, y = stage.ego.position
+    return sum(
+        body.speed > 0.3 and math.hypot(*(body.position - (x, y))) < NEAR_M
+        for body in stage.bodies
+    )
+
+
+def arrivals(stage: Stage) -> list[tuple[int, int, str]]:
+    schedule = stage.schedule
+    assert schedule is not None
+    return [(e.time_us, e.body.id, str(e.body.kind)) for e in schedule.arrivals]
+
+
+def test_routes_are_200_to_400_m_long(stages: dict[str, Stage]) -> None:
+    lengths = [stage.path.goal_m for stage in stages.values()]
+
+    assert 200.0 <= min(lengths) < 240.0
+    assert 300.0 < max(lengths) <= 400.0
+
+
+def test_the_median_route_begins_among_eight_who_move(stages: dict[str, Stage]) -> None:
+    assert median(map(moving_near, stages.values())) >= 8
+
+
+def test_every_lane_into_the_map_brings_traffic(stages: dict[str, Stage]) -> None:
+    for name in ("T_Junction", "SequentialLaneChange", "EnterActorFlow"):
+        coming = {
+            each.body.lanes[0]
+            for each in stages[name].schedule.arrivals  # type: ignore[union-attr]
+            if isinstance(each.body, Car)
+        }
+        arms = {"T_Junction": 3, "SequentialLaneChange": 4, "EnterActorFlow": 4}
+        assert len(coming) == arms[name]
+
+
+def test_few_types_wait_for_the_ego_and_the_list_names_them(
+    stages: dict[str, Stage],
+) -> None:
+    waiting = [n for n, stage in stages.items() if "trigger_m" in stage.parameters]
+
+    assert sorted(waiting) == sorted(TRIGGERED)
+    assert len(waiting) <= 12
+
+
+def test_lights_and_signs_are_met_by_as_many_types_as_promised(
+    stages: dict[str, Stage],
+) -> None:
+    met = {
+        name: {each.kind for each in stage.regulators if each.line_s is not None}
+        for name, stage in stages.items()
+    }
+
+    assert sum(SignalKind.TRAFFIC_LIGHT in kinds for kinds in met.values()) >= 12
+    signs = {SignalKind.STOP_SIGN, SignalKind.GIVE_WAY}
+    assert sum(bool(kinds & signs) for kinds in met.values()) >= 6
+
+
+def test_nobody_overlaps_at_the_start(stages: dict[str, Stage]) -> None:
+    for name, stage in stages.items():
+        bodies = [stage.ego, *stage.bodies, *stage.static_objects]
+        cars = [body for body in bodies if not getattr(body, "going", False)]
+        assert not any(
+            overlap(a, b) for i, a in enumerate(cars) for b in cars[i + 1 :]
+        ), name
+
+
+def test_the_same_route_gives_the_same_bytes_whatever_ran_before() -> None:
+    route = second("NonSignalizedJunctionLeftTurn")
+    alone = trace(route, 60)
+    trace(second("MergerIntoSlowTraffic"), 20)
+
+    assert trace(route, 60) == alone
+
+
+def test_a_proposal_writes_out_every_parameter() -> None:
+    route = second("EnterActorFlow")
+
+    assert route.parameters == World(route).parameters
+    assert route.record()["road"] == 2
+
+
+def test_other_traffic_is_other_traffic_on_the_same_road() -> None:
+    route = second("T_Junction")
+    one, other = stage_of(route), stage_of(with_other_traffic(route))
+
+    assert arrivals(one) != arrivals(other)
+    assert {**one.parameters, "traffic": 0} == {**other.parameters, "traffic": 0}
+    assert (one.path.points == other.path.points).all()
+
+
+def seen(route: Route, control: Control, seconds: int) -> list[tuple[object, ...]]:
+    """Phases of all lights, and who is there for the first time, every 0.5 s."""
+    world, known, found = World(route), set[int](), list[tuple[object, ...]]()
+    for step in range(seconds * 20):
+        world.step(control)
+        if world.done:
+            break
+        if step % 10 == 9:
+            scene = world.scene()
+            new = sorted({actor.id for actor in scene.actors} - known)
+            known |= set(new)
+            found.append((*(e.state for e in scene.signals), *new))
+    return found
+
+
+@pytest.mark.parametrize(
+    "scenario", ["VanillaSignalizedTurnEncounterRedLight", "PedestrianCrossing"]
+)
+def test_standing_changes_neither_lights_nor_arrivals(scenario: str) -> None:
+    route = second(scenario)
+    stands, drives = seen(route, BRAKE, 20), seen(route, GO, 20)
+
+    assert len(stands) == 40
+    assert len(drives) > 12
+    assert stands[: len(drives)] == drives
+    assert len({phases[:1] for phases in stands}) > 1
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 7.3, 41.0])
+def test_a_plan_is_yellow_for_3_s_and_all_red_for_2(offset_s: float) -> None:
+    plan = SignalPlan(((), ()), (12.0, 9.0), offset_s)
+    phases = [
+        tuple(plan.state(group, tenth * 100_000) for group in (0, 1))
+        for tenth in range(round(plan.cycle_s * 10))
+    ]
+    red, yellow = SignalState.RED, SignalState.YELLOW
+
+    assert all(red in both for both in phases)
+    assert [sum(e[g] is yellow for e in phases) for g in (0, 1)] == [30, 30]
+    assert sum(both == (red, red) for both in phases) == 2 * ALL_RED_S * 10
+    assert sum(both[0] is SignalState.GREEN for both in phases) == 120
+    assert YELLOW_S == 3.0
+
+
+def test_the_tail_alone_decides_as_in_carla() -> None:
+    for tail_alone, found in ((False, None), (True, EventKind.RED_LIGHT)):
+        light = Regulator(1, SignalKind.TRAFFIC_LIGHT, Pose(0.0, 0.0, 0.0), 50.0)
+        light.tail_alone, light.state = tail_alone, SignalState.YELLOW
+        assert light.check(51.0, 46.0, 8.0) is None
+        light.state = SignalState.RED
+        assert light.check(55.5, 50.5, 8.0) is found
+
+
+def test_a_red_light_stops_traffic_and_green_does_not() -> None:
+    world = World(second("SignalizedJunctionRightTurn"))
+    stopped = 0
+    for _ in range(20 * 20):
+        world.step(BRAKE)
+        lights = {e.id: e.state for e in world.scene().signals}
+        stopped += sum(
+            car.braking and car.speed < 0.3 and SignalState.RED in lights.values()
+            for car in cars_of(world)
+        )
+    kinds = [event.kind for event in world.events]
+
+    assert stopped > 50
+    assert EventKind.ACTOR_COLLISION not in kinds
+
+
+def cars_of(world: World) -> Iterator[Car]:
+    stage = world._stage
+    return (body for body in stage.bodies if isinstance(body, Car))
+
+
+def test_gaps_have_their_mean_and_never_fall_below_the_shortest() -> None:
+    import numpy as np
+
+    for platoons in (0.0, 0.5):
+        times = [
+            time
+            for seed in range(60)
+            for time in arrival_times(np.random.default_rng(seed), 6.0, 0.0, platoons)
+        ]
+        one = arrival_times(np.random.default_rng(1), 6.0, -20.0, platoons)
+        assert 60 * HORIZON_S / len(times) == pytest.approx(6.0, rel=0.12)
+        assert np.diff(one).min() >= 1.6
+
+
+def test_a_third_of_the_routes_has_weather() -> None:
+    kinds = [kind for kind in DRAWN if drawn_weather(kind, 0.5, 1) != CLEAR]
+
+    assert len(kinds) * 3 == len(DRAWN)
+    for kind in set(kinds):
+        assert drawn_weather(kind, 0.0, 0) != drawn_weather(kind, 1.0, 0)
+
+
+def test_a_route_says_its_weather() -> None:
+    night = Route("test", "Accident", "Overtaking", 1, {"weather": "night"}, road=2)
+
+    assert World(night).weather.night > 0.5
+    assert World(Route("old", "Accident", "Overtaking", 1)).weather == CLEAR
