@@ -29,7 +29,7 @@ ROUNDING_DB = 100.0
 The exact passes leave every value of VAD-tiny and UniAD-tiny above it, or above it when
 computed of equal inputs (``benchmarks/bench_locate.py``)."""
 
-AT_ONCE, MOST = 8, 32
+AT_ONCE, MOST = 4, 32
 """Places that run alone in one round, whose values fit in memory together; and in all.
 """
 

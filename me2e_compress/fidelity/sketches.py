@@ -192,16 +192,20 @@ def apart(a: Array, b: Array) -> float:
     """Return the same of two whole arrays; infinite where their shapes differ."""
     if a.shape != b.shape:
         return math.inf
-    x, y = (np.clip(np.asarray(each, np.float64), -LARGEST, LARGEST) for each in (a, b))
-    neither = np.isnan(x) & np.isnan(y)
-    x, y = np.where(neither, 0.0, x), np.where(neither, 0.0, y)
-    if np.isnan(x).any() or np.isnan(y).any():
+    x, y = a.reshape(-1), b.reshape(-1)
+    sums = np.zeros((2, 2))  # noise and signal, of the tensors and of x / (1 + |x|)
+    for start in range(0, x.size, LARGE):
+        part = slice(start, start + LARGE)
+        p, q = (np.asarray(each[part], np.float64) for each in (x, y))
+        p, q = (np.clip(each, -LARGEST, LARGEST) for each in (p, q))
+        neither = np.isnan(p) & np.isnan(q)
+        p[neither] = q[neither] = 0.0
+        for at in range(2):
+            sums[:, at] += np.square(p - q).sum(), np.square(p).sum()
+            p, q = p / (1 + np.abs(p)), q / (1 + np.abs(q))
+    if np.isnan(sums).any():
         return math.inf
-    soft = x / (1 + np.abs(x)), y / (1 + np.abs(y))
-    ratios = (
-        _ratio(np.square(p - q).sum(), np.square(p).sum()) for p, q in ((x, y), soft)
-    )
-    return float(max(ratios))
+    return float(_ratio(*sums).max())
 
 
 def decibels(amplitude: float) -> float:

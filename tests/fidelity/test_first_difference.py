@@ -161,6 +161,34 @@ def test_what_never_reaches_an_output_is_told_apart() -> None:
     assert next(each.nodes for each in found.places) == ("a",)
 
 
+def test_what_reaches_an_output_comes_first() -> None:
+    frames = [Frame(0, True, {"x": np.ones((1, 8), np.float32)})]
+    source = Source.of(ir.from_onnx_text(HIDDEN % "Sigmoid"), frames)
+    text = (HIDDEN % "Tanh").replace("Add(x, gone)", "Div(x, gone)")
+
+    found = source.first_difference(ir.from_onnx_text(text))
+
+    assert [each.nodes for each in found.places] == [("d",)]
+
+
+def test_a_detour_through_float16_is_a_fault(source: Source) -> None:
+    def change(model: ir.Model) -> None:
+        relu = node(model, "/backbone/Relu")
+        narrow = ir.node("Cast", [relu.inputs[0]], {"to": 10}, name="narrow")
+        wide = ir.node("Cast", narrow.outputs, {"to": 1}, name="wide")
+        model.graph.insert_before(relu, [narrow, wide])
+        relu.replace_input_with(0, wide.outputs[0])
+        for each in (narrow, wide):
+            each.outputs[0].name = f"{each.name}_value"
+
+    found = source.first_difference(changed(change))
+
+    assert not found.lossy
+    assert [each.nodes for each in found.places] == [
+        ("narrow", "wide", "/backbone/Relu")
+    ]
+
+
 GROWN = """
 <ir_version: 9, opset_import: ["" : 17]>
 grown (float[1,64] x) => (float[1,64] y)
