@@ -26,8 +26,8 @@ from me2e_compress.runtime.providers import CPU, Provider
 
 ROUNDING_DB = 100.0
 """Above this SQNR two float32 values are equal but for rounding: 1e-5 of the amplitude.
-The exact passes leave every value of VAD-tiny and UniAD-tiny above it, or above it when
-computed of equal inputs (``benchmarks/bench_locate.py``)."""
+Of VAD-tiny's values after the exact passes those below it are right when computed of
+equal inputs, or reach no output (``benchmarks/bench_locate.py``)."""
 
 AT_ONCE, MOST = 4, 32
 """Places that run alone in one round, whose values fit in memory together; and in all.
