@@ -23,12 +23,12 @@ LEAST_CHANNELS = 16
 class ErrorSources:
     """The places of a float graph where int8 makes errors.
 
-    ``taps`` are the values that int8 nodes read, ``layers`` those that layers with an
+    ``probes`` are the values that int8 nodes read, ``layers`` those that layers with an
     int8 weight give: each with the first output of the node that is blamed.
     """
 
     model: ir.Model
-    taps: Mapping[ir.Value, str]
+    probes: Mapping[ir.Value, str]
     grids: Mapping[ir.Value, tuple[np.float32, int]]
     layers: Mapping[ir.Value, str]
     weights: Mapping[str, QuantizedWeight]
@@ -36,24 +36,24 @@ class ErrorSources:
 
     @classmethod
     def of(cls, model: ir.Model, plan: QuantPlan, grids: Grids) -> "ErrorSources":
-        """Copy a graph, tap what int8 nodes read, and expand fused nodes."""
+        """Copy a graph, probe what its int8 nodes read, and expand fused nodes."""
         origin = {str(n.outputs[0].name): n for n in model.graph}
         copy = model.clone()
         nodes = {str(n.outputs[0].name): n for n in copy.graph}
-        taps, found = dict[str, str](), dict[str, tuple[np.float32, int]]()
+        probes, found = dict[str, str](), dict[str, tuple[np.float32, int]]()
         for each in plan.placed:
             node = nodes[each.output]
             for index in each.activations:
                 value, read = node.inputs[index], origin[each.output].inputs[index]
                 if value is None or read is None:
                     continue
-                tap = ir.node("Identity", [value])
-                made = tap.outputs[0]
-                made.name = f"me2e_sensitivity_tap_{len(taps)}"
+                probe = ir.node("Identity", [value])
+                made = probe.outputs[0]
+                made.name = f"me2e_sensitivity_probe_{len(probes)}"
                 made.shape, made.type = value.shape, value.type
-                copy.graph.insert_before(node, tap)
+                copy.graph.insert_before(node, probe)
                 node.replace_input_with(index, made)
-                taps[made.name] = blamed(origin[each.output], each)
+                probes[made.name] = blamed(origin[each.output], each)
                 found[made.name] = grids[str(read.name)]
         made_of, _ = compiled_or_expanded(copy, compiled=False)
         graph.infer_shapes(made_of)
@@ -61,7 +61,7 @@ class ErrorSources:
         weights = weights_of(model, plan.placed)
         return cls(
             made_of,
-            {values[name]: layer for name, layer in taps.items()},
+            {values[name]: layer for name, layer in probes.items()},
             {values[name]: each for name, each in found.items()},
             {values[name]: name for name in weights},
             weights,
@@ -70,7 +70,7 @@ class ErrorSources:
 
     def reached(self) -> set[ir.Value]:
         """Return every value that depends on an error."""
-        found = {*self.taps, *self.layers}
+        found = {*self.probes, *self.layers}
         for node in self.model.graph:
             if not found.isdisjoint(filter(None, node.inputs)):
                 found.update(node.outputs)
@@ -79,13 +79,13 @@ class ErrorSources:
     def layer_of(self, node: ir.Node) -> str:
         """Return the layer whose error a node's output shows; empty for most nodes."""
         value = node.outputs[0]
-        return self.taps.get(value) or self.layers.get(value, "")
+        return self.probes.get(value) or self.layers.get(value, "")
 
     def power(self, t: Tape, node: ir.Node, g: ir.Value) -> ir.Value:
         """Write the sum of squares of what the channels of an error do."""
         value = node.outputs[0]
         rank = len(static_shape(value) or ())
-        if value not in self.taps:
+        if value not in self.probes:
             return self._power_of_weight(t, node, g, rank)
         layer = next(iter(value.consumers()), None)
         convolved = layer is not None and layer.op_type.startswith("Conv")
@@ -135,7 +135,7 @@ class ErrorSources:
                     waiting.append(each)
         return {
             layer: reasons[value]
-            for where in (self.taps, self.layers)
+            for where in (self.probes, self.layers)
             for value, layer in where.items()
             if value in reasons
         }
@@ -164,9 +164,9 @@ def _output_axis(node: ir.Node, rank: int) -> int | None:
     return rank - 1 if node.op_type == "MatMul" else None
 
 
-def _rounding(t: Tape, tap: ir.Node, step: np.float32, zero: int) -> ir.Value:
+def _rounding(t: Tape, probe: ir.Node, step: np.float32, zero: int) -> ir.Value:
     """Write the difference between a tensor in int8 and the tensor."""
-    value = tap.inputs[0]
+    value = probe.inputs[0]
     grid = [t.constant(np.array(step)), t.constant(np.array(zero, np.uint8))]
     integers = t.op("QuantizeLinear", [value, *grid])
     return t.op("Sub", [t.op("DequantizeLinear", [integers, *grid]), value])
