@@ -44,7 +44,7 @@ from me2e_compress.targets import TARGETS, Target
 
 def main() -> None:
     """Estimate and measure model by model, and print one table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--models", default="highway,tcp,vad-tiny")
     parser.add_argument("--frames", type=int, default=8)
