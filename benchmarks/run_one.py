@@ -98,7 +98,8 @@ def openvino(
 
     def run() -> Mapping[str, Any]:
         found = request.infer(fed)
-        return {port.any_name: found[port] for port in compiled.outputs}
+        # One port may stand for several outputs, and have the names of all
+        return {name: found[port] for port in compiled.outputs for name in port.names}
 
     return run
 

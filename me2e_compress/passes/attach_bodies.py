@@ -17,6 +17,9 @@ from me2e_compress.passes.base import Context, Pass, PassResult
 LARGEST_TABLE = 256
 """Largest constant operand, in elements, that a body may hold (feature-map sizes)."""
 
+_OVERLOADS_SINCE_IR = 10
+"""The first IR version whose functions may have overloads (onnx/onnx.proto)."""
+
 
 @dataclasses.dataclass(frozen=True)
 class AttachBodies(Pass):
@@ -28,10 +31,12 @@ class AttachBodies(Pass):
              file: { ... GridSample ... Mul ... ReduceSum ... }
 
     A runtime without the operator inlines the function; one that has it (this toolkit's
-    sessions, or TensorRT with its plugin) uses its own. All nodes of a name share one
-    function. Constants that they agree on, above all the sizes of feature maps, are
-    stored in it. Nodes that differ in attributes, and plugins without a domain (which
-    functions cannot have), get no body; the notes name them.
+    sessions, or TensorRT with its plugin) uses its own. Nodes of a name that agree in
+    attributes and number of inputs share one function; where some do not, the second
+    and further functions are overloads ("2", "3", ...), which files hold since IR
+    version 10 (onnx 1.16). Constants that the nodes of a function agree on, above all
+    the sizes of feature maps, are stored in it. Plugins without a domain (which
+    functions cannot have) get no body; the notes name them.
     """
 
     name: ClassVar[str] = "attach-bodies"
@@ -46,14 +51,20 @@ class AttachBodies(Pass):
         for identifier, calls in kinds.items():
             if identifier in model.functions:
                 continue
-            if reason := _why_not(calls):
+            op_type = calls[0].node.op_type
+            if _is_bare(calls[0].node):
                 notes.append(
-                    f"no body for {len(calls)} {calls[0].node.op_type}: {reason}"
+                    f"no body for {len(calls)} {op_type}: it has no domain of its own"
                 )
                 continue
-            model.functions[identifier] = self._body(calls)
-            made += 1
-            notes.append(f"a body for {len(calls)} {calls[0].node.op_type}")
+            alike = _alike(calls)
+            for each in alike:
+                _overload(each, model)
+                function = self._body(each)
+                model.functions[function.identifier()] = function
+            made += len(alike)
+            bodies = "a body" if len(alike) == 1 else f"{len(alike)} bodies"
+            notes.append(f"{bodies} for {len(calls)} {op_type}")
         return PassResult(model, made, tuple(notes))
 
     def _body(self, calls: Sequence[FusedNode]) -> ir.Function:
@@ -70,6 +81,7 @@ class AttachBodies(Pass):
             [value for value, _ in inputs],
             list(first.node.attributes.values()),
             outputs=[result],
+            overload=first.node.overload,
             name=first.operator.name,
         )
         opsets = {"": first.opset}
@@ -79,6 +91,7 @@ class AttachBodies(Pass):
         function = ir.Function(
             node.domain,
             node.op_type,
+            node.overload,
             graph=body,
             attributes=[
                 ir.Attr(name, each.type, each.value)
@@ -94,19 +107,30 @@ class AttachBodies(Pass):
         return function
 
 
-def _why_not(calls: Sequence[FusedNode]) -> str:
-    first = calls[0].node
-    if not first.domain or ORIGINAL_DOMAIN in first.metadata_props:
-        return "it has no domain of its own"
-    said = {
-        tuple(sorted((name, str(a.value)) for name, a in each.node.attributes.items()))
-        for each in calls
-    }
-    if len(said) > 1:
-        return "its nodes differ in attributes"
-    if len({len(each.node.inputs) for each in calls}) > 1:
-        return "its nodes differ in inputs"
-    return ""
+def _is_bare(node: ir.Node) -> bool:
+    return not node.domain or ORIGINAL_DOMAIN in node.metadata_props
+
+
+def _alike(calls: Sequence[FusedNode]) -> list[list[FusedNode]]:
+    """Group calls that agree in attributes and number of inputs."""
+    found: dict[tuple[object, ...], list[FusedNode]] = {}
+    for each in calls:
+        said = sorted((n, str(a.value)) for n, a in each.node.attributes.items())
+        found.setdefault((len(each.node.inputs), *said), []).append(each)
+    return list(found.values())
+
+
+def _overload(calls: Sequence[FusedNode], model: ir.Model) -> None:
+    """Give calls an overload of their own where their name has a function already."""
+    domain, op_type, overload = calls[0].node.op_identifier()
+    number = 1
+    while (domain, op_type, overload) in model.functions:
+        number += 1
+        overload = str(number)
+    for each in calls:
+        each.node.overload = overload
+    if overload:
+        model.ir_version = max(model.ir_version, _OVERLOADS_SINCE_IR)
 
 
 def _parameter(

@@ -5,6 +5,7 @@ import onnxruntime
 from me2e_compress.graph import static_shape
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.operators.deformable_attention import DeformableAttention
+from me2e_compress.operators.multi_head_attention import FusedMultiHeadAttention
 from me2e_compress.passes.attach_bodies import AttachBodies
 from me2e_compress.passes.fused_nodes import ExpandOperators
 from tests.passes.decomposed import Sizes, decomposed
@@ -31,6 +32,12 @@ OF_OTHER_SIZES = (
     y = Add(first, second)
 }"""
 )
+OF_TWO_COUNTS_OF_HEADS = """<ir_version: 9, opset_import: ["" : 17, "me2e" : 1]>
+net (float[1,5,8] q) => (float[1,5,8] y) {
+    once = me2e.MultiHeadAttention<heads = 4>(q, q, q)
+    twice = me2e.MultiHeadAttention(once, once, once)
+    y = me2e.MultiHeadAttention<heads = 4>(twice, twice, twice)
+}"""
 SIZES, STARTS = np.array([[4, 4], [2, 2]]), np.array([0, 16])
 
 
@@ -102,20 +109,29 @@ def test_a_second_time_there_is_nothing_to_do() -> None:
     assert apply(AttachBodies(), model).changes == 0
 
 
-def test_nodes_that_differ_in_attributes_stay_without() -> None:
-    call = (
-        "mmdeploy.MMCVMultiScaleDeformableAttention<im2col_step = {}>(v, s, b, at, w)"
-    )
-    text = ALIKE.replace("float[1,5,2,4] y", "float[1,5,8] y")
-    plain = "me2e.MultiScaleDeformableAttention(v, s, b, at, w)"
-    for step in (32, 64):
-        text = text.replace(plain, call.format(step), 1)
-    result = apply(AttachBodies(), model := read(text))
-    assert not model.functions
-    assert result.notes == (
-        "no body for 2 MMCVMultiScaleDeformableAttention: its nodes differ in"
-        " attributes",
-    )
+def test_nodes_that_differ_in_attributes_get_a_body_each() -> None:
+    model = read(OF_TWO_COUNTS_OF_HEADS)
+    draws = np.random.default_rng(7)
+    rows = draws.normal(size=(1, 5, 8)).astype(np.float32)
+
+    result = apply(AttachBodies(), model)
+
+    assert result.notes == ("2 bodies for 3 MultiHeadAttention",)
+    session = onnxruntime.InferenceSession(ir.to_proto(model).SerializeToString())
+    (found,) = session.run(None, {"q": rows})
+    once = FusedMultiHeadAttention().reference([rows] * 3, {"heads": 4})
+    twice = FusedMultiHeadAttention().reference([once] * 3, {"heads": 1})
+    expected = FusedMultiHeadAttention().reference([twice] * 3, {"heads": 4})
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert model.ir_version == 10
+    (kernels,) = compute(model, {"q": rows})
+    np.testing.assert_allclose(kernels, expected, atol=1e-5)
+
+
+def test_a_second_time_bodies_of_two_sets_of_attributes_stay() -> None:
+    model = read(OF_TWO_COUNTS_OF_HEADS)
+    apply(AttachBodies(), model)
+    assert apply(AttachBodies(), model).changes == 0
 
 
 def test_a_plugin_without_a_domain_stays_without() -> None:
