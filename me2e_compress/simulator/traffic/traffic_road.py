@@ -112,9 +112,12 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         """Return who is behind a car in another lane, and the gap (m)."""
         row, column = self._row[id(car)], self.table.column[index]
         at, last = float(self._s[row, column]), None
+        blind = not car.behaviour.sees_ego
         for s, r, other in self._on_lane(column):
             if s >= at:
                 break
+            if blind and self._ego[other]:
+                continue
             if other != row and abs(r) < self._half[other] + 1.0:
                 last = s, other
         if last is None:

@@ -11,6 +11,7 @@ from me2e_compress.simulator.scenarios.scripts.streams import (
 )
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
     hold,
+    keep_clear,
     met,
     nearest_station,
     patience,
@@ -73,7 +74,7 @@ def invader(stage: Stage, street: Street) -> Script:
     chain = street.oncoming()
     total = sum(stage.network.length(index) for index in chain)
     if stage.schedule is not None:
-        yield from _invaders(stage, chain)
+        yield from _invaders(stage, street)
         return
     where = stage.uniform("meet_m", 55.0, 75.0)
     away = stage.uniform("away_m", 50.0, 60.0)
@@ -103,17 +104,24 @@ def invader(stage: Stage, street: Street) -> Script:
     car.forced_mps2, car.offset_m = None, 0.0
 
 
-INVADING = 0.4
-"""Share of the oncoming cars of the second road that drive partly in the ego's lane."""
+INVADING, INTO_M = 0.4, (0.9, 1.2)
+"""Share of the oncoming cars of the second road that drive partly in the ego's lane,
+and how far they reach into it."""
+ASIDE_M = 1.1
+"""How far right of its lane's centre traffic keeps there, to have room."""
 
 
-def _invaders(stage: Stage, chain: list[LaneIndex]) -> Script:
+def _invaders(stage: Stage, street: Street) -> Script:
     """Drive oncoming traffic, a share of it partly in the ego's lane."""
     gap, random = stage.uniform("oncoming_gap_s", 4.0, 7.0), stage.random("invaders")
-    cars = stream(stage, "oncoming", [chain], Traffic(gap))
+    keep_clear(stage, street.ahead(), 60.0)
+    for car in stream(stage, "same_way", [street.ahead()], Traffic(2 * gap)):
+        car.offset_m = -ASIDE_M
+    cars = stream(stage, "oncoming", [street.oncoming()], Traffic(gap))
     invaders = [car for car in cars if random.random() < INVADING]
     for car in invaders:
-        car.offset_m = LANE_WIDTH_M - float(random.uniform(1.4, 2.0))
+        into = float(random.uniform(*INTO_M))
+        car.offset_m = (LANE_WIDTH_M - car.WIDTH) / 2 + into
         car.behaviour = replace(car.behaviour, sees_ego=False)
     yield from encounter(stage, invaders, None, "invader")
 

@@ -18,9 +18,9 @@ HEEDLESS, SLOW = 0.12, 0.15
 choice."""
 TURNING = 0.4
 """Share of traffic that turns at a junction."""
-EGO_M, OTHER_M = 25.0, 10.0
-"""The ego and another meet if each is this close to the place of the conflict; the ego
-waits before it."""
+AHEAD_M, BEHIND_M, OTHER_M = 25.0, 8.0, 10.0
+"""The ego and another meet if one is so far before or after the place of the conflict,
+the other so near to it: the ego waits at a line before it."""
 EGO_ROOM_M = 14.0
 """Nobody begins nearer to the ego, bumper to bumper."""
 
@@ -35,6 +35,7 @@ class Traffic:
         platoons: Share of arrivals that lead a platoon.
         reckless: Share of drivers who obey neither lights nor signs.
         joins: The chain that they join where their lane ends.
+        blind_to_ego: Share of drivers who do not mind the ego.
     """
 
     gap_s: float
@@ -42,6 +43,7 @@ class Traffic:
     platoons: float = 0.25
     reckless: float = 0.0
     joins: tuple[LaneIndex, ...] = ()
+    blind_to_ego: float = 0.0
 
 
 def stream(
@@ -109,6 +111,8 @@ def _driver(
     wanted = float(wanted)
     car = stage.coming(chain, s_m, wanted, wanted, vehicle, mind)
     car.joins = list(traffic.joins) or None
+    if traffic.blind_to_ego and random.random() < traffic.blind_to_ego:
+        car.behaviour = replace(mind, sees_ego=False)
     return car
 
 
@@ -144,7 +148,7 @@ def across(
 ) -> Script:
     """Drive traffic that the ego's route crosses or joins; see `encounter`."""
     reckless = 0.6 if name == "crossing_car" else 0.0
-    gap = stage.uniform(f"{name}_gap_s", 4.0, 7.0)
+    gap = stage.uniform(f"{name}_gap_s", 4.5, 8.0)
     cars = stream(stage, name, [chain], Traffic(gap, reckless=reckless))
     yield from encounter(stage, cars, route_s, name)
 
@@ -160,7 +164,7 @@ def encounter(
     while True:
         yield
         at = place or stage.ego.pose
-        if route_s is not None and abs(stage.ahead_m(route_s)) > EGO_M:
+        if route_s is not None and not -BEHIND_M < stage.ahead_m(route_s) < AHEAD_M:
             continue
         for body in others:
             x, y = body.position
