@@ -233,7 +233,7 @@ def admitted_routes(
     """Propose routes of a type until enough are admitted."""
     routes, refusals = list[Route](), list[str]()
     for attempt in range(MOST_TRIES * variants):
-        name = f"{scenario}_{len(routes)}"
+        name = f"{scenario}_{'' if road == 1 else 'R2_'}{len(routes)}"
         drawn = seed_of(seed, scenario, attempt)
         verdict = examine(propose(scenario, drawn, name, road))
         if verdict.refusal is None:

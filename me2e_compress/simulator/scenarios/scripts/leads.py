@@ -107,7 +107,10 @@ def queue_cut_in(stage: Stage, street: Street) -> Script:
 def ramp_cut_in(stage: Stage, ramp: Ramp) -> Script:
     """Merge a car from the on-ramp right in front of the ego, at a crawl."""
     if stage.schedule is not None:
-        gap, slow = stage.uniform("ramp_gap_s", 3.0, 5.5), stage.uniform("ramp_mps", 5, 8)
+        gap, slow = (
+            stage.uniform("ramp_gap_s", 3.0, 5.5),
+            stage.uniform("ramp_mps", 5, 8),
+        )
         traffic = Traffic(
             gap,
             (slow, slow + 1.0),
