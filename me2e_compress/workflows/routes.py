@@ -202,7 +202,7 @@ def _begun(draft: Path, options: RoutesOptions) -> list[ScenarioRoutes]:
                     f" not {wanted}; delete it, or choose another name"
                 )
         done = TypeAdapter(list[ScenarioRoutes]).validate_python(record.get("done"))
-    return [one for one in done if one.scenario in options.names]
+    return done
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -64,8 +64,8 @@ class DryRun:
         return self.ending is Ending.COMPLETED and not self.infractions
 
 
-MOST_S = 60.0
-"""On the second road nobody drives for longer; a route of 400 m takes 50 s at 8 m/s."""
+MOST_S = 80.0
+"""On the second road nobody drives for longer; two cycles of a light."""
 TEN_A_SECOND = Conditions(FixedLatency(100_000))
 FAULTS = INFRACTIONS | {EventKind.ACTOR_COLLISION}
 
@@ -125,11 +125,19 @@ class Admission:
         if self.expert is None:
             return "the expert did not drive it"
         why = _unsolved(self.expert)
-        if why is None and not self.expert.triggered:
+        if why is None and not self._met:
             return "the scenario's event never happened"
         if why is None and self.again is not None and (found := _unsolved(self.again)):
             return f"with other traffic {found}"
         return why
+
+    @property
+    def _met(self) -> bool:
+        """Whether the event happened: to the expert, or by chance to anybody."""
+        if self.route.road == 1:
+            return self.expert is not None and self.expert.triggered
+        drives = (self.expert, self.again, *self.blind)
+        return any(each is not None and each.triggered for each in drives)
 
     @property
     def admitted(self) -> bool:

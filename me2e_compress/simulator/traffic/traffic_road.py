@@ -52,7 +52,20 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         self._row = {id(body): i for i, body in enumerate(self.vehicles)}
         self._s, self._r = self.table.coordinates(points)
         self._half = [body.WIDTH / 2 for body in self._bodies]
+        if self.rules is not None:
+            self._turn_objects()
         self._ego = [body.id == 0 for body in self._bodies]
+
+    def _turn_objects(self) -> None:
+        """Let what stands across a lane take the width that it takes there."""
+        first = len(self.vehicles)
+        s, r = self._s[first:], np.abs(self._r[first:])
+        along = self.table.headings(s)
+        r = np.where((s < 0) | (s > self.table.length), np.inf, r)
+        for row, body in enumerate(self.objects):
+            askew = body.heading - along[row, int(np.argmin(r[row]))]
+            cos, sin = abs(math.cos(askew)), abs(math.sin(askew))
+            self._half[first + row] = float(body.WIDTH * cos + body.LENGTH * sin) / 2
 
     def _with_crossers(self, points: Floats) -> Floats:
         """Add where people who cross will be: drivers stop for them in time."""
@@ -166,10 +179,10 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         pairs = list[tuple[RoadObject, RoadObject]]()
         first, second = (side.tolist() for side in np.nonzero(np.triu(near, 1)))
         for i, j in zip(first, second, strict=True):
-            if self.rules is not None and all(
-                isinstance(each, Walker) for each in (bodies[i], bodies[j])
-            ):
-                continue  # people step aside for each other
+            people = [isinstance(each, Walker) for each in (bodies[i], bodies[j])]
+            aside = all(people) or (any(people) and bodies[j] in self.objects)
+            if self.rules is not None and aside:
+                continue  # people step aside for each other, and round things
             if overlap(bodies[i], bodies[j]):
                 pairs.append((bodies[i], bodies[j]))
         return pairs

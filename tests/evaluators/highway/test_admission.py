@@ -23,6 +23,7 @@ SAMPLE = pick_routes(load_routes(), "11")
 HIT = (InfractionKind.COLLISION_VEHICLE,)
 SOLVED = DryRun((), Ending.COMPLETED, True, False, 20.0)
 FAILED = DryRun(HIT, Ending.COLLISION, True, False, 9.0)
+UNMET = replace(SOLVED, triggered=False)
 LATE = DryRun((), Ending.BLOCKED, True, False, 75.0)
 BROKEN = DryRun((), Ending.POLICY_FAILED, True, False, 1.0, "ValueError: no")
 
@@ -111,8 +112,8 @@ def second() -> Route:
         (None, (SOLVED, LATE), None, "no infraction at 8 and 12 m/s"),
         (SOLVED, (FAILED,) * 3, FAILED, "with other traffic the expert commits"),
         (SOLVED, (FAILED,) * 3, LATE, "with other traffic the expert ends after 75 s"),
-        (replace(SOLVED, triggered=False), (FAILED,) * 3, SOLVED, "never happened"),
-        (SOLVED, (FAILED,) * 3, replace(SOLVED, triggered=False), None),
+        (UNMET, (replace(FAILED, triggered=False),) * 2, UNMET, "never happened"),
+        (UNMET, (FAILED,) * 2, UNMET, None),
         (None, (replace(FAILED, actors_crashed=True),), None, "two actors collide"),
     ],
 )

@@ -181,7 +181,7 @@ def _beside(
     On the second road cars come by all the time.
     """
     if stage.schedule is not None:
-        yield from across(stage, chain, change_s, name)
+        yield from across(stage, chain, change_s, name, (2.5, 4.0))
         return
     speed = float(stage.ego.speed)
     aside = stage.uniform("beside_m", -1.5, 1.5)

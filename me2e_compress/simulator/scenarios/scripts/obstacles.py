@@ -1,6 +1,7 @@
 """Things in the way: accidents, road works, parked cars, doors, slow cyclists."""
 
 from me2e_compress.simulator.scenarios.layouts.road import BEFORE_M, Street
+from me2e_compress.simulator.scenarios.scripts.streams import Traffic, stream
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
     NEAR_M,
     approach,
@@ -134,12 +135,18 @@ def neighbours(stage: Stage, street: Street) -> Script:
     yield
 
 
+ONCOMING_S = (16.0, 24.0)
+"""Mean gap of the oncoming traffic of the second road where one must overtake."""
+
+
 def oncoming_cars(stage: Stage, street: Street) -> Script:
     """Drive a few cars in the other direction, and then none.
 
-    The second road has traffic without it.
+    On the second road they come all the time, with gaps in which one can overtake.
     """
     if stage.schedule is not None:
+        traffic = Traffic(stage.uniform("oncoming_gap_s", *ONCOMING_S), platoons=0.6)
+        stream(stage, "oncoming", [street.oncoming()], traffic)
         return
     count = stage.integer("oncoming", 1, 3)
     chain = street.oncoming()

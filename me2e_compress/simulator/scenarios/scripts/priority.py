@@ -164,6 +164,8 @@ def emergency_behind(stage: Stage, street: Street) -> Script:
     passed[0] = True
 
 
+SPARSE_S = 20.0
+"""Mean gap in the ego's lane where an emergency vehicle comes: others make room."""
 HELD_UP_M, HELD_UP_S = 20.0, 5.0
 """The ego has not yielded if the vehicle was this close behind for this long, and still
 is behind at the end: on the second road it may come too late to be let by."""
@@ -178,8 +180,8 @@ def _emergency_comes(stage: Stage, lanes: list[LaneIndex]) -> Script:
         jam_gap_m=4.0,
         obeys_limits=False,
         obeys_rules=False,
-        changes_lanes=True,
     )
+    stream(stage, "same_way", [lanes], Traffic(SPARSE_S))
     car = stage.coming(lanes, 0.0, 15.0, 18.0, ActorKind.EMERGENCY, mind)
     if stage.schedule is not None:
         stage.schedule.add(at, car)

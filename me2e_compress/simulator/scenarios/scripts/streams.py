@@ -144,11 +144,15 @@ def _has_room(stage: Stage, car: Car) -> bool:
 
 
 def across(
-    stage: Stage, chain: Sequence[LaneIndex], route_s: float, name: str
+    stage: Stage,
+    chain: Sequence[LaneIndex],
+    route_s: float,
+    name: str,
+    gap_s: tuple[float, float] = (4.5, 8.0),
 ) -> Script:
     """Drive traffic that the ego's route crosses or joins; see `encounter`."""
-    reckless = 0.6 if name == "crossing_car" else 0.0
-    gap = stage.uniform(f"{name}_gap_s", 4.5, 8.0)
+    reckless = 0.35 if name == "crossing_car" else 0.0
+    gap = stage.uniform(f"{name}_gap_s", *gap_s)
     cars = stream(stage, name, [chain], Traffic(gap, reckless=reckless))
     yield from encounter(stage, cars, route_s, name)
 
@@ -180,7 +184,7 @@ TRIGGERED = (
     *("CrossingBicycleFlow", "VehicleTurningRoute", "VehicleTurningRoutePedestrian"),
 )
 """Types in which somebody waits for the ego, as in scenario_runner."""
-TRIGGER_M, DELAY_S = (14.0, 32.0), (0.0, 1.5)
+TRIGGER_M, DELAY_S = (18.0, 36.0), (0.0, 1.0)
 """Where the ego sets off what waits for it, and how long that still waits.
 scenario_runner's actors start when the ego is within a distance; ours is drawn."""
 
