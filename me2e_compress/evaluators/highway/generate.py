@@ -125,10 +125,10 @@ class Admission:
         if self.expert is None:
             return "the expert did not drive it"
         why = _unsolved(self.expert)
-        if why is None and not self._met:
-            return "the scenario's event never happened"
         if why is None and self.again is not None and (found := _unsolved(self.again)):
             return f"with other traffic {found}"
+        if why is None and not self._met:
+            return "the scenario's event never happened"
         return why
 
     @property
@@ -186,7 +186,7 @@ def examine(route: Route) -> Admission:
         return Admission(route, dry_run(route, Expert()), blind)
     # with its own traffic and with other
     first = Admission(route, dry_run(route, Expert(cameras_only=True)), blind)
-    if first.refusal is not None:
+    if first.expert is not None and _unsolved(first.expert) is not None:
         return first
     again = dry_run(with_other_traffic(route), Expert(cameras_only=True))
     return replace(first, again=again)
@@ -201,7 +201,7 @@ OTHER_TRAFFIC = 1_000_003
 """Any number: the seed of the route decides beside it."""
 
 
-MOST_TRIES = 8
+MOST_TRIES = 12
 """Most proposals of a type per wanted route."""
 
 

@@ -17,6 +17,8 @@ from me2e_compress.simulator.traffic.right_of_way import RightOfWay
 
 FORESEEN_S = (1.0, 2.0, 3.0)
 """When drivers foresee people who cross, seconds from now."""
+INSIDE_M, ALONG_RAD = 0.6, 0.3
+"""The ego is wholly in a lane if it is so near to its centre and direction."""
 BESIDE_M = 0.25
 """Two bodies closer than this sideways are in each other's way."""
 
@@ -99,7 +101,9 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             here = k == 0 and chain is None
             own = float(self._r[row, column]) if here else 0.0
             for s, r, other in self._on_lane(column):
-                if other == row or s + offset <= 0 or (blind and self._ego[other]):
+                if other == row or s + offset <= 0:
+                    continue
+                if blind and self._ego[other] and not self._leads(car, r):
                     continue
                 room = self._half[other] + beside
                 if abs(r + car.offset_m) < room or (here and abs(r - own) < room):
@@ -110,6 +114,15 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             if offset > LOOK_AHEAD_M:
                 break
         return None
+
+    def _leads(self, car: Car, aside_m: float) -> bool:
+        """Return whether the ego drives in a lane in a car's direction, well inside.
+
+        On the second road even who does not mind the ego keeps the distance then.
+        """
+        turn = math.remainder(self.vehicles[0].heading - car.heading, math.tau)
+        inside = abs(aside_m) < INSIDE_M and abs(turn) < ALONG_RAD
+        return self.rules is not None and inside
 
     def _on_lane(self, column: int) -> list[tuple[float, float, int]]:
         """Return (arc length, right offset, row) of the bodies along a lane."""

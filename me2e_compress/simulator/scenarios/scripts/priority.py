@@ -166,29 +166,23 @@ def emergency_behind(stage: Stage, street: Street) -> Script:
 
 SPARSE_S = 20.0
 """Mean gap in the ego's lane where an emergency vehicle comes: others make room."""
-HELD_UP_M, HELD_UP_S = 20.0, 5.0
+HELD_UP_M, HELD_UP_S = 20.0, 4.0
 """The ego has not yielded if the vehicle was this close behind for this long, and still
 is behind at the end: on the second road it may come too late to be let by."""
 
 
 def _emergency_comes(stage: Stage, lanes: list[LaneIndex]) -> Script:
-    """Let an emergency vehicle come from behind at a time that is drawn."""
-    at = stage.uniform("comes_s", 0.5, 8.0)
+    """Let an emergency vehicle come from behind, from a place that is drawn."""
     mind = Behaviour(
-        3.5,
-        headway_s=0.5,
-        jam_gap_m=4.0,
-        obeys_limits=False,
-        obeys_rules=False,
+        3.5, headway_s=0.5, jam_gap_m=4.0, obeys_limits=False, obeys_rules=False
     )
+    begin = BEFORE_M - stage.uniform("behind_m", 24.0, 56.0)
+    car = stage.car(lanes, begin, 16.0, 20.0, ActorKind.EMERGENCY, mind)
     stream(stage, "same_way", [lanes], Traffic(SPARSE_S))
-    car = stage.coming(lanes, 0.0, 15.0, 18.0, ActorKind.EMERGENCY, mind)
-    if stage.schedule is not None:
-        stage.schedule.add(at, car)
     held = [0.0]
 
     def judge() -> Event | None:
-        if held[0] < HELD_UP_S or car.road is None or stage.gap_m(car) > 0:
+        if held[0] < HELD_UP_S or stage.gap_m(car) > 0:
             return None
         return stage.event(EventKind.YIELD_EMERGENCY, "it was held up", car)
 
@@ -196,7 +190,7 @@ def _emergency_comes(stage: Stage, lanes: list[LaneIndex]) -> Script:
     fired = False
     while True:
         yield
-        if car.road is None or not -HELD_UP_M < stage.gap_m(car) < 0:
+        if not -HELD_UP_M < stage.gap_m(car) < 0:
             continue
         held[0] += 0.1
         if not fired:

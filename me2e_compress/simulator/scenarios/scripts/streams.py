@@ -16,6 +16,8 @@ from me2e_compress.simulator.traffic.stage import Script, Stage
 HEEDLESS, SLOW = 0.12, 0.15
 """Shares of drivers who follow closely and take short gaps, and of slow ones: our
 choice."""
+BLIND_TO_EGO = 0.4
+"""Share of drivers of a conflict who do not make room for an ego that comes in."""
 TURNING = 0.4
 """Share of traffic that turns at a junction."""
 AHEAD_M, BEHIND_M, OTHER_M = 25.0, 8.0, 10.0
@@ -148,12 +150,13 @@ def across(
     chain: Sequence[LaneIndex],
     route_s: float,
     name: str,
-    gap_s: tuple[float, float] = (4.5, 8.0),
+    gap_s: tuple[float, float] = (5.0, 9.0),
 ) -> Script:
     """Drive traffic that the ego's route crosses or joins; see `encounter`."""
     reckless = 0.35 if name == "crossing_car" else 0.0
     gap = stage.uniform(f"{name}_gap_s", *gap_s)
-    cars = stream(stage, name, [chain], Traffic(gap, reckless=reckless))
+    traffic = Traffic(gap, reckless=reckless, blind_to_ego=BLIND_TO_EGO)
+    cars = stream(stage, name, [chain], traffic)
     yield from encounter(stage, cars, route_s, name)
 
 
