@@ -10,6 +10,7 @@ from me2e_compress.simulator.scene import ActorKind
 from me2e_compress.simulator.traffic.bodies import Walker
 from me2e_compress.simulator.traffic.cars import Behaviour, Car
 from me2e_compress.simulator.traffic.network import LaneIndex
+from me2e_compress.simulator.traffic.right_of_way import DECIDE_M
 from me2e_compress.simulator.traffic.schedule import arrival_times, is_free
 from me2e_compress.simulator.traffic.stage import Script, Stage
 
@@ -23,6 +24,8 @@ TURNING = 0.4
 AHEAD_M, BEHIND_M, OTHER_M = 25.0, 8.0, 10.0
 """The ego and another meet if one is so far before or after the place of the conflict,
 the other so near to it: the ego waits at a line before it."""
+END_M = 12.0
+"""Nobody begins so near to the end of the map."""
 EGO_ROOM_M = 14.0
 """Nobody begins nearer to the ego, bumper to bumper."""
 
@@ -62,7 +65,7 @@ def stream(
     schedule.claimed.append(entry)
     low, high = traffic.speed or (0.0, 0.0)
     usual = (low + high) / 2 or 0.85 * float(network.lane(entry).speed_limit)
-    free_m = _before_junction(stage, chains[0]) - 12.0
+    free_m = _free_m(stage, chains[0])
     weights = np.array([_weight(stage, chain, chains) for chain in chains])
     clear = stage.clear.get(entry, (0.0, 0.0))
     cars = list[Car]()
@@ -118,14 +121,17 @@ def _driver(
     return car
 
 
-def _before_junction(stage: Stage, chain: Sequence[LaneIndex]) -> float:
-    """Return the length of a chain up to the first junction."""
+def _free_m(stage: Stage, chain: Sequence[LaneIndex]) -> float:
+    """Return how far on a chain cars may be as a route begins.
+
+    Nobody is so near to a junction that it is too late to decide.
+    """
     length = 0.0
     for index in chain:
         if index in stage.network.ranks:
-            break
+            return length - DECIDE_M
         length += stage.network.length(index)
-    return length
+    return length - END_M
 
 
 def _weight(
@@ -153,7 +159,7 @@ def across(
     gap_s: tuple[float, float] = (5.0, 9.0),
 ) -> Script:
     """Drive traffic that the ego's route crosses or joins; see `encounter`."""
-    reckless = 0.35 if name == "crossing_car" else 0.0
+    reckless = 0.45 if name == "crossing_car" else 0.0
     gap = stage.uniform(f"{name}_gap_s", *gap_s)
     traffic = Traffic(gap, reckless=reckless, blind_to_ego=BLIND_TO_EGO)
     cars = stream(stage, name, [chain], traffic)
