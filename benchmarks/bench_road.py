@@ -1,32 +1,41 @@
 """How much a set of routes lets happen, and how well it tells drivers apart.
 
-    python -m benchmarks.bench_road --road 2 --variants 1 --types Accident,T_Junction
+    python -m benchmarks.bench_road --road 2 --workers 2
     python -m benchmarks.bench_road --routes routes.json
+    python -m benchmarks.bench_road --fresh 1 --types Accident,T_Junction
+    python -m benchmarks.bench_road --admission admission.json
     python -m benchmarks.bench_road --compare float/ full/ float-4fps/
 
-The first two look at proposals, or at a set: how many actors move within 80 m of the
-ego as a route begins (the median over routes), what a step of the world takes, and at
-how many of five speeds a blind driver and the scenario's others meet, by type; they
-also count types whose light shows the ego red or yellow, and those with a sign. The
-last compares results folders of one set: the share of routes with a driving score of
-exactly 100, and how many routes do not end alike for all.
+The first three look at the set that ships, another, or so many proposals of each type:
+how many actors move within 80 m of the ego as a route begins (the median over routes),
+and how often blind drivers of five speeds and the scenario's others meet, by type; they
+also count types whose light shows a blind driver red or yellow, and those with a sign.
+Blind drivers decide ten times a second. ``--admission`` takes what ``routes --json``
+printed, and counts the proposals that were refused, by reason. The last compares
+results folders of one set: the share of routes with a driving score of exactly 100, how
+many routes do not end alike for all, frames and seconds of a route.
 """
 
 import argparse
+import json
 import math
-import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, median
 
 from me2e_compress.evaluators.highway.blind import Blind
-from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.generate import propose, seed_of
-from me2e_compress.evaluators.highway.results import ResultsFolder
+from me2e_compress.evaluators.highway.generate import (
+    TEN_A_SECOND,
+    propose,
+    seed_of,
+)
+from me2e_compress.evaluators.highway.results import ResultsFolder, log_beside
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.driving_score import route_score
-from me2e_compress.simulator.routes import Route, load_routes
+from me2e_compress.runtime.children import pool
+from me2e_compress.simulator.routes import SETS, Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from me2e_compress.simulator.scene import EventKind, Scene, SignalKind, SignalState
 from me2e_compress.simulator.world import World
@@ -35,6 +44,7 @@ SPEEDS_MPS = (4.0, 6.0, 8.0, 10.0, 12.0)
 NEAR_M, MOVING_MPS = 80.0, 0.3
 AHEAD_M = 40.0
 """A light that is this near shows the ego its phase."""
+WAIT = (SignalState.RED, SignalState.YELLOW)
 SIGNS = (SignalKind.STOP_SIGN, SignalKind.GIVE_WAY)
 
 
@@ -44,8 +54,17 @@ class BlindDrive:
 
     met: bool
     infraction: bool
-    stopped_by_light: bool
-    step_ms: float
+    lit: bool
+
+
+@dataclass(frozen=True)
+class Look:
+    """One route: who moves near its beginning, its signs, and the blind drives."""
+
+    route: Route
+    moving: int
+    has_sign: bool
+    drives: tuple[BlindDrive, ...]
 
 
 def moving_near(scene: Scene) -> int:
@@ -60,58 +79,81 @@ def moving_near(scene: Scene) -> int:
 
 def blind_drive(route: Route, speed_mps: float) -> BlindDrive:
     """Drive a route blindly, and note what it meets."""
-    shown, worlds = list[bool](), list[World]()
+    lit, worlds = list[bool](), list[World]()
 
     def look(world: World) -> None:
         worlds.append(world)
-        lines = {
-            e.signal_id: e.line_s - world.ego_s for e in world.privileged(()).phases
-        }
-        shown.append(
-            any(
-                0.0 < lines.get(each.id, -1.0) < AHEAD_M
-                and each.state in (SignalState.RED, SignalState.YELLOW)
-                for each in world.scene().signals
-            )
-        )
+        ahead = [(e.line_s - world.ego_s, e.state) for e in world.privileged(()).phases]
+        lit.append(any(0.0 < at < AHEAD_M and state in WAIT for at, state in ahead))
 
-    begun = time.process_time()
-    episode = drive(route, Blind(speed_mps), Conditions(), Listeners(on_query=look))
-    took = time.process_time() - begun
-    kinds = [event.kind for event in worlds[-1].events]
-    return BlindDrive(
-        EventKind.TRIGGER in kinds,
-        bool(episode.infractions),
-        any(shown),
-        1e3 * took / max(len(episode.frames), 1),
+    episode = drive(
+        route,
+        Blind(speed_mps),
+        TEN_A_SECOND,
+        Listeners(on_query=look),
+        lambda world: False,
     )
+    kinds = [event.kind for event in worlds[-1].events]
+    return BlindDrive(EventKind.TRIGGER in kinds, bool(episode.infractions), any(lit))
 
 
-def look_at(routes: Sequence[Route]) -> None:
+def look_at(route: Route) -> Look:
+    """Look at one route."""
+    scene = World(route).scene()
+    drives = tuple(blind_drive(route, speed) for speed in SPEEDS_MPS)
+    has_sign = any(each.kind in SIGNS for each in scene.signals)
+    return Look(route, moving_near(scene), has_sign, drives)
+
+
+def show(routes: Sequence[Route], workers: int) -> None:
     """Print the tables of some routes."""
-    moving, frame_ms, lit, signed = list[int](), list[float](), set[str](), set[str]()
-    print("scenario | moving | met at 4, 6, 8, 10, 12 m/s | infractions at these")
+    with pool(workers) as processes:
+        looks = list(processes.map(look_at, routes))
+    print("type | moving | meets at 4, 6, 8, 10, 12 m/s | infractions at these")
     print("---|---|---|---")
+    lit, signed = set[str](), set[str]()
     for name in dict.fromkeys(route.scenario for route in routes):
-        own = [route for route in routes if route.scenario == name]
-        near, drives = list[int](), dict[float, list[BlindDrive]]()
-        for route in own:
-            scene = World(route).scene()
-            near.append(moving_near(scene))
-            signed |= {name for each in scene.signals if each.kind in SIGNS}
-            for speed in SPEEDS_MPS:
-                drives.setdefault(speed, []).append(blind_drive(route, speed))
-        found = [each for several in drives.values() for each in several]
-        met = " ".join(f"{fmean(e.met for e in drives[s]):.0%}" for s in SPEEDS_MPS)
-        lit |= {name} if any(each.stopped_by_light for each in found) else set()
-        failed = [fmean(e.infraction for e in drives[s]) for s in SPEEDS_MPS]
-        words = " ".join(f"{share:.0%}" for share in failed)
-        print(f"{name} | {median(near):g} | {met} | {words}", flush=True)
-        moving += near
-        frame_ms += [each.step_ms for each in found]
-    print(f"\nmoving within 80 m as a route begins: median {median(moving):g}")
-    print(f"a frame of a blind drive: median {median(frame_ms):.2f} ms of CPU time")
-    print(f"types that show red or yellow: {len(lit)}; with a sign: {len(signed)}")
+        own = [each for each in looks if each.route.scenario == name]
+        lit |= {name for each in own for one in each.drives if one.lit}
+        signed |= {name for each in own if each.has_sign}
+        print(f"{name} | {median(e.moving for e in own):g} | {_shares(own)}")
+    print(f"all | {median(e.moving for e in looks):g} | {_shares(looks)}")
+    still = sum(each.moving == 0 for each in looks)
+    print(f"\n{len(looks)} routes; nobody moves within 80 m as {still} begin")
+    print(f"types that show a blind driver red or yellow: {len(lit)}")
+    print(f"types with a stop or give-way sign: {len(signed)}")
+
+
+def _shares(looks: Sequence[Look]) -> str:
+    columns = list(zip(*(each.drives for each in looks), strict=True))
+    met = " ".join(f"{fmean(e.met for e in drives):.0%}" for drives in columns)
+    failed = " ".join(
+        f"{fmean(e.infraction for e in drives):.0%}" for drives in columns
+    )
+    return f"{met} | {failed}"
+
+
+REASONS = {
+    "the blind driver": "blind drivers solve it",
+    "two actors collide": "two others collide",
+    "with other traffic": "the expert fails with other traffic",
+    "the scenario's event": "the expert never meets its conflict",
+    "the expert": "the expert fails",
+}
+
+
+def admission(path: Path) -> None:
+    """Print why proposals were refused."""
+    record = json.loads(path.read_text())
+    why = [each for one in record["scenarios"] for each in one["refusals"]]
+    counts = Counter(
+        next(words for start, words in REASONS.items() if each.startswith(start))
+        for each in why
+    )
+    tried = record["tried"]
+    print(f"{len(why)} of {tried} proposals were refused ({len(why) / tried:.0%})")
+    for words, count in counts.most_common():
+        print(f"{words} | {count}")
 
 
 def compare(folders: Sequence[Path]) -> None:
@@ -125,7 +167,15 @@ def compare(folders: Sequence[Path]) -> None:
     ]
     for path, own in zip(folders, scores, strict=True):
         whole = fmean(score == 100.0 for score in own.values())
-        print(f"{path}: {len(own)} routes, {whole:.1%} at exactly 100")
+        log = log_beside(path).read_text().splitlines()
+        costs = [json.loads(line) for line in log]
+        frames, seconds = (
+            fmean(e[key] for e in costs) for key in ("frames", "seconds")
+        )
+        print(
+            f"{path}: {len(own)} routes, {whole:.1%} at exactly 100,"
+            f" {frames:.0f} frames and {seconds:.1f} s a route"
+        )
     shared = [name for name in scores[0] if all(name in own for own in scores)]
     unlike = [name for name in shared if len({own[name] for own in scores}) > 1]
     print(f"{len(unlike)} of {len(shared)} routes do not end alike for all")
@@ -134,26 +184,30 @@ def compare(folders: Sequence[Path]) -> None:
 def main() -> None:
     """Read what is looked at."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--routes", type=Path, help="a set; else proposals")
+    parser.add_argument("--routes", type=Path, help="another set than what ships")
     parser.add_argument("--road", type=int, default=2)
-    parser.add_argument("--variants", type=int, default=1, help="proposals of a type")
+    parser.add_argument("--fresh", type=int, help="proposals of each type, no set")
     parser.add_argument("--types", default=",".join(SCENARIO_ABILITIES))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--admission", type=Path, help="what routes --json printed")
     parser.add_argument("--compare", type=Path, nargs="+", help="results folders")
     given = parser.parse_args()
     if given.compare:
         compare(given.compare)
-        return
-    if given.routes:
-        look_at(load_routes(given.routes))
-        return
-    look_at(
-        [
+    elif given.admission:
+        admission(given.admission)
+    elif given.fresh:
+        proposals = [
             propose(name, seed_of(given.seed, name, k), f"{name}_{k}", given.road)
             for name in given.types.split(",")
-            for k in range(given.variants)
+            for k in range(given.fresh)
         ]
-    )
+        show(proposals, given.workers)
+    else:
+        there = load_routes(given.routes or SETS[given.road])
+        types = given.types.split(",")
+        show([each for each in there if each.scenario in types], given.workers)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.generate import propose, seed_of
-from me2e_compress.simulator.routes import Route, load_routes
+from me2e_compress.simulator.routes import SETS, Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 
 MANIFEST = "dataset.json"
@@ -107,7 +107,11 @@ def refuse_shipped(what: str, seed: int, routes: Iterable[tuple[str, int]]) -> N
     Raises:
         TrainingError: one of them is such a route: those are for evaluation.
     """
-    shipped = {(route.scenario, route.seed): route.id for route in load_routes()}
+    shipped = {
+        (route.scenario, route.seed): route.id
+        for path in SETS.values()
+        for route in load_routes(path)
+    }
     for each in routes:
         if each in shipped:
             raise TrainingError(

@@ -34,11 +34,13 @@ FULL_SET = 220
 class SafetyScores:
     """How near the routes came to collisions; None where it was not recorded.
 
-    ``ttc_exposure`` is the percentage of frames with a time to collision below 1.5 s;
-    the smallest values are means of the routes' minima, in seconds or metres: TTC over
-    routes on which a contact was ever within 10 s, PET over routes with crossing paths.
+    ``room_kept`` grades a route from 0 to 100; ``ttc_exposure`` is the percentage of
+    frames with a time to collision below 1.5 s; the smallest values are means of the
+    routes' minima, in seconds or metres: TTC over routes on which a contact was ever
+    within 10 s, PET over routes with crossing paths.
     """
 
+    room_kept: Estimate
     ttc_exposure: Estimate
     smallest_ttc: Estimate
     smallest_pet: Estimate
@@ -156,6 +158,7 @@ def _safety(episodes: Sequence[Episode], seed: int) -> SafetyScores:
         reason = f"whose fault {len(faults) - len(known)} collisions were is not known"
         at_fault = Estimate.missing("%", reason)
     return SafetyScores(
+        _over(episodes, surrogate_safety.room_kept, "%", seed, PERCENT),
         _over(episodes, surrogate_safety.ttc_exposure, "%", seed, PERCENT),
         _over(episodes, surrogate_safety.smallest_ttc, "s", seed),
         _over(episodes, surrogate_safety.smallest_pet, "s", seed),

@@ -30,6 +30,22 @@ def ttc_exposure(episode: Episode) -> Measure:
     return Measure(100.0 * exposed / len(found.ttc_s), "%")
 
 
+def room_kept(episode: Episode) -> Measure:
+    """Return how much room a route kept to others, a grade from 0 to 100 percent.
+
+    It is the share of frames without a contact within 1.5 s, times the part of 1.5 s
+    that the smallest post-encroachment time reaches, at most 1; 0 after a collision
+    that was the ego's fault. The driving score sees neither near misses nor faults.
+    """
+    exposed, pet = ttc_exposure(episode).value, smallest_pet(episode).value
+    fault = at_fault_collision(episode)
+    if exposed is None or fault is None:
+        why = "whose fault a collision was is not known"
+        return Measure(None, "%", NOT_RECORDED if exposed is None else why)
+    kept = 1.0 if pet is None else min(pet / TTC_CRITICAL_S, 1.0)
+    return Measure(0.0 if fault else (100.0 - exposed) * kept, "%")
+
+
 def smallest_ttc(episode: Episode) -> Measure:
     """Return the smallest time to collision of a route, seconds; 0 if it collided."""
     seconds = () if episode.conflicts is None else episode.conflicts.ttc_s

@@ -25,9 +25,14 @@ ROADS = (1, 2)
 """Generations of roads. On the first, actors wait for the ego and nobody else is about;
 on the second, arrivals and signals follow plans that are drawn before the route begins,
 and there is traffic on every road."""
+SETS = {1: SHIPPED, 2: SHIPPED.with_name("routes_2_220.json")}
+"""The set of each road that ships, as large."""
 DIGEST = "set_sha256"
 """Key of a set of the second road, in its first record: what its routes were when they
 were admitted."""
+VERSION, ROAD_VERSION = "road_version", 1
+"""What makes roads and traffic of a route of the second road, in the first record of a
+set and in the manifest of its drives: another version makes another route of it."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +91,13 @@ class Route:
         return record
 
 
+def check_road(road: int) -> None:
+    """Raise EvaluationError if there is no such road."""
+    if road not in ROADS:
+        there = " and ".join(map(str, ROADS))
+        raise EvaluationError(f"--road {road}: there are {there}")
+
+
 def is_route_id(text: str) -> bool:
     """Return whether a text can be the id of a route, and so part of a file name."""
     return 0 < len(text) <= 200 and all(c.isalnum() or c in "_-" for c in text)
@@ -103,7 +115,8 @@ def load_routes(path: Path = SHIPPED, road: int | None = None) -> tuple[Route, .
     Raises:
         EvaluationError: The file is missing, not a manifest, or repeats an id; its
             routes lie on several roads, or on another than was asked for; or it is of
-            the second road and was changed after it was made.
+            the second road and was changed after it was made, or made by another
+            version of its generator.
     """
     with documents.reading(path, EvaluationError, "not routes"):
         content = documents.content(path)
@@ -122,6 +135,8 @@ def load_routes(path: Path = SHIPPED, road: int | None = None) -> tuple[Route, .
         raise EvaluationError(
             f"{path}: its routes lie on road {found}; road {road} was asked for"
         )
+    if roads == [2]:
+        check_version(path, records[0].get(VERSION))
     if roads == [2] and records[0].get(DIGEST) != digest_of(routes):
         raise EvaluationError(
             f"{path}: was changed after its routes were admitted (its {DIGEST} does not"
@@ -138,6 +153,19 @@ def load_routes(path: Path = SHIPPED, road: int | None = None) -> tuple[Route, .
     return tuple(routes)
 
 
+def check_version(path: Path, version: object) -> None:
+    """Refuse what another version of the second road's generator made.
+
+    Raises:
+        EvaluationError: It did.
+    """
+    if version != ROAD_VERSION:
+        raise EvaluationError(
+            f"{path}: is of version {version} of the second road's generator; this is"
+            f" version {ROAD_VERSION}, which makes other roads and traffic of it"
+        )
+
+
 def digest_of(routes: Sequence[Route]) -> str:
     """Return the sha256 of the definitions of some routes."""
     definitions = json.dumps([route.record() for route in routes], sort_keys=True)
@@ -149,7 +177,7 @@ def save_routes(routes: Sequence[Route], path: Path) -> None:
     records = [route.record() for route in routes]
     mark: dict[str, Any] = dict(IN_JSON)
     if routes and routes[0].road == 2:
-        mark[DIGEST] = digest_of(routes)
+        mark |= {VERSION: ROAD_VERSION, DIGEST: digest_of(routes)}
     records[:1] = [mark | each for each in records[:1]]  # a list has no other place
     lines = ",\n".join(map(json.dumps, records))
     try:

@@ -124,6 +124,7 @@ class _Study(_Table):
     baseline: str
     evaluator: str = HIGHWAY
     routes: str | int | None = None
+    road: int | None = None
     seed: int = 0
     frames: str | None = None
     held_out: str | None = None
@@ -188,7 +189,7 @@ class _Reader:
         # the caller's routes take precedence over the file's
         libraries = (*map(self._beside, table.plugins), *plugins)
         which = routes if table.routes is None or routes else str(table.routes)
-        driven, set_size = self._routes(which, table.evaluator)
+        driven, set_size = self._routes(which, table)
         return Study(
             title=table.title,
             variants=tuple(self._variant(each) for each in table.variant),
@@ -254,11 +255,11 @@ class _Reader:
         return str(self._beside(name))
 
     def _routes(
-        self, which: str | None, evaluator: str
+        self, which: str | None, table: _Study
     ) -> tuple[tuple[Route, ...], int]:
-        if which is None and not is_highway(evaluator):
+        if which is None and not is_highway(table.evaluator):
             return (), 0
-        return routes_named(which or "all", self.path.parent)
+        return routes_named(which or "all", self.path.parent, table.road)
 
     def _file(self, name: str | None) -> Path | None:
         return None if name is None else self._beside(name)

@@ -13,7 +13,7 @@ from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome, VariantOutcome
 from me2e_compress.workflows.result import Cell, Table, counted
 
-SCORES = ("DS", "SR %", "DE %", "DC")
+SCORES = ("DS", "room %", "SR %", "DE %", "DC")
 MOST_ROUTES = 40
 """With more routes than this, the table of endings is left out."""
 COSTS = ("size MB", "p50 ms", "p99 ms", "plan m", "SQNR dB")
@@ -241,10 +241,10 @@ def _safety(drive: DriveRecord, columns: int) -> tuple[Cell, ...]:
 
 def _scores(drive: DriveRecord) -> tuple[Cell, ...]:
     if drive.scores is None:
-        return (Cell(MISSING, reason=drive.reason),) * 4
+        return (Cell(MISSING, reason=drive.reason),) * len(SCORES)
     found = drive.scores
-    shown = (found.driving_score, found.success_rate, found.efficiency, found.comfort)
-    return tuple(map(estimate_cell, shown))
+    graded = (found.driving_score, found.safety.room_kept, found.success_rate)
+    return tuple(map(estimate_cell, (*graded, found.efficiency, found.comfort)))
 
 
 def _costs(variant: VariantOutcome) -> tuple[Cell, ...]:
@@ -277,7 +277,8 @@ def _routes_note(outcome: StudyOutcome) -> str:
     of = "" if driven == whole else f"{driven} of "
     share = f"{of}{counted(whole, 'route')}"
     return (
-        f"{share}. DS driving score, SR success rate, DE efficiency, DC comfort, each "
+        f"{share}. DS driving score, room kept to others, SR success rate, DE"
+        " efficiency, DC comfort, each "
         f"with its 95 % interval over these scenario types. {MISSING} means not "
         "measured."
     )

@@ -6,17 +6,23 @@ import dataclasses
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from pydantic import TypeAdapter
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.extras import need_extra
+from me2e_compress.registry import documents
+from me2e_compress.runtime.atomic import write_document
 from me2e_compress.simulator.routes import (
-    ROADS,
+    ROAD_VERSION,
+    check_road,
     load_routes,
     pick_routes,
     save_routes,
 )
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES, VARIANTS
+from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import check_count
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.listener import SILENT, Listener
@@ -49,9 +55,7 @@ class RoutesOptions:
 
     def __post_init__(self) -> None:
         check_count("--seed", self.seed)
-        if self.road not in ROADS:
-            there = " and ".join(map(str, ROADS))
-            raise EvaluationError(f"--road {self.road}: there are {there}")
+        check_road(self.road)
         for name in self.names:
             if name not in SCENARIO_ABILITIES:
                 there = ", ".join(sorted(SCENARIO_ABILITIES))
@@ -147,18 +151,58 @@ def make_routes(
 def _made(output: Path, options: RoutesOptions, listener: Listener) -> RoutesResult:
     from me2e_compress.evaluators.highway.generate import generate
 
-    # report each scenario type as soon as its routes are admitted
-    names = options.names
-    harvests: list[ScenarioRoutes] = []
+    # go on where a run that was killed left off
+    draft = output.with_name(f"{output.name}.part")
+    begun = _begun(draft, options)
+    found = {one.scenario: one for one in begun}
+    names = [name for name in options.names if name not in found]
+    # keep and report each scenario type as soon as its routes are admitted
     made = generate(
         options.seed, names, options.variants, options.workers, options.road
     )
     for harvest in made:
-        harvests.append(harvest)
-        done = len(harvests)
-        listener.on_progress("admitting", done, len(names), harvest.scenario)
+        found[harvest.scenario] = harvest
+        done = [dataclasses.asdict(one) for one in found.values()]
+        write_document(draft, _deciding(options) | {"done": done})
+        listener.on_progress(
+            "admitting", len(found), len(options.names), harvest.scenario
+        )
+    harvests = tuple(found[name] for name in options.names)
     save_routes([route for one in harvests for route in one.routes], output)
-    return RoutesResult(output, tuple(harvests))
+    draft.unlink(missing_ok=True)
+    return RoutesResult(output, harvests)
+
+
+def _deciding(options: RoutesOptions) -> dict[str, object]:
+    """Return what decides the routes of a type."""
+    return {
+        "version": f"{__version__}, road {ROAD_VERSION}",
+        "seed": options.seed,
+        "variants": options.variants,
+        "road": options.road,
+    }
+
+
+def _begun(draft: Path, options: RoutesOptions) -> list[ScenarioRoutes]:
+    """Read the types that a run with these options has admitted already.
+
+    Raises:
+        EvaluationError: The draft is of other options, or no draft.
+    """
+    from me2e_compress.evaluators.highway.generate import ScenarioRoutes
+
+    if not draft.exists():
+        return []
+    with documents.reading(draft, EvaluationError, "not a set that was begun"):
+        record = TypeAdapter(dict[str, Any]).validate_json(documents.content(draft))
+        for key, wanted in _deciding(options).items():
+            if record.get(key) != wanted:
+                raise EvaluationError(
+                    f"{draft}: is a set that was begun with {key} {record.get(key)},"
+                    f" not {wanted}; delete it, or choose another name"
+                )
+        done = TypeAdapter(list[ScenarioRoutes]).validate_python(record.get("done"))
+    return done
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

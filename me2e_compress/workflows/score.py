@@ -213,6 +213,7 @@ def score_records(scores: Scores) -> list[dict[str, object]]:
 
 def _each(scores: Scores) -> Iterator[tuple[str, Estimate]]:
     yield "driving score", scores.driving_score
+    yield "room kept", scores.safety.room_kept
     yield "success rate", scores.success_rate
     yield "efficiency", scores.efficiency
     yield "comfort", scores.comfort

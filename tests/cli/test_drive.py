@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from me2e_compress.metrics.episode import Ending
+from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.registry.marks import IN_JSON
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import LatencyTrace
@@ -192,6 +194,8 @@ def test_sets_of_the_wrong_road_are_one_line(cli: Cli, tmp_path: Path) -> None:
         ("routes --examine old.json --road 2", "lie on road 1; road 2 was asked for"),
         ("routes --examine new.json --road 1", "lie on road 2; road 1 was asked for"),
         ("routes -o x.json --road 3", "--road 3: there are 1 and 2"),
+        ("evaluate blind:8 -o out --road 3", "--road 3: there are 1 and 2"),
+        ("evaluate blind:8 -o out --routes old.json --road 2", "lie on road 1; road 2"),
         ("evaluate blind:8 -o out --routes edited.json", "edited.json: was changed"),
     ):
         assert words in cli.refused(line)
@@ -206,3 +210,46 @@ def test_a_route_of_the_second_road_is_driven_on(cli: Cli, tmp_path: Path) -> No
     assert report["routes"]["driven"] == 1
     manifest = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     assert manifest["drive_on"] is True
+    old = json.dumps(manifest | {"road_version": 0})
+    (tmp_path / "out" / "evaluation.json").write_text(old)
+    assert "out: is of version 0 of the second road's" in cli.refused("score out")
+
+
+def test_a_set_goes_on_where_it_was_killed(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from me2e_compress.evaluators.highway import generate as room
+
+    asked = "routes -o set.json --seed 3 --variants 1 --road 2 --scenarios"
+    admitted, made = room.admitted_routes, list[str]()
+
+    def killed(scenario: str, **options: int) -> room.ScenarioRoutes:
+        made.append(scenario)
+        if len(made) == 2:
+            raise KeyboardInterrupt
+        return admitted(scenario, **options)
+
+    hit, there = InfractionKind.COLLISION_VEHICLE, Ending.COMPLETED
+    blind = room.DryRun((hit,), Ending.COLLISION, True, False, 9.0)
+    expert = room.DryRun((), there, True, False, 20.0)
+    monkeypatch.setattr(
+        room, "examine", lambda route: room.Admission(route, expert, (blind,), expert)
+    )
+    monkeypatch.setattr(room, "admitted_routes", killed)
+    cli(f"{asked} Accident,ParkedObstacle")
+    assert not (tmp_path / "set.json").exists()
+
+    said = cli.refused(f"{asked.replace('3', '4', 1)} Accident")
+    assert "set.json.part: is a set that was begun with seed 3, not 4" in said
+    assert cli.document(f"{asked} Accident,ParkedObstacle")["admitted"] == 2
+    assert made == ["Accident", "ParkedObstacle", "ParkedObstacle"]
+    assert [path.name for path in tmp_path.iterdir()] == ["set.json"]
+
+
+def test_what_lies_beside_a_set_and_is_no_draft_is_named(
+    cli: Cli, tmp_path: Path
+) -> None:
+    (tmp_path / "set.json.part").write_text("[]")
+    line = "routes -o set.json --scenarios Accident"
+
+    assert "set.json.part: not a set that was begun: the file: " in cli.refused(line)

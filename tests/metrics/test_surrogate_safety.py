@@ -11,6 +11,7 @@ from me2e_compress.metrics.measure import Measure
 from me2e_compress.metrics.scores import score
 from me2e_compress.metrics.surrogate_safety import (
     at_fault_collision,
+    room_kept,
     smallest_distance,
     smallest_pet,
     smallest_ttc,
@@ -49,6 +50,26 @@ def test_the_smallest_of_a_route() -> None:
     assert smallest_pet(NEAR_MISS) == Measure(2.5, "s")
 
 
+def test_room_is_kept_by_who_comes_near_nobody() -> None:
+    close = dataclasses.replace(
+        NEAR_MISS.conflicts, encounters=(encounter(0.3, 60.0), encounter(2.0, 90.0))
+    )
+    found = [
+        room_kept(drive(*faults, conflicts=conflicts)).value
+        for faults, conflicts in (
+            ((), NEAR_MISS.conflicts),
+            ((), close),
+            ((crash(False),), close),
+            ((crash(True),), close),
+            ((), ALONE.conflicts),
+        )
+    ]
+
+    assert found == pytest.approx([50.0, 10.0, 10.0, 0.0, 100.0])
+    unknown = room_kept(drive(crash(None), conflicts=close))
+    assert unknown == Measure(None, "%", "whose fault a collision was is not known")
+
+
 def test_who_met_nobody_has_no_smallest() -> None:
     assert smallest_ttc(ALONE).reason == "no contact was ever within 10 s"
     assert smallest_distance(ALONE).reason == "nobody else was there"
@@ -56,7 +77,7 @@ def test_who_met_nobody_has_no_smallest() -> None:
 
 
 @pytest.mark.parametrize(
-    "measure", [ttc_exposure, smallest_ttc, smallest_distance, smallest_pet]
+    "measure", [room_kept, ttc_exposure, smallest_ttc, smallest_distance, smallest_pet]
 )
 def test_what_was_not_recorded_is_not_measured(
     measure: Callable[[Episode], Measure],

@@ -8,6 +8,7 @@ import pytest
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.routes import (
+    SETS,
     SHIPPED,
     Route,
     digest_of,
@@ -165,6 +166,8 @@ def test_the_first_road_is_written_and_fingerprinted_as_ever(tmp_path: Path) -> 
         (('"lanes": 2', '"lanes": 3'), "changed after its routes were admitted"),
         (('"set_sha256": "', '"set_sha256": "0'), "changed after its routes"),
         (('"seed": 1, ', '"seed": 8, '), "changed after its routes were admitted"),
+        (('"road_version": 1', '"road_version": 0'), "is of version 0 of the second"),
+        (('"road_version": 1, ', ""), "is of version None of the second road's"),
         ((', "road": 2}]', "}]"), "r1 lies on road 1, r0 on road 2"),
         (('"road": 2', '"road": 3'), "road 3: there are 1 and 2"),
     ],
@@ -182,6 +185,15 @@ def test_a_set_of_the_second_road_that_was_edited_is_refused(
 
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_220_routes_of_the_second_road_ship_five_of_each_type() -> None:
+    routes = load_routes(SETS[2], road=2)
+
+    assert len({route.seed for route in routes}) == len(routes) == 220
+    assert Counter(e.scenario for e in routes) == dict.fromkeys(SCENARIO_ABILITIES, 5)
+    assert not {e.id for e in routes} & {e.id for e in load_routes()}
+    assert all(route.parameters for route in routes)
 
 
 def test_a_set_of_the_other_road_is_refused(tmp_path: Path) -> None:

@@ -55,6 +55,7 @@ def evaluate(
     output: Output = None,
     check: Check = False,
     routes: given.Routes = "all",
+    road: given.Road = None,
     latency: Latency = "none",
     latency_scale: Scale = 1.0,
     latency_model: Model = "drop",
@@ -89,7 +90,7 @@ def evaluate(
         raise typer.BadParameter("driving needs -o RESULTS/", param_hint="-o")
     engine_name, address = given.engine_and_address(engine)
     options = workflow.EvaluateOptions(
-        routes=routes, latency=latency, latency_scale=latency_scale,
+        routes=routes, road=road, latency=latency, latency_scale=latency_scale,
         latency_model=latency_model, in_order=in_order, seed=seed, workers=workers,
         dt_ms=dt_ms, adapter=adapter, host_stage=host_stage, weather=weather,
         drive_on=drive_on,

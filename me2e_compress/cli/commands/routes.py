@@ -17,10 +17,6 @@ Examine = Annotated[
     Path | None, typer.Option(help="examine this manifest instead of making one")
 ]
 Scenarios = Annotated[str, typer.Option(help="scenario types: all, or NAME,NAME")]
-Road = Annotated[
-    int | None,
-    typer.Option(help="1, or 2: traffic, signal plans, arrivals by chance"),
-]
 Picked = Annotated[
     str, typer.Option("--routes", "--pick", help=f"{given.ROUTES}; with --examine")
 ]
@@ -34,7 +30,7 @@ def routes(
     ] = VARIANTS,
     scenarios: Scenarios = "all",
     workers: given.Workers = 1,
-    road: Road = None,
+    road: given.Road = None,
     examine: Examine = None,
     picked: Picked = "all",
     force: given.Force = False,

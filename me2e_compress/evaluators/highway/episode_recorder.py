@@ -60,13 +60,14 @@ class EpisodeRecorder:
     world: World
     frames: list[EgoFrame] = field(default_factory=list)
     decisions: list[InferenceRecord] = field(default_factory=list)
-    conflicts: ConflictRecorder = field(default_factory=ConflictRecorder)
+    conflicts: ConflictRecorder | None = field(default_factory=ConflictRecorder)
 
     def record(self, scene: Scene) -> None:
         """Record a frame if one is due."""
         if scene.time_us >= len(self.frames) * FRAME_US:
             self.frames.append(_frame(scene, self.world.progress_m))
-            self.conflicts.record(scene)
+            if self.conflicts is not None:
+                self.conflicts.record(scene)
 
     def episode(self, ending: Ending, failure: str | None = None) -> Episode:
         """Return the episode of the world's route."""
@@ -85,7 +86,7 @@ class EpisodeRecorder:
             frames=tuple(self.frames),
             decisions=tuple(self.decisions),
             junction_m=junction_m(world.path),
-            conflicts=self.conflicts.result(),
+            conflicts=None if self.conflicts is None else self.conflicts.result(),
             first_collision=_first_collision(world, ending),
         )
 

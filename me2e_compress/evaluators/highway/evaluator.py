@@ -18,7 +18,13 @@ from me2e_compress.extras import need_extra
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.simulator.routes import Route, load_routes, pick_routes
+from me2e_compress.simulator.routes import (
+    SETS,
+    Route,
+    check_road,
+    load_routes,
+    pick_routes,
+)
 from me2e_compress.simulator.scenarios.catalogue import EXPERT_S
 
 
@@ -125,6 +131,7 @@ class DrivingOptions(ConditionOptions):
 
     Attributes:
         routes: ``all``, a number, ``ID,ID`` or a file of routes.
+        road: 1 or 2: whose set ``routes`` are from, and where those of a file lie.
         latency: what a decision costs: ``none``, ``fps:F``, ``trace:FILE``,
             ``measured``.
         latency_scale: factor on a trace or a measurement.
@@ -138,6 +145,7 @@ class DrivingOptions(ConditionOptions):
     """
 
     routes: str = "all"
+    road: int | None = None
     latency: str = "none"
     latency_scale: float = 1.0
     seed: int = 0
@@ -155,7 +163,7 @@ class DrivingOptions(ConditionOptions):
         Raises:
             EvaluationError: There is no such route, or no file of routes.
         """
-        return routes_named(self.routes)
+        return routes_named(self.routes, road=self.road)
 
     @functools.cached_property
     def source(self) -> LatencySource:
@@ -232,18 +240,23 @@ class HighwayEvaluation(DrivingOptions):
         return self.driven_by(driver, self.folder)
 
 
-def routes_named(text: str, beside: Path = Path()) -> tuple[tuple[Route, ...], int]:
+def routes_named(
+    text: str, beside: Path = Path(), road: int | None = None
+) -> tuple[tuple[Route, ...], int]:
     """Return the routes asked for, and the size of the set they are from.
 
-    A file of routes is looked up in the folder ``beside``.
+    A file of routes is looked up in the folder ``beside``. Without ``road``, a file may
+    be of any, and all else is of the first.
 
     Raises:
         EvaluationError: There is no such route, or no file of routes.
     """
     if text.endswith(".json"):
-        routes = load_routes(beside / text)
+        routes = load_routes(beside / text, road)
         return routes, len(routes)
-    shipped = load_routes()
+    if road is not None:
+        check_road(road)
+    shipped = load_routes(SETS[road or 1], road)
     return pick_routes(shipped, text), len(shipped)
 
 

@@ -15,7 +15,14 @@ from me2e_compress.metrics.episode import Episode
 from me2e_compress.registry import documents
 from me2e_compress.registry.marks import IN_JSON
 from me2e_compress.runtime.atomic import write_json
-from me2e_compress.simulator.routes import Route, digest_of, is_route_id
+from me2e_compress.simulator.routes import (
+    ROAD_VERSION,
+    VERSION,
+    Route,
+    check_version,
+    digest_of,
+    is_route_id,
+)
 from me2e_compress.version import __version__
 
 MANIFEST = "evaluation.json"
@@ -31,9 +38,11 @@ LARGEST_SET = 1_000_000
 
 def fingerprint(job: Job, routes: Sequence[Route], set_size: int) -> dict[str, Any]:
     """Return everything that decides the bytes of the results."""
-    went_on = {"drive_on": True} if job.conditions.drive_on else {}
+    more: dict[str, Any] = {"drive_on": True} if job.conditions.drive_on else {}
+    if routes and routes[0].road == 2:
+        more[VERSION] = ROAD_VERSION
     return {
-        **went_on,
+        **more,
         "version": __version__,
         "policy": job.driver.fingerprint(),
         "latency": job.conditions.latency.to_json(),
@@ -189,9 +198,14 @@ def log_beside(folder: Path) -> Path:
 
 
 def _check_manifest(path: Path, made_by: object) -> None:
-    """Check the parts that are read: routes, which are file names, and set size."""
+    """Check the parts that are read: routes, which are file names, and set size.
+
+    Drives of another version of the second road are compared with none of this one.
+    """
     if not isinstance(made_by, dict) or not isinstance(made_by.get("routes"), list):
         raise EvaluationError(f"{path}: {MANIFEST} does not name its routes")
+    if VERSION in made_by:
+        check_version(path, made_by[VERSION])
     routes = made_by["routes"]
     for route in routes:
         if not isinstance(route, str) or not is_route_id(route):

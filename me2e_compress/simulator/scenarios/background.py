@@ -15,9 +15,9 @@ from me2e_compress.simulator.traffic.stage import Stage
 
 FAST_MPS = 13.5
 """Roads with a higher limit carry more traffic."""
-GAP_S, FAST_GAP_S = (5.5, 9.0), (3.5, 6.5)
-"""Mean time between two cars of a lane, by road class: 400 to 1030 vehicles an hour."""
-WALKER_EVERY_M = (16.0, 26.0)
+GAP_S, FAST_GAP_S = (6.5, 10.5), (3.5, 6.5)
+"""Mean time between two cars of a lane, by road class: 340 to 1030 vehicles an hour."""
+WALKER_EVERY_M = (11.0, 20.0)
 """Mean distance between two people beside the road."""
 CYCLIST = 0.25
 """Share of them who ride."""

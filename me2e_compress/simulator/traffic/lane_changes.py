@@ -19,6 +19,9 @@ JOIN_IMPOSED_MPS2 = 3.5
 """What somebody whose lane ends imposes on others: our choice."""
 NEAREST_M = 2.0
 """Gap between bumpers below which nobody changes."""
+SETTLED_M = 30.0
+"""Nobody changes nearer than this to the beginning of a lane, or in a junction: who
+comes up behind is on another lane yet."""
 SLOWEST_MPS = 1.0
 BRAKING_MPS2 = 3.0
 """Comfortable braking with which the ego is reckoned."""
@@ -35,7 +38,8 @@ def consider(car: Car, lane_s: float, wanted_mps2: float) -> float:
             return wanted_mps2
         end = car.network.length(car.lanes[-1]) - car.LENGTH / 2 - 2.0
         return min(wanted_mps2, car.idm_stop(max(end - lane_s, 0.1)))
-    if car.behaviour.changes_lanes:
+    begins = car.leg > 0 and lane_s < SETTLED_M
+    if car.behaviour.changes_lanes and not begins:
         _change(car, wanted_mps2)
     return wanted_mps2
 

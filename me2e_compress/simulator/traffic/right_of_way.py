@@ -31,6 +31,8 @@ HARDEST_MPS2 = 6.0
 """A red light stops who can brake no harder than this."""
 LINE_M = 4.0
 """Where who waits without a line stops, metres before a junction."""
+ENTRY_M = 4.0
+"""The ego enters all conflicts at once that begin this close to the first."""
 RECKLESS = -1
 """Rank of those who obey nothing: everybody else lets them pass."""
 
@@ -184,12 +186,16 @@ class RightOfWay:
         ]
 
     def soonest_s(self) -> float:
-        """Return the seconds until somebody with priority is where the ego goes.
+        """Return the seconds until somebody with priority is where the ego enters.
 
-        Who is there already is before the ego, and leaves.
+        Who is there already is before the ego, and leaves. Lanes that the ego crosses
+        later do not count.
         """
-        soonest = math.inf
-        for _, conflict in self.priority_over_ego():
+        soonest, meets = math.inf, self.priority_over_ego()
+        first = min((at for at, _ in meets), default=0.0)
+        for at, conflict in meets:
+            if at > first + ENTRY_M:
+                continue
             for user in self._users.get(conflict.other, ()):
                 nose, tail = user.at_m + user.length_m / 2, user.at_m
                 tail -= user.length_m / 2

@@ -37,7 +37,7 @@ Script = Iterator[None]
 """One actor script: resumed at every decision, it yields until the next one."""
 GOAL_M = 150.0
 """Length of a route; on the second road, without what is drawn before and after."""
-LEAD_M, AFTER_M = (25.0, 90.0), (25.0, 160.0)
+LEAD_M, AFTER_M = (25.0, 60.0), (25.0, 190.0)
 """Metres of the second road before the places of a scenario, and after them."""
 TRAFFIC = "traffic"
 """The parameter that, with the seed, decides all arrivals of the second road."""
@@ -86,7 +86,7 @@ class Stage(Draws):
             self.lead_m = self.uniform("lead_m", *LEAD_M)
             low, high = AFTER_M
             spread = self.uniform("after_share", 0.0, 1.0)
-            self.goal_m += self.lead_m + round(low + (high - low) * spread**2, 3)
+            self.goal_m += self.lead_m + round(low + (high - low) * spread**4, 3)
             self._traffic = self.integer(TRAFFIC, 0, 2**31 - 1)
             kind, strength = self.choice("weather", DRAWN), 0.0
             if kind != "clear":

@@ -17,6 +17,8 @@ from me2e_compress.simulator.traffic.right_of_way import RightOfWay
 
 FORESEEN_S = (1.0, 2.0, 3.0)
 """When drivers foresee people who cross, seconds from now."""
+INSIDE_M, ALONG_RAD = 0.6, 0.3
+"""The ego is wholly in a lane if it is so near to its centre and direction."""
 BESIDE_M = 0.25
 """Two bodies closer than this sideways are in each other's way."""
 
@@ -52,7 +54,20 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         self._row = {id(body): i for i, body in enumerate(self.vehicles)}
         self._s, self._r = self.table.coordinates(points)
         self._half = [body.WIDTH / 2 for body in self._bodies]
+        if self.rules is not None:
+            self._turn_objects()
         self._ego = [body.id == 0 for body in self._bodies]
+
+    def _turn_objects(self) -> None:
+        """Let what stands across a lane take the width that it takes there."""
+        first = len(self.vehicles)
+        s, r = self._s[first:], np.abs(self._r[first:])
+        along = self.table.headings(s)
+        r = np.where((s < 0) | (s > self.table.length), np.inf, r)
+        for row, body in enumerate(self.objects):
+            askew = body.heading - along[row, int(np.argmin(r[row]))]
+            cos, sin = abs(math.cos(askew)), abs(math.sin(askew))
+            self._half[first + row] = float(body.WIDTH * cos + body.LENGTH * sin) / 2
 
     def _with_crossers(self, points: Floats) -> Floats:
         """Add where people who cross will be: drivers stop for them in time."""
@@ -86,7 +101,9 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             here = k == 0 and chain is None
             own = float(self._r[row, column]) if here else 0.0
             for s, r, other in self._on_lane(column):
-                if other == row or s + offset <= 0 or (blind and self._ego[other]):
+                if other == row or s + offset <= 0:
+                    continue
+                if blind and self._ego[other] and not self._leads(car, r):
                     continue
                 room = self._half[other] + beside
                 if abs(r + car.offset_m) < room or (here and abs(r - own) < room):
@@ -97,6 +114,15 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             if offset > LOOK_AHEAD_M:
                 break
         return None
+
+    def _leads(self, car: Car, aside_m: float) -> bool:
+        """Return whether the ego drives in a lane in a car's direction, well inside.
+
+        On the second road even who does not mind the ego keeps the distance then.
+        """
+        turn = math.remainder(self.vehicles[0].heading - car.heading, math.tau)
+        inside = abs(aside_m) < INSIDE_M and abs(turn) < ALONG_RAD
+        return self.rules is not None and inside
 
     def _on_lane(self, column: int) -> list[tuple[float, float, int]]:
         """Return (arc length, right offset, row) of the bodies along a lane."""
@@ -112,9 +138,12 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         """Return who is behind a car in another lane, and the gap (m)."""
         row, column = self._row[id(car)], self.table.column[index]
         at, last = float(self._s[row, column]), None
+        blind = not car.behaviour.sees_ego
         for s, r, other in self._on_lane(column):
             if s >= at:
                 break
+            if blind and self._ego[other]:
+                continue
             if other != row and abs(r) < self._half[other] + 1.0:
                 last = s, other
         if last is None:
@@ -163,10 +192,10 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         pairs = list[tuple[RoadObject, RoadObject]]()
         first, second = (side.tolist() for side in np.nonzero(np.triu(near, 1)))
         for i, j in zip(first, second, strict=True):
-            if self.rules is not None and all(
-                isinstance(each, Walker) for each in (bodies[i], bodies[j])
-            ):
-                continue  # people step aside for each other
+            people = [isinstance(each, Walker) for each in (bodies[i], bodies[j])]
+            aside = all(people) or (any(people) and bodies[j] in self.objects)
+            if self.rules is not None and aside:
+                continue  # people step aside for each other, and round things
             if overlap(bodies[i], bodies[j]):
                 pairs.append((bodies[i], bodies[j]))
         return pairs

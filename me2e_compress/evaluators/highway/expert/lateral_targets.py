@@ -21,6 +21,8 @@ CHAIN_M = 14.0
 """Obstacles closer to each other than this are passed in one go."""
 CLEAR_S = 1.0
 """Time to spare between the return and the oncoming car."""
+FACING = 0.75
+"""Who is so many lanes from the middle of the oncoming lane is beside the road."""
 PASS_MPS2 = 1.8
 """Acceleration while passing."""
 
@@ -130,8 +132,8 @@ def gap_for_passing(
     # when oncoming cars reach the end of that stretch
     gap = seen.along_m[:, 0] - place.s_m
     coming = (np.cos(seen.away[:, 0]) < -0.5) & (seen.speed_mps.max(axis=1) > 0.5)
-    coming &= np.abs(seen.lateral_m[:, 0] - left_m - lane_m / 2) < lane_m
-    coming &= gap > -2.0
+    coming &= np.abs(seen.lateral_m[:, 0] - left_m - lane_m / 2) < FACING * lane_m
+    coming &= (gap > -2.0) & ~seen.walks
     closing = np.maximum(seen.speed_mps.max(axis=1), 3.0)
     arrival = (gap - seen.length / 2 - distance) / closing
     return bool(np.all(arrival[coming] > seconds + CLEAR_S))

@@ -4,7 +4,12 @@ from me2e_compress.simulator.scenarios.layouts.circle import ring_way
 from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
 from me2e_compress.simulator.scenarios.layouts.ramps import Ramp
 from me2e_compress.simulator.scenarios.layouts.road import BEFORE_M, Street
-from me2e_compress.simulator.scenarios.scripts.streams import across
+from me2e_compress.simulator.scenarios.scripts.streams import (
+    Traffic,
+    across,
+    encounter,
+    stream,
+)
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
     arrive_together,
     meeting,
@@ -119,7 +124,9 @@ def bay_flow(stage: Stage, street: Street) -> Script:
     chain = street.ahead()
     route_s, _ = meeting(stage, chain)
     if stage.schedule is not None:
-        yield from across(stage, chain, route_s, "bay_flow")
+        gap = stage.uniform("bay_flow_gap_s", 3.0, 5.0)
+        cars = stream(stage, "bay_flow", [chain], Traffic(gap, (5.0, 7.5), 0.4))
+        yield from encounter(stage, cars, route_s, "bay_flow")
         return
     begin = BEFORE_M - stage.uniform("behind_m", 3.0, 6.0)
     lead = stage.car(chain, begin, 3.0, behaviour=HEEDLESS)
@@ -181,7 +188,7 @@ def _beside(
     On the second road cars come by all the time.
     """
     if stage.schedule is not None:
-        yield from across(stage, chain, change_s, name)
+        yield from across(stage, chain, change_s, name, (2.5, 4.0))
         return
     speed = float(stage.ego.speed)
     aside = stage.uniform("beside_m", -1.5, 1.5)

@@ -107,8 +107,16 @@ def queue_cut_in(stage: Stage, street: Street) -> Script:
 def ramp_cut_in(stage: Stage, ramp: Ramp) -> Script:
     """Merge a car from the on-ramp right in front of the ego, at a crawl."""
     if stage.schedule is not None:
-        gap = stage.uniform("ramp_gap_s", 3.0, 5.5)
-        traffic = Traffic(gap, joins=tuple(ramp.main.ahead()))
+        gap, slow = (
+            stage.uniform("ramp_gap_s", 3.0, 5.5),
+            stage.uniform("ramp_mps", 5, 8),
+        )
+        traffic = Traffic(
+            gap,
+            (slow, slow + 1.0),
+            joins=tuple(ramp.main.ahead()),
+            blind_to_ego=0.5,
+        )
         cars = stream(stage, "ramp_cut_in", [ramp.ramp], traffic)
         joint = stage.network.pose(ramp.ramp[-1], 30.0)
         s, _ = stage.path.project(joint.x, joint.y)

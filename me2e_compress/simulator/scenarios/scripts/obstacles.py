@@ -1,6 +1,7 @@
 """Things in the way: accidents, road works, parked cars, doors, slow cyclists."""
 
 from me2e_compress.simulator.scenarios.layouts.road import BEFORE_M, Street
+from me2e_compress.simulator.scenarios.scripts.streams import Traffic, stream
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
     NEAR_M,
     approach,
@@ -8,7 +9,7 @@ from me2e_compress.simulator.scenarios.scripts.synchronise import (
     met,
 )
 from me2e_compress.simulator.scene import ActorKind
-from me2e_compress.simulator.traffic.cars import Car
+from me2e_compress.simulator.traffic.cars import Behaviour, Car
 from me2e_compress.simulator.traffic.network import LANE_WIDTH_M
 from me2e_compress.simulator.traffic.stage import Script, Stage
 
@@ -59,6 +60,10 @@ def parked_car(stage: Stage, street: Street) -> Script:
     yield from met(stage, s, "parked_car")
 
 
+TOGETHER = Behaviour(headway_s=0.4, jam_gap_m=1.5)
+"""Cyclists of the second road stay a row that is as short as it begins."""
+
+
 def slow_cyclists(stage: Stage, street: Street) -> Script:
     """Drive cyclists in a row, on the right part of the lane."""
     count = stage.integer("cyclists", 2, 4)
@@ -66,9 +71,12 @@ def slow_cyclists(stage: Stage, street: Street) -> Script:
     first = stage.uniform("cyclist_gap_m", 26.0, 34.0)
     last: Car | None = None
     keep_clear(stage, street.ahead(), first + 60.0)
+    mind = None if stage.schedule is None else TOGETHER
     for k in range(count):
         s = BEFORE_M + first + 4.5 * k
-        rider = stage.car(street.ahead(), s, speed, speed, ActorKind.BICYCLE)
+        rider = stage.car(
+            street.ahead(), s, speed, speed, ActorKind.BICYCLE, behaviour=mind
+        )
         rider.offset_m = -0.8
         right = rider.pose.moved(0.0, -0.8)
         rider.position[:] = (right.x, -right.y)
@@ -134,12 +142,18 @@ def neighbours(stage: Stage, street: Street) -> Script:
     yield
 
 
+ONCOMING_S = (16.0, 24.0)
+"""Mean gap of the oncoming traffic of the second road where one must overtake."""
+
+
 def oncoming_cars(stage: Stage, street: Street) -> Script:
     """Drive a few cars in the other direction, and then none.
 
-    The second road has traffic without it.
+    On the second road they come all the time, with gaps in which one can overtake.
     """
     if stage.schedule is not None:
+        traffic = Traffic(stage.uniform("oncoming_gap_s", *ONCOMING_S), platoons=0.6)
+        stream(stage, "oncoming", [street.oncoming()], traffic)
         return
     count = stage.integer("oncoming", 1, 3)
     chain = street.oncoming()

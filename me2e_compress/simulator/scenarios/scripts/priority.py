@@ -11,6 +11,7 @@ from me2e_compress.simulator.scenarios.scripts.streams import (
 )
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
     hold,
+    keep_clear,
     met,
     nearest_station,
     patience,
@@ -73,7 +74,7 @@ def invader(stage: Stage, street: Street) -> Script:
     chain = street.oncoming()
     total = sum(stage.network.length(index) for index in chain)
     if stage.schedule is not None:
-        yield from _invaders(stage, chain)
+        yield from _invaders(stage, street)
         return
     where = stage.uniform("meet_m", 55.0, 75.0)
     away = stage.uniform("away_m", 50.0, 60.0)
@@ -103,17 +104,24 @@ def invader(stage: Stage, street: Street) -> Script:
     car.forced_mps2, car.offset_m = None, 0.0
 
 
-INVADING = 0.4
-"""Share of the oncoming cars of the second road that drive partly in the ego's lane."""
+INVADING, INTO_M = 0.4, (0.9, 1.2)
+"""Share of the oncoming cars of the second road that drive partly in the ego's lane,
+and how far they reach into it."""
+ASIDE_M = 1.1
+"""How far right of its lane's centre traffic keeps there, to have room."""
 
 
-def _invaders(stage: Stage, chain: list[LaneIndex]) -> Script:
+def _invaders(stage: Stage, street: Street) -> Script:
     """Drive oncoming traffic, a share of it partly in the ego's lane."""
     gap, random = stage.uniform("oncoming_gap_s", 4.0, 7.0), stage.random("invaders")
-    cars = stream(stage, "oncoming", [chain], Traffic(gap))
+    keep_clear(stage, street.ahead(), 60.0)
+    for car in stream(stage, "same_way", [street.ahead()], Traffic(2 * gap)):
+        car.offset_m = -ASIDE_M
+    cars = stream(stage, "oncoming", [street.oncoming()], Traffic(gap))
     invaders = [car for car in cars if random.random() < INVADING]
     for car in invaders:
-        car.offset_m = LANE_WIDTH_M - float(random.uniform(1.4, 2.0))
+        into = float(random.uniform(*INTO_M))
+        car.offset_m = (LANE_WIDTH_M - car.WIDTH) / 2 + into
         car.behaviour = replace(car.behaviour, sees_ego=False)
     yield from encounter(stage, invaders, None, "invader")
 
@@ -156,29 +164,25 @@ def emergency_behind(stage: Stage, street: Street) -> Script:
     passed[0] = True
 
 
-HELD_UP_M, HELD_UP_S = 20.0, 5.0
+SPARSE_S = 20.0
+"""Mean gap in the ego's lane where an emergency vehicle comes: others make room."""
+HELD_UP_M, HELD_UP_S = 20.0, 4.0
 """The ego has not yielded if the vehicle was this close behind for this long, and still
 is behind at the end: on the second road it may come too late to be let by."""
 
 
 def _emergency_comes(stage: Stage, lanes: list[LaneIndex]) -> Script:
-    """Let an emergency vehicle come from behind at a time that is drawn."""
-    at = stage.uniform("comes_s", 0.5, 8.0)
+    """Let an emergency vehicle come from behind, from a place that is drawn."""
     mind = Behaviour(
-        3.5,
-        headway_s=0.5,
-        jam_gap_m=4.0,
-        obeys_limits=False,
-        obeys_rules=False,
-        changes_lanes=True,
+        3.5, headway_s=0.5, jam_gap_m=4.0, obeys_limits=False, obeys_rules=False
     )
-    car = stage.coming(lanes, 0.0, 15.0, 18.0, ActorKind.EMERGENCY, mind)
-    if stage.schedule is not None:
-        stage.schedule.add(at, car)
+    begin = BEFORE_M - stage.uniform("behind_m", 24.0, 56.0)
+    car = stage.car(lanes, begin, 16.0, 20.0, ActorKind.EMERGENCY, mind)
+    stream(stage, "same_way", [lanes], Traffic(SPARSE_S))
     held = [0.0]
 
     def judge() -> Event | None:
-        if held[0] < HELD_UP_S or car.road is None or stage.gap_m(car) > 0:
+        if held[0] < HELD_UP_S or stage.gap_m(car) > 0:
             return None
         return stage.event(EventKind.YIELD_EMERGENCY, "it was held up", car)
 
@@ -186,7 +190,7 @@ def _emergency_comes(stage: Stage, lanes: list[LaneIndex]) -> Script:
     fired = False
     while True:
         yield
-        if car.road is None or not -HELD_UP_M < stage.gap_m(car) < 0:
+        if not -HELD_UP_M < stage.gap_m(car) < 0:
             continue
         held[0] += 0.1
         if not fired:

@@ -10,17 +10,22 @@ from me2e_compress.simulator.scene import ActorKind
 from me2e_compress.simulator.traffic.bodies import Walker
 from me2e_compress.simulator.traffic.cars import Behaviour, Car
 from me2e_compress.simulator.traffic.network import LaneIndex
+from me2e_compress.simulator.traffic.right_of_way import DECIDE_M
 from me2e_compress.simulator.traffic.schedule import arrival_times, is_free
 from me2e_compress.simulator.traffic.stage import Script, Stage
 
 HEEDLESS, SLOW = 0.12, 0.15
 """Shares of drivers who follow closely and take short gaps, and of slow ones: our
 choice."""
+BLIND_TO_EGO = 0.4
+"""Share of drivers of a conflict who do not make room for an ego that comes in."""
 TURNING = 0.4
 """Share of traffic that turns at a junction."""
-EGO_M, OTHER_M = 25.0, 10.0
-"""The ego and another meet if each is this close to the place of the conflict; the ego
-waits before it."""
+AHEAD_M, BEHIND_M, OTHER_M = 25.0, 8.0, 10.0
+"""The ego and another meet if one is so far before or after the place of the conflict,
+the other so near to it: the ego waits at a line before it."""
+END_M = 12.0
+"""Nobody begins so near to the end of the map."""
 EGO_ROOM_M = 14.0
 """Nobody begins nearer to the ego, bumper to bumper."""
 
@@ -35,6 +40,7 @@ class Traffic:
         platoons: Share of arrivals that lead a platoon.
         reckless: Share of drivers who obey neither lights nor signs.
         joins: The chain that they join where their lane ends.
+        blind_to_ego: Share of drivers who do not mind the ego.
     """
 
     gap_s: float
@@ -42,6 +48,7 @@ class Traffic:
     platoons: float = 0.25
     reckless: float = 0.0
     joins: tuple[LaneIndex, ...] = ()
+    blind_to_ego: float = 0.0
 
 
 def stream(
@@ -58,7 +65,7 @@ def stream(
     schedule.claimed.append(entry)
     low, high = traffic.speed or (0.0, 0.0)
     usual = (low + high) / 2 or 0.85 * float(network.lane(entry).speed_limit)
-    free_m = _before_junction(stage, chains[0]) - 12.0
+    free_m = _free_m(stage, chains[0])
     weights = np.array([_weight(stage, chain, chains) for chain in chains])
     clear = stage.clear.get(entry, (0.0, 0.0))
     cars = list[Car]()
@@ -109,17 +116,22 @@ def _driver(
     wanted = float(wanted)
     car = stage.coming(chain, s_m, wanted, wanted, vehicle, mind)
     car.joins = list(traffic.joins) or None
+    if traffic.blind_to_ego and random.random() < traffic.blind_to_ego:
+        car.behaviour = replace(mind, sees_ego=False)
     return car
 
 
-def _before_junction(stage: Stage, chain: Sequence[LaneIndex]) -> float:
-    """Return the length of a chain up to the first junction."""
+def _free_m(stage: Stage, chain: Sequence[LaneIndex]) -> float:
+    """Return how far on a chain cars may be as a route begins.
+
+    Nobody is so near to a junction that it is too late to decide.
+    """
     length = 0.0
     for index in chain:
         if index in stage.network.ranks:
-            break
+            return length - DECIDE_M
         length += stage.network.length(index)
-    return length
+    return length - END_M
 
 
 def _weight(
@@ -140,12 +152,17 @@ def _has_room(stage: Stage, car: Car) -> bool:
 
 
 def across(
-    stage: Stage, chain: Sequence[LaneIndex], route_s: float, name: str
+    stage: Stage,
+    chain: Sequence[LaneIndex],
+    route_s: float,
+    name: str,
+    gap_s: tuple[float, float] = (5.0, 9.0),
 ) -> Script:
     """Drive traffic that the ego's route crosses or joins; see `encounter`."""
-    reckless = 0.6 if name == "crossing_car" else 0.0
-    gap = stage.uniform(f"{name}_gap_s", 4.0, 7.0)
-    cars = stream(stage, name, [chain], Traffic(gap, reckless=reckless))
+    reckless = 0.45 if name == "crossing_car" else 0.0
+    gap = stage.uniform(f"{name}_gap_s", *gap_s)
+    traffic = Traffic(gap, reckless=reckless, blind_to_ego=BLIND_TO_EGO)
+    cars = stream(stage, name, [chain], traffic)
     yield from encounter(stage, cars, route_s, name)
 
 
@@ -160,7 +177,7 @@ def encounter(
     while True:
         yield
         at = place or stage.ego.pose
-        if route_s is not None and abs(stage.ahead_m(route_s)) > EGO_M:
+        if route_s is not None and not -BEHIND_M < stage.ahead_m(route_s) < AHEAD_M:
             continue
         for body in others:
             x, y = body.position
@@ -176,7 +193,7 @@ TRIGGERED = (
     *("CrossingBicycleFlow", "VehicleTurningRoute", "VehicleTurningRoutePedestrian"),
 )
 """Types in which somebody waits for the ego, as in scenario_runner."""
-TRIGGER_M, DELAY_S = (14.0, 32.0), (0.0, 1.5)
+TRIGGER_M, DELAY_S = (18.0, 36.0), (0.0, 1.0)
 """Where the ego sets off what waits for it, and how long that still waits.
 scenario_runner's actors start when the ego is within a distance; ours is drawn."""
 
