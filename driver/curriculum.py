@@ -1,6 +1,6 @@
 """Courses of training: rounds of driving and learning, in full and in small."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
@@ -14,6 +14,8 @@ from me2e_compress.errors import TrainingError
 HELD_OUT_FIRST, HELD_OUT_EVERY = 7, 28
 """Which of the expert's episodes are held out: one of every other type, where there
 are 14 of each."""
+SEEDS_APART = 1000
+"""Between two seeds of a course, for its stages count from theirs."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Course:
         rounds: in order.
         trial: what the driver drives after every round, for the log.
         config: sizes of the model.
+        road: generation of the road that is driven.
 
     Raises:
         TrainingError: no driver for a round, a round without training, or a trial on
@@ -70,6 +73,7 @@ class Course:
     rounds: tuple[Round, ...]
     trial: Trial = field(default_factory=Trial)
     config: HighwayConfig = field(default_factory=HighwayConfig)
+    road: int = 1
 
     def __post_init__(self) -> None:
         """Check the rounds."""
@@ -86,14 +90,22 @@ class Course:
 
     def on(self, workers: int) -> Self:
         """Return the course with at most so many processes in training."""
+        return self._training(
+            lambda each: replace(each, workers=min(workers, each.workers))
+        )
+
+    def seeded(self, seed: int) -> Self:
+        """Return the course with other random weights and samples; 0 changes nothing.
+
+        The routes are the same: what the expert alone drives has the same bytes.
+        """
+        return self._training(
+            lambda each: replace(each, seed=each.seed + SEEDS_APART * seed)
+        )
+
+    def _training(self, change: Callable[[Training], Training]) -> Self:
         rounds = tuple(
-            replace(
-                each,
-                trainings=tuple(
-                    replace(training, workers=min(workers, training.workers))
-                    for training in each.trainings
-                ),
-            )
+            replace(each, trainings=tuple(map(change, each.trainings)))
             for each in self.rounds
         )
         return replace(self, rounds=rounds)

@@ -1,6 +1,6 @@
 """Train the driver from nothing.
 
-    python -m driver.train -o FOLDER [--workers N] [--small] [--json]
+    python -m driver.train -o FOLDER [--road 2] [--seed N] [--workers N] [--small]
 
 The same command again goes on where it was interrupted.
 """
@@ -24,11 +24,16 @@ Small = Annotated[
     bool, typer.Option("--small", help="every part, a minute, learns nothing")
 ]
 
+Road = Annotated[int, typer.Option(help="the generation of the road: 1 or 2")]
+Seed = Annotated[int, typer.Option(help="of the first weights, not of the routes")]
+
 
 def command(
     output: Output,
     workers: given.Workers = 4,
     small: Small = False,
+    road: Road = 1,
+    seed: Seed = 0,
     json: given.Json = False,
 ) -> None:
     """Train the driver from nothing: collect, learn, drive, learn again (hours)."""
@@ -36,7 +41,7 @@ def command(
     from driver.workflow import train  # takes torch seconds to import
 
     with listening(stages=True) as listener:
-        found = train(output, workers, listener, small=small)
+        found = train(output, workers, listener, small=small, road=road, seed=seed)
     show(found)
 
 

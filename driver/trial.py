@@ -27,7 +27,7 @@ OnDone = Callable[[int, int], None]
 
 
 def routes_of(
-    what: Trial, path: Path, workers: int, on_done: OnDone
+    what: Trial, path: Path, workers: int, on_done: OnDone, road: int = 1
 ) -> tuple[Route, ...]:
     """Return the routes of a trial, from its file once they were found.
 
@@ -36,17 +36,19 @@ def routes_of(
         path: their manifest; written if it is not there.
         workers: processes.
         on_done: called with the types done and their total.
+        road: generation of their road.
 
     Raises:
         TrainingError: one of them is a route that ships: those are for evaluation.
         EvaluationError: a type has no such routes, or the manifest is not one.
     """
     if path.exists():
-        return load_routes(path)
+        return load_routes(path, road)
     types = what.scenarios or tuple(SCENARIO_ABILITIES)
     variants = -(-what.routes // len(types))
     found = list[Route]()
-    for done, harvest in enumerate(generate(what.seed, types, variants, workers), 1):
+    harvests = generate(what.seed, types, variants, workers, road)
+    for done, harvest in enumerate(harvests, 1):
         found += harvest.routes
         on_done(done, len(types))
     refuse_shipped("trial", what.seed, [(e.scenario, e.seed) for e in found])

@@ -6,7 +6,8 @@ from pathlib import Path
 from driver.course import NO_LATENCY, RoundResult, run
 from driver.curriculum import FULL, SMALL, SMALL_LATENCY
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.workflows.checks import check_folder
+from me2e_compress.simulator.routes import check_road
+from me2e_compress.workflows.checks import check_count, check_folder
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, number, table
@@ -69,6 +70,8 @@ def train(
     listener: Listener = SILENT,
     *,
     small: bool = False,
+    road: int = 1,
+    seed: int = 0,
 ) -> TrainResult:
     """Train the driver ``highway``: collect, learn, drive, learn again (hours).
 
@@ -77,14 +80,20 @@ def train(
         workers: processes.
         listener: is called with progress and warnings.
         small: go through every part in a minute, and learn nothing.
+        road: generation of the road that is driven.
+        seed: of the first weights and of the samples' order, not of the routes.
 
     Raises:
         TrainingError: the folder is of another course, or a part failed.
+        EvaluationError: there is no such road.
         GraphError: the folder is a file.
     """
     output = Path(output)
     check_folder(output, ())
+    check_road(road)
+    check_count("--seed", seed)
     course, latency = (SMALL, SMALL_LATENCY) if small else (FULL, NO_LATENCY)
+    course = dataclasses.replace(course.seeded(seed), road=road)
     with writing(folders=[output]):
         return TrainResult(run(course, output, workers, listener, latency))
 

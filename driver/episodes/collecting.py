@@ -152,7 +152,9 @@ def episode_of(
     Raises:
         TrainingError: The student failed.
     """
-    recording = RecordingPolicy(what.seed, what.noise, what.expert_share, student)
+    recording = RecordingPolicy(
+        what.seed, what.noise, what.expert_share, student, cameras_only=what.road == 2
+    )
     route = task.route()
     episode = drive(route, recording, Conditions(image_size=what.image_size))
     if episode.ending is Ending.POLICY_FAILED or recording.world is None:

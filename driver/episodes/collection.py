@@ -27,6 +27,8 @@ class Collection:
             the others; 1 without a student.
         student: sha256 of the student's file, None without one.
         scenarios: The types; empty for all 44.
+        road: Generation of the road; on the second the expert knows what the cameras
+            show, and no more.
 
     Raises:
         TrainingError: A value is out of range.
@@ -40,6 +42,7 @@ class Collection:
     expert_share: float = 1.0
     student: str | None = None
     scenarios: tuple[str, ...] = ()
+    road: int = 1
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -74,15 +77,17 @@ class Task:
         scenario: Its type.
         seed: Of its parameters.
         name: Its id, and the name of its file.
+        road: Generation of the road.
     """
 
     scenario: str
     seed: int
     name: str
+    road: int = 1
 
     def route(self) -> Route:
         """Propose the route."""
-        return propose(self.scenario, self.seed, self.name)
+        return propose(self.scenario, self.seed, self.name, self.road)
 
 
 def tasks_of(what: Collection) -> tuple[Task, ...]:
@@ -92,7 +97,7 @@ def tasks_of(what: Collection) -> tuple[Task, ...]:
         TrainingError: One of them is a route that ships: those are for judging.
     """
     tasks = tuple(
-        Task(scenario, seed, f"{scenario}_{what.seed}_{variant:03d}")
+        Task(scenario, seed, f"{scenario}_{what.seed}_{variant:03d}", what.road)
         for variant in range(what.variants)
         for scenario in what.scenarios or SCENARIO_ABILITIES
         for seed in (seed_of(what.seed, scenario, variant),)

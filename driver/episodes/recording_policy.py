@@ -24,7 +24,7 @@ from me2e_compress.evaluators.highway.expert.expert_policy import (
     decide,
 )
 from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
-from me2e_compress.evaluators.highway.observe import scene_and_world
+from me2e_compress.evaluators.highway.observe import scene_and_world, seen
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.privileged import Phase
 from me2e_compress.simulator.scene import Scene
@@ -157,6 +157,7 @@ class RecordingPolicy:
         noise: Strength of the noise on the driven plan, see `Perturbation`.
         expert_share: Share of the 2 s turns in which the expert drives.
         student: Who drives in the others; None if the expert always does.
+        cameras_only: Whether the expert knows only what the cameras show.
 
     Attributes:
         frames: Of the present route.
@@ -167,6 +168,7 @@ class RecordingPolicy:
     noise: float = 1.0
     expert_share: float = 1.0
     student: Policy | None = None
+    cameras_only: bool = False
     privileged: bool = field(default=True, init=False)
     frames: list[LabelledFrame] = field(default_factory=list, init=False)
     world: World | None = field(default=None, init=False)
@@ -195,8 +197,9 @@ class RecordingPolicy:
         if self.world is None:
             self.world, self.top = world, ceiling(world.path)
         memory = self.frames[-1].decision.memory if self.frames else Memory()
-        known = world.privileged()
-        decision = decide(scene, known, world.path, self.top, memory)
+        shown = seen(scene) if self.cameras_only else scene
+        known = world.privileged([actor.id for actor in shown.actors])
+        decision = decide(shown, known, world.path, self.top, memory)
         self.frames.append(
             LabelledFrame(scene, known.phases, observation.command, memory, decision)
         )

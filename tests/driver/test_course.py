@@ -41,9 +41,9 @@ pytestmark = pytest.mark.xdist_group("small-course")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the command comes to, never interrupted."""
     folder = tmp_path_factory.mktemp("course") / "driver"
-    words = ("train", "highway", "--small", "--workers", str(WORKERS), "-o")
+    words = ("--small", "--workers", str(WORKERS), "-o")
     subprocess.run(
-        [sys.executable, "-m", "me2e_compress", *words, folder],
+        [sys.executable, "-m", "driver.train", *words, folder],
         check=True,
         capture_output=True,
     )
@@ -190,6 +190,15 @@ def test_killed_in_every_part_it_comes_to_the_same_driver(
     finish(folder, 2)
     drivers = [place / "round-1" / "driver.onnx" for place in (folder, small)]
     assert drivers[0].read_bytes() == drivers[1].read_bytes()
+
+
+def test_another_seed_draws_other_weights_for_every_stage_and_the_same_routes() -> None:
+    other = FULL.seeded(1)
+    before = [one.seed for each in FULL.rounds for one in each.trainings]
+    after = [one.seed for each in other.rounds for one in each.trainings]
+    assert not set(before) & set(after)
+    assert [each.seed for each in other.rounds] == [each.seed for each in FULL.rounds]
+    assert FULL.seeded(0) == FULL
 
 
 def test_more_workers_than_it_trains_with_do_not_matter() -> None:
