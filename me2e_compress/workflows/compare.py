@@ -135,6 +135,7 @@ def compare(
     alive: float = ALIVE,
     provider: Provider = CPU,
     adapter: str | Path | None = None,
+    module_map: str | Path | None = None,
 ) -> CompareResult:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres.
 
@@ -162,7 +163,7 @@ def compare(
     # each graph must take the frames, and open in another process first
     for path in dict.fromkeys(paths):
         loaded = LoadedModel.load(path)
-        said[path] = adapted(loaded.model, adapter)
+        said[path] = adapted(loaded.model, adapter, module_map)
         models.append(loaded.model)
         recording.check(loaded.model)
         try_model(loaded, listener, provider, recording)

@@ -117,6 +117,7 @@ def compare_dump(
     float_graph: str | Path | None = None,
     provider: Provider = CPU,
     adapter: str | Path | None = None,
+    module_map: str | Path | None = None,
 ) -> DumpResult:
     """Hold what an engine answered over frames against the graph it was built from.
 
@@ -137,7 +138,7 @@ def compare_dump(
     recording, answered = CalibrationSet(Path(frames)), EngineDump(dump)
     answered.check(recording)
     loaded = LoadedModel.load(path)
-    said = adapted(loaded.model, adapter)
+    said = adapted(loaded.model, adapter, module_map)
     recording.check(loaded.model)
     notes = _checked_names(answered, loaded)
     try_model(loaded, listener, provider, recording)

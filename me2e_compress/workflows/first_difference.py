@@ -124,6 +124,7 @@ def first_difference(
     most_frames: int = FRAMES,
     provider: Provider = CPU,
     adapter: str | Path | None = None,
+    module_map: str | Path | None = None,
 ) -> FirstDifferenceResult:
     """Find the first module and node after which the second graph differs.
 
@@ -148,7 +149,7 @@ def first_difference(
         if loaded.first_files:
             names = ", ".join(loaded.first_files)
             raise GraphError(f"{path}: {names} run at first frames alone: name a file")
-        adapted(loaded.model, adapter)
+        adapted(loaded.model, adapter, module_map)
         recording.check(loaded.model)
         try_model(loaded, listener, provider, recording)
         models[path] = _with_modules(loaded.model)

@@ -74,7 +74,7 @@ def inspect(
     if frames is not None:
         taken = _timed(path, module_map, frames, listener, adapter)
     loaded = graph.LoadedModel.load(path)
-    adapted(loaded.model, adapter)
+    adapted(loaded.model, adapter, module_map)
     modules = load_map(module_map, loaded.model)
     found = inspected(path, loaded.model, modules, dims, process, taken)
     return found if loaded.stack is None else _with_joints(found, loaded.stack)

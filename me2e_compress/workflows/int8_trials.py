@@ -102,7 +102,7 @@ class TrialFiles:
         rules, place = RULE_SETS.parse(options.rules), TARGETS.parse(target)
         read = graph.LoadedModel.load(self.model)
         loaded = read.model
-        adapted(loaded, options.adapter)
+        adapted(loaded, options.adapter, options.module_map)
         recording = recording_of(read, self.frames, options.provider)
         scheme = QuantScheme.named(options.scheme, load_map(options.module_map, loaded))
         # the graph is opened and prepared once; every trial starts from there

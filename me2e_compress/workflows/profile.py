@@ -122,7 +122,7 @@ def profile(
         # each measurement has inferences of its own: the profiler takes time itself
         recording = CalibrationSet(Path(frames))
         loaded = graph.LoadedModel.load(source)
-        said = adapted(loaded.model, options.adapter)
+        said = adapted(loaded.model, options.adapter, options.module_map)
         trace = _measured(loaded, said, recording, options, listener)
         operators: Microseconds = {}
         if options.by_module or figure is not None:
