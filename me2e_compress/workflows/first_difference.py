@@ -34,20 +34,7 @@ class FirstDifferenceResult(Result):
     @property
     def headline(self) -> str:
         """The first wrong module and node."""
-        found, first = self.found, self.found.first
-        if first is not None:
-            return _told(first, found)
-        if not found.different:
-            return (
-                f"no difference: {counted(found.compared, 'value')} at"
-                f" {found.floor_db:g} dB or more"
-            )
-        of = f"{found.different} of {counted(found.compared, 'value')}"
-        if found.outputs_differ:
-            end = "every place that was tried is right on equal inputs: rounding grew"
-        else:
-            end = "none of that reaches an output"
-        return f"{of} are below {found.floor_db:g} dB, but {end}"
+        return told_of(self.found)
 
     def tables(self) -> tuple[Table, ...]:
         """Return the places, and what every module was given and gave."""
@@ -96,6 +83,23 @@ class FirstDifferenceResult(Result):
     def to_json(self) -> object:
         """Return all that was found."""
         return dataclasses.asdict(self.found)
+
+
+def told_of(found: FirstDifference) -> str:
+    """Name the first wrong module and node, or say that there is none."""
+    if found.first is not None:
+        return _told(found.first, found)
+    if not found.different:
+        return (
+            f"no difference: {counted(found.compared, 'value')} at"
+            f" {found.floor_db:g} dB or more"
+        )
+    of = f"{found.different} of {counted(found.compared, 'value')}"
+    if found.outputs_differ:
+        end = "every place that was tried is right on equal inputs: rounding grew"
+    else:
+        end = "none of that reaches an output"
+    return f"{of} are below {found.floor_db:g} dB, but {end}"
 
 
 def _told(first: Place, found: FirstDifference) -> str:
@@ -152,7 +156,7 @@ def first_difference(
         adapted(loaded.model, adapter, module_map)
         recording.check(loaded.model)
         try_model(loaded, listener, provider, recording)
-        models[path] = _with_modules(loaded.model)
+        models[path] = with_modules(loaded.model)
     # the source runs once, then the other graph
     shown = tuple(itertools.islice(recording, most_frames))
     listener.on_progress("sketches", 0, 2, str(paths[0]))
@@ -163,7 +167,7 @@ def first_difference(
     return FirstDifferenceResult(*paths, found)
 
 
-def _with_modules(model: ir.Model) -> ir.Model:
+def with_modules(model: ir.Model) -> ir.Model:
     """Write the module of every node into its metadata, where it does not stand yet."""
     if provenance.missing(model):
         try:
