@@ -169,7 +169,7 @@ def hosts(stack: str) -> dict[str, Host]:
         ),
         "big endian": Host(("dtype",), read=reading(small, lambda x: x.byteswap())),
         "output channels last": Host(("layout",), read=reading(large, channels_last)),
-        "output transposed, shape kept": Host(
+        "output transposed but shaped as before": Host(
             ("layout",),
             read=reading(large, lambda x: channels_last(x).reshape(x.shape)),
         ),
