@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -94,7 +95,7 @@ class ErrorSources:
         self, t: Tape, node: ir.Node, g: ir.Value, rank: int
     ) -> ir.Value:
         """Write what the rounding of a weight does: a product as the layer's own."""
-        name = str(node.outputs[0].name)
+        name = self.layers[node.outputs[0]]
         at, weight = self.decisions[name].weight or 0, self.weights[name]
         near, exact = _stored(weight), array_of(node.inputs[at])
         inputs = list(node.inputs[:2])
@@ -108,6 +109,19 @@ class ErrorSources:
         effect = t.times(g, t.op(node.op_type, inputs, node.attributes))
         along = [axis for axis in range(rank) if axis != channel]
         return _summed(t, t.total(effect, along, keep=False))
+
+    def moved(self, copies: Mapping[ir.Value, ir.Value]) -> Self:
+        """Return these places where their values were computed again."""
+
+        def new(value: ir.Value) -> ir.Value:
+            return copies.get(value, value)
+
+        return dataclasses.replace(
+            self,
+            probes={new(value): each for value, each in self.probes.items()},
+            grids={new(value): each for value, each in self.grids.items()},
+            layers={new(value): each for value, each in self.layers.items()},
+        )
 
     def behind(self, missing: Mapping[ir.Value, str]) -> dict[str, str]:
         """Return the layers whose gradient lacks a part, with the reasons."""
