@@ -6,6 +6,7 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.fidelity.compare import Fidelity, common_adapter
 from me2e_compress.fidelity.compare import compare as measure
@@ -19,7 +20,10 @@ from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack_session import open_session
-from me2e_compress.workflows.checks import adapted, check_number, model_path
+from me2e_compress.workflows.checks import (
+    check_number,
+    model_path,
+)
 from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, counted, table

@@ -10,6 +10,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
 from me2e_compress.driving.adapter.image_inputs import IMAGE, ImageNormalization
+from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.fidelity.dump_readings import HIGHEST_DB
 from me2e_compress.fidelity.engine_loss import OutputLoss, losses
@@ -24,7 +25,9 @@ from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack_session import open_session
 from me2e_compress.targets.quantized import describe_quantized
-from me2e_compress.workflows.checks import adapted, model_path
+from me2e_compress.workflows.checks import (
+    model_path,
+)
 from me2e_compress.workflows.compress_result import beside
 from me2e_compress.workflows.first_difference import told_of, with_modules
 from me2e_compress.workflows.first_opening import try_model

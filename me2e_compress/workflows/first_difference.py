@@ -8,13 +8,17 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import GraphError, ModuleMapError
 from me2e_compress.fidelity.first_difference import FirstDifference, Source
 from me2e_compress.fidelity.places import Place
 from me2e_compress.graph import LoadedModel, provenance
 from me2e_compress.graph.modules import ModuleMap, assign, map_of
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.workflows.checks import adapted, check_count, model_path
+from me2e_compress.workflows.checks import (
+    check_count,
+    model_path,
+)
 from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, counted, number, table

@@ -9,13 +9,13 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.driving.adapter import Adapter
+from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import EvaluationError, FramesError, RecipeError
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.stack_session import open_session
 from me2e_compress.workflows.calibrate import calibrate
 from me2e_compress.workflows.calibrate_options import CalibrateOptions
-from me2e_compress.workflows.checks import adapted
 from me2e_compress.workflows.compare import compare
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.inspect import inspect
