@@ -146,11 +146,8 @@ def evaluate(
     policy = named
     # a trace that is no file is harmless here
     trace = options.latency.removeprefix("trace:")
-    check_folder(
-        output,
-        (policy, options.routes, trace, options.adapter, options.module_map),
-        (MANIFEST,),
-    )
+    read = (policy, options.routes, trace, options.adapter, options.module_map)
+    check_folder(output, read, (MANIFEST,))
     logs = [log_beside(output)]
     with writing(logs, folders=[output], force=options.force):
         return _evaluated(policy, output, options, listener)

@@ -165,5 +165,5 @@ def test_a_module_map_names_the_plan(tmp_path: Path) -> None:
 def test_a_module_map_of_another_graph_does_not_drive(tmp_path: Path) -> None:
     (tmp_path / "map.toml").write_text(MAP.replace("way", "path"))
     driver = OnnxDriver(controlled(tmp_path), module_map=str(tmp_path / "map.toml"))
-    with pytest.raises(EvaluationError, match="^map map: no output path"):
+    with pytest.raises(EvaluationError, match=r"^map map: no output path"):
         driver.open()
