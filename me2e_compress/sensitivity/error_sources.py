@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -88,7 +87,9 @@ class ErrorSources:
         layer = next(iter(value.consumers()), None)
         convolved = layer is not None and layer.op_type.startswith("Conv")
         along = range(2, rank) if convolved else range(max(rank - 2, 0), rank - 1)
-        effect = t.times(g, _rounding(t, node, *self.grids[value]))
+        step, zero = self.grids[value]
+        late = t.op("Add", [t.constant(np.array(step)), t.zero_after([g])])
+        effect = t.times(g, _rounding(t, node, late, zero))
         return _summed(t, t.total(effect, [*along], keep=False))
 
     def _effect_of_weight(
@@ -106,22 +107,10 @@ class ErrorSources:
         else:
             error = near - exact.reshape(near.shape).astype(np.float32)
             inputs[at] = t.constant(np.ascontiguousarray(error))
+        inputs[at] = t.op("Add", [inputs[at], t.zero_after([g])])
         effect = t.times(g, t.op(node.op_type, inputs, node.attributes))
         along = [axis for axis in range(rank) if axis != channel]
         return _summed(t, t.total(effect, along, keep=False))
-
-    def moved(self, copies: Mapping[ir.Value, ir.Value]) -> Self:
-        """Return these places where their values were computed again."""
-
-        def new(value: ir.Value) -> ir.Value:
-            return copies.get(value, value)
-
-        return dataclasses.replace(
-            self,
-            probes={new(value): each for value, each in self.probes.items()},
-            grids={new(value): each for value, each in self.grids.items()},
-            layers={new(value): each for value, each in self.layers.items()},
-        )
 
     def behind(self, missing: Mapping[ir.Value, str]) -> dict[str, str]:
         """Return the layers whose gradient lacks a part, with the reasons."""
@@ -159,10 +148,10 @@ def _stored(weight: QuantizedWeight) -> npt.NDArray[np.float32]:
     return np.asarray(weight.integers * steps, np.float32)
 
 
-def _rounding(t: Tape, probe: ir.Node, step: np.float32, zero: int) -> ir.Value:
+def _rounding(t: Tape, probe: ir.Node, step: ir.Value, zero: int) -> ir.Value:
     """Write the difference between a tensor in int8 and the tensor."""
     value = probe.inputs[0]
-    grid = [t.constant(np.array(step)), t.constant(np.array(zero, np.uint8))]
+    grid = [step, t.constant(np.array(zero, np.uint8))]
     integers = t.op("QuantizeLinear", [value, *grid])
     return t.op("Sub", [t.op("DequantizeLinear", [integers, *grid]), value])
 

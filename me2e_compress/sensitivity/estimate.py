@@ -31,9 +31,6 @@ from me2e_compress.targets.base import Grids
 MOST_HELD = 1_500_000_000
 """Bytes of a graph's own tensors that may be kept in memory for its gradients."""
 
-MOST_AGAIN = 3
-"""How often the nodes before may be computed again where that is not enough."""
-
 PRIOR = 0.5
 """Draws that the squares of independent channels count as, per number of an output
 beyond the first: of one number, a draw tells all.
@@ -199,7 +196,8 @@ def _write(
     ]  # fmt: skip
     nodes, tape = list(main), Tape(sources.model)
     signal = [tape.op("ReduceSumSquare", [each], {"keepdims": 0}) for each in ports]
-    back, seeds = Backward(tape, {*reached}, math.inf), dict[str, ir.Value]()
+    # the backward pass; where a gradient is complete it meets the error
+    back, seeds = Backward(tape, reached, MOST_HELD), dict[str, ir.Value]()
     for value in ports:
         signs = ir.Value(
             name=f"{_SIGNS}_{value.name}", shape=value.shape, type=value.type
@@ -207,7 +205,13 @@ def _write(
         main.inputs.append(signs)
         seeds[str(value.name)] = signs
         back.seed(value, signs)
-    names, effects, missing = _pulled(back, nodes, sources)
+    names, effects = list[str](), list[ir.Value]()
+    for node in reversed(nodes):
+        found = back.found.get(node.outputs[0])
+        if found is not None and (layer := sources.layer_of(node)):
+            names.append(layer)
+            effects.append(sources.effect(tape, node, found))
+        back.pass_through(node)
     # one vector of each kind
     for name, values in ((_NOISE, effects), (_SIGNAL, signal)):
         if values:
@@ -216,31 +220,4 @@ def _write(
             joined.name, joined.type = name, ir.TensorType(ir.DataType.FLOAT)
             main.outputs.append(joined)
     rewrite.remove_dead(main)
-    return _Written(sources.model, seeds, names, sources.behind(missing))
-
-
-def _pulled(
-    back: Backward, nodes: list[ir.Node], sources: ErrorSources
-) -> tuple[list[str], list[ir.Value], dict[ir.Value, str]]:
-    """Write the backward pass; where a gradient is complete it meets the error.
-
-    Where it needs more tensors than memory may hold, the nodes before are computed
-    again. Returns the layers of readings, these, and values that lack a gradient.
-    """
-    names, effects = list[str](), list[ir.Value]()
-    places, origins = sources, dict[ir.Value, ir.Value]()
-    for left in range(MOST_AGAIN, -1, -1):
-        back.most_held = math.inf if left else MOST_HELD
-        while nodes and (back.tape.held <= MOST_HELD or not left):
-            node = nodes.pop()
-            found = back.found.get(node.outputs[0])
-            if found is not None and (layer := places.layer_of(node)):
-                names.append(layer)
-                effects.append(places.effect(back.tape, node, found))
-            back.pass_through(node)
-        if nodes:
-            nodes, copies = back.begin_again(nodes)
-            places = places.moved(copies)
-            origins |= {new: origins.get(old, old) for old, new in copies.items()}
-    missing = {origins.get(value, value): why for value, why in back.missing.items()}
-    return names, effects, missing
+    return _Written(sources.model, seeds, names, sources.behind(back.missing))

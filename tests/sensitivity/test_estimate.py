@@ -243,23 +243,8 @@ def test_memory_is_kept_and_what_lies_behind_the_limit_is_not_estimated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(room, "MOST_HELD", 30_000)
-    monkeypatch.setattr(room, "MOST_AGAIN", 0)
     told = Case.of(tmp_path, block()).told()
 
     assert told["/head/Linear"].noise is not None
     assert told["/backbone/stem"].noise is None
     assert "held already" in told["/backbone/stem"].reason
-
-
-def test_what_memory_cannot_hold_is_computed_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    case = Case.of(tmp_path, block())
-    whole = case.told()
-
-    monkeypatch.setattr(room, "MOST_HELD", 30_000)
-    again = case.told()
-
-    assert again.keys() == whole.keys()
-    for name, cost in again.items():
-        assert cost.noise == pytest.approx(whole[name].noise, rel=1e-5)

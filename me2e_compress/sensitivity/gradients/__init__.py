@@ -6,8 +6,7 @@ the choice of a TopK have no gradient; an operator without a rule is told.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from collections.abc import Mapping
 
 import onnx_ir as ir
 
@@ -38,10 +37,6 @@ RULES: Mapping[str, Rule] = {
 """Rules by operator; Split, which gives several tensors, has one of its own."""
 
 
-Copies: TypeAlias = Mapping[ir.Value, ir.Value]
-"""Values and what was computed again in their place."""
-
-
 @dataclasses.dataclass
 class Backward:
     """The gradients of a graph's values, written from the last node to the first.
@@ -56,7 +51,7 @@ class Backward:
 
     tape: Tape
     wanted: set[ir.Value]
-    most_held: float
+    most_held: int
     found: dict[ir.Value, ir.Value] = dataclasses.field(default_factory=dict)
     missing: dict[ir.Value, str] = dataclasses.field(default_factory=dict)
 
@@ -66,22 +61,6 @@ class Backward:
         if known is not None:
             gradient = self.tape.op("Add", [known, gradient])
         self.found[value] = gradient
-
-    def begin_again(self, nodes: Sequence[ir.Node]) -> tuple[list[ir.Node], Copies]:
-        """Compute nodes again, so that what they gave is not held until here.
-
-        Returns the nodes and values that take the place of the old ones.
-        """
-        values = [value for node in nodes for value in node.outputs]
-        known = [self.found[value] for value in values if value in self.found]
-        again, made = self.tape.again(nodes, list(dict.fromkeys(known)))
-        self.wanted |= {
-            made[each] for each in values if each in made and each in self.wanted
-        }
-        for value in values:
-            if value in self.found and value in made:
-                self.found[made[value]] = self.found.pop(value)
-        return again, made
 
     def pass_through(self, node: ir.Node) -> None:
         """Add what a node hands to its inputs."""

@@ -8,7 +8,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, rewrite, static_shape
-from me2e_compress.graph.nodes import FLOATS, Array, bodies_of
+from me2e_compress.graph.nodes import Array
 
 Attributes: TypeAlias = Mapping[
     str, int | float | str | Sequence[int] | ir.TensorProtocol | ir.Attr
@@ -53,40 +53,14 @@ class Tape:
         self.graph.append(node)
         return node.outputs[-1]
 
-    def again(
-        self, nodes: Sequence[ir.Node], after: Sequence[ir.Value]
-    ) -> tuple[list[ir.Node], dict[ir.Value, ir.Value]]:
-        """Write nodes again, to run once some floats are known; return old to new.
+    def zero_after(self, values: Sequence[ir.Value]) -> ir.Value:
+        """Return a zero that is known once some floats are.
 
-        What the first ones gave need not be kept until then. Nodes that read nothing
-        but constants, or have bodies, are not copied.
+        What reads it waits for them: onnxruntime runs nodes as soon as it may, and
+        would keep what they give.
         """
-        sums = [self.op("ReduceSum", [each], {"keepdims": 0}) for each in after]
-        zero = self.times(self.op("Sum", sums), self.number(0, None))
-        made, copies = dict[ir.Value, ir.Value](), list[ir.Node]()
-        for value in self.graph.inputs:
-            if value.dtype in (*FLOATS, ir.DataType.INT32, ir.DataType.INT64):
-                kind = self.op("Cast", [zero], {"to": value.dtype.value})
-                made[value] = self.op("Add", [value, kind])
-                made[value].shape, made[value].type = value.shape, value.type
-        for node in nodes:
-            if made.keys().isdisjoint(filter(None, node.inputs)) or bodies_of(node):
-                copies.append(node)
-                continue
-            reads = [None if v is None else made.get(v, v) for v in node.inputs]
-            copy = ir.Node(
-                node.domain, node.op_type, reads, node.attributes.values(),
-                overload=node.overload, num_outputs=len(node.outputs),
-                version=node.version, name=f"{node.name}/again",
-            )  # fmt: skip
-            for old, new in zip(node.outputs, copy.outputs, strict=True):
-                new.name, new.shape, new.type = self._name("again"), old.shape, old.type
-                made[old] = new
-            self.graph.append(copy)
-            copies.append(copy)
-        self._before.update(made.values())
-        self.held = 0
-        return copies, made
+        sums = [self.op("ReduceSum", [each], {"keepdims": 0}) for each in values]
+        return self.times(self.op("Sum", sums), self.number(0, values[0]))
 
     def _name(self, what: str) -> str:
         return rewrite.fresh_name(f"me2e_{what}_{len(self._names)}", self._names)
