@@ -171,8 +171,8 @@ def compare_dump(
         opened = open_session(source, release=True, provider=provider, said=said)
     outputs = losses(run, opened)
     if set(answered.names) - set(session.outputs):
-        model = with_modules(loaded.model)
-        inner = first_difference_of_engine(model, run, provider=provider)
+        named = with_modules(loaded.model)
+        inner = first_difference_of_engine(named, run, provider=provider)
     return DumpResult(
         path, answered.path, source, why, len(recording), _state(run), outputs, faults,
         (*notes, *_rounded(run)), run.inferences, inner,
