@@ -1,13 +1,14 @@
 """One-pass sensitivity against one int8 node at a time.
 
     python -m benchmarks.bench_sensitivity OUT [--models highway,tcp,vad-tiny]
-        [--frames 8] [--target tensorrt] [--nodes N]
+        [--frames 8] [--target tensorrt] [--nodes N] [--outputs plan,pred_wp]
 
 For each output of each model: Spearman's rank correlation, over the nodes that the plan
 makes int8, of the estimated noise with the measured one; the median of their quotient;
 and the CPU time of the estimate per frame over that of inference, one thread, opening
-apart. Measured costs stay in OUT: a run that was stopped goes on from them. Of more
-nodes than ``--nodes``, evenly spread ones are measured.
+apart. All outputs are asked for, which take turns, or those named. Measured costs stay
+in OUT: a run that was stopped goes on from them. Of more nodes than ``--nodes``, evenly
+spread ones are measured.
 """
 
 import argparse
@@ -50,13 +51,15 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--target", default="tensorrt")
     parser.add_argument("--nodes", type=int, default=1000, help="most to measure")
+    parser.add_argument("--outputs", default="", help="that are asked for; all")
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
     rows = []
     for name in asked.models.split(","):
         subject = make(name, asked.out, asked.frames)
+        case = Case.of(subject, asked.frames, TARGETS.parse(asked.target))
         rows += rows_of(
-            Case.of(subject, asked.frames, TARGETS.parse(asked.target)), asked.nodes
+            case, asked.nodes, [*filter(None, asked.outputs.split(","))] or None
         )
         columns = (
             "model", "output", "nodes", "Spearman", "estimated / measured", "x time"
@@ -124,10 +127,10 @@ class Case:
         return found
 
 
-def rows_of(case: Case, most: int) -> list[tuple[str, ...]]:
+def rows_of(case: Case, most: int, outputs: list[str] | None) -> list[tuple[str, ...]]:
     """Return a row for each output."""
     grids = case.target.grids(case.plan, case.model, case.ranges)
-    told = partial(estimate, case.model, case.plan, grids, threads=1)
+    told = partial(estimate, case.model, case.plan, grids, threads=1, outputs=outputs)
     found = {e.output: e.noise for e in told(case.frames) if e.noise is not None}
     ratio = per_frame_s(case, told) / per_frame_s(case, partial(_infer, case.model))
     measured, rows = case.measured(most), list[tuple[str, ...]]()
@@ -151,13 +154,16 @@ def _infer(model: ir.Model, frames: list[Frame]) -> None:
 
 
 def per_frame_s(case: Case, run: Callable[[list[Frame]], object]) -> float:
-    """Return CPU seconds of one more frame, so without those of opening."""
+    """Return CPU seconds of one more frame, so without those of opening.
+
+    No fewer frames than outputs, which take turns, are run at least.
+    """
     seconds = []
-    for frames in (case.frames[:1], case.frames):
+    for frames in (case.frames, case.frames * 4):
         start = process_time()
         run(frames)
         seconds.append(process_time() - start)
-    return (seconds[1] - seconds[0]) / (len(case.frames) - 1)
+    return (seconds[1] - seconds[0]) / (3 * len(case.frames))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """A policy that runs an ONNX file."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
@@ -51,14 +52,17 @@ class OnnxPolicy:
         adapter: Adapter | None = None,
         provider: Provider = CPU,
         stage: HostStage | None = None,
+        said: Mapping[str, str] | None = None,
     ) -> Self:
         """Load a file, or the TOML of a stack of several, and run it once on zeros.
+
+        ``said`` are metadata that override the model's own.
 
         Raises:
             EvaluationError: It cannot be run, or does not keep the contract.
         """
         try:
-            session = open_session(path, threads=1, provider=provider)
+            session = open_session(path, threads=1, provider=provider, said=said)
             return cls.of(session, adapter or Adapter(), stage)
         except (GraphError, FramesError, EvaluationError) as error:
             words = str(error).removeprefix(f"{path}: ")

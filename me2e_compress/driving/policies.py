@@ -146,7 +146,9 @@ class PythonDriver(Driver):
         return f"{text}+{_sha256(Path(found.origin))}"
 
 
-def driver_named(text: str, adapter: str | Path | None = None) -> Driver:
+def driver_named(
+    text: str, adapter: str | Path | None = None, module_map: str | Path | None = None
+) -> Driver:
     """Build the driver of a text: a policy with its options, or an ONNX file's path.
 
     Args:
@@ -154,6 +156,7 @@ def driver_named(text: str, adapter: str | Path | None = None) -> Driver:
             ``highway`` for the driver that ships, the name of another package's policy,
             ``package.module:function`` for a Python function's result, or else a path.
         adapter: TOML file that adapts a model; a policy without models ignores it.
+        module_map: preset or TOML file that says plan and state of a model; likewise.
 
     Raises:
         EvaluationError: An option that the policy has not, or refuses.
@@ -171,9 +174,10 @@ def driver_named(text: str, adapter: str | Path | None = None) -> Driver:
         driver = POLICIES.build(PYTHON, {"factory": text})
     else:
         driver = POLICIES.build(MODEL, {"path": text})
-    if adapter is None or "adapter" not in type(driver).__dataclass_fields__:
-        return driver
-    return POLICIES.with_options(driver, {"adapter": adapter})
+    given = {"adapter": adapter, "module_map": module_map}
+    fields = type(driver).__dataclass_fields__
+    options = {k: v for k, v in given.items() if v is not None and k in fields}
+    return POLICIES.with_options(driver, options) if options else driver
 
 
 def opened(driver: Driver) -> Policy:

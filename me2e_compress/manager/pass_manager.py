@@ -241,14 +241,8 @@ class _Books:
         after = graph.size(result.model)
         self.steps.append(
             Step(
-                current.name,
-                to_text((current,)),
-                current.exact,
-                result.changes,
-                seconds,
-                self._size,
-                after,
-                result.notes,
+                *(current.name, to_text((current,)), current.exact, result.changes),
+                *(seconds, self._size, after, result.notes),
             )
         )
         self._size = after

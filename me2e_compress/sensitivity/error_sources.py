@@ -15,9 +15,6 @@ from me2e_compress.sensitivity.gradients import Tape
 from me2e_compress.targets.base import Grids
 from me2e_compress.targets.weights import QuantizedWeight, weights_of
 
-LEAST_CHANNELS = 16
-"""Output channels on which the rounding of a weight is judged, at least."""
-
 
 @dataclasses.dataclass(frozen=True)
 class ErrorSources:
@@ -81,47 +78,39 @@ class ErrorSources:
         value = node.outputs[0]
         return self.probes.get(value) or self.layers.get(value, "")
 
-    def power(self, t: Tape, node: ir.Node, g: ir.Value) -> ir.Value:
-        """Write the sum of squares of what the channels of an error do."""
+    def effect(self, t: Tape, node: ir.Node, g: ir.Value) -> ir.Value:
+        """Write what an error does: its channels' squares summed, and its sum."""
         value = node.outputs[0]
         rank = len(static_shape(value) or ())
         if value not in self.probes:
-            return self._power_of_weight(t, node, g, rank)
+            return self._effect_of_weight(t, node, g, rank)
         layer = next(iter(value.consumers()), None)
         convolved = layer is not None and layer.op_type.startswith("Conv")
         along = range(2, rank) if convolved else range(max(rank - 2, 0), rank - 1)
-        effect = t.times(g, _rounding(t, node, *self.grids[value]))
-        return _squared(t, t.total(effect, [*along], keep=False))
+        step, zero = self.grids[value]
+        late = t.op("Add", [t.constant(np.array(step)), t.zero_after([g])])
+        effect = t.times(g, _rounding(t, node, late, zero))
+        return _summed(t, t.total(effect, [*along], keep=False))
 
-    def _power_of_weight(
+    def _effect_of_weight(
         self, t: Tape, node: ir.Node, g: ir.Value, rank: int
     ) -> ir.Value:
-        """Write what the rounding of a weight does, judged on a part of its channels.
-
-        That takes a product as large as the layer's own, but for the part.
-        """
-        name = str(node.outputs[0].name)
+        """Write what the rounding of a weight does: a product as the layer's own."""
+        name = self.layers[node.outputs[0]]
         at, weight = self.decisions[name].weight or 0, self.weights[name]
         near, exact = _stored(weight), array_of(node.inputs[at])
         inputs = list(node.inputs[:2])
         channel = 1 if node.op_type.startswith("Conv") else rank - 1
-        part = 1
         if exact is None:
             flat = t.op("Reshape", [node.inputs[at], t.ints(near.shape)])
             inputs[at] = t.op("Sub", [t.constant(near), flat])
         else:
             error = near - exact.reshape(near.shape).astype(np.float32)
-            axis = _output_axis(node, near.ndim)
-            if axis is not None and near.shape[axis] >= 2 * LEAST_CHANNELS:
-                part = near.shape[axis] // LEAST_CHANNELS
-                error = error.take(range(0, near.shape[axis], part), axis)
-                ends = (t.ints([each]) for each in (0, 1 << 31, channel, part))
-                g = t.op("Slice", [g, *ends])
             inputs[at] = t.constant(np.ascontiguousarray(error))
+        inputs[at] = t.op("Add", [inputs[at], t.zero_after([g])])
         effect = t.times(g, t.op(node.op_type, inputs, node.attributes))
         along = [axis for axis in range(rank) if axis != channel]
-        power = _squared(t, t.total(effect, along, keep=False))
-        return t.times(power, t.number(part, None))
+        return _summed(t, t.total(effect, along, keep=False))
 
     def behind(self, missing: Mapping[ir.Value, str]) -> dict[str, str]:
         """Return the layers whose gradient lacks a part, with the reasons."""
@@ -141,8 +130,12 @@ class ErrorSources:
         }
 
 
-def _squared(t: Tape, value: ir.Value) -> ir.Value:
-    return t.op("ReduceSumSquare", [value], {"keepdims": 0})
+def _summed(t: Tape, value: ir.Value) -> ir.Value:
+    sums = [
+        t.shaped(t.op(each, [value], {"keepdims": 0}), [1])
+        for each in ("ReduceSumSquare", "ReduceSum")
+    ]
+    return t.op("Concat", sums, {"axis": 0})
 
 
 def _stored(weight: QuantizedWeight) -> npt.NDArray[np.float32]:
@@ -155,19 +148,10 @@ def _stored(weight: QuantizedWeight) -> npt.NDArray[np.float32]:
     return np.asarray(weight.integers * steps, np.float32)
 
 
-def _output_axis(node: ir.Node, rank: int) -> int | None:
-    """Return the axis of a weight along which a part of the output can be computed."""
-    if node.op_type == "Conv":
-        return 0 if node.attributes.get_int("group", 1) == 1 else None
-    if node.op_type == "Gemm":
-        return 0 if node.attributes.get_int("transB", 0) else 1
-    return rank - 1 if node.op_type == "MatMul" else None
-
-
-def _rounding(t: Tape, probe: ir.Node, step: np.float32, zero: int) -> ir.Value:
+def _rounding(t: Tape, probe: ir.Node, step: ir.Value, zero: int) -> ir.Value:
     """Write the difference between a tensor in int8 and the tensor."""
     value = probe.inputs[0]
-    grid = [t.constant(np.array(step)), t.constant(np.array(zero, np.uint8))]
+    grid = [step, t.constant(np.array(zero, np.uint8))]
     integers = t.op("QuantizeLinear", [value, *grid])
     return t.op("Sub", [t.op("DequantizeLinear", [integers, *grid]), value])
 

@@ -1,14 +1,18 @@
 """Estimate what int8 of every node costs every output, by first-order propagation.
 
 The gradient g of an output, weighted by random signs, meets the local error e of each
-int8 node: E (g e)^2 = |J e|^2 is the power of the noise that e makes at the output. The
-errors of different channels are taken to be independent, so that products are summed
-per channel, then squared. One backward pass so tells of all nodes what would take an
-inference for each. Choices (a TopK, comparisons, integers) count as fixed.
+int8 node: E (g e)^2 = |J e|^2 is the power of the noise that e makes at the output. One
+backward pass so tells of all nodes what would take an inference for each. Choices (a
+TopK, comparisons, integers) count as fixed.
+
+One draw of signs says little of g e, in which what the channels of e do adds up or
+cancels. If channels were independent, the sum of their squares would do: steady, but
+wrong where an output is so small that chance decides. Both are mixed; see `PRIOR`.
 """
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -26,6 +30,14 @@ from me2e_compress.targets.base import Grids
 
 MOST_HELD = 1_500_000_000
 """Bytes of a graph's own tensors that may be kept in memory for its gradients."""
+
+PRIOR = 0.5
+"""Draws that the squares of independent channels count as, per number of an output
+beyond the first: of one number, a draw tells all.
+
+On TCP, 36 nodes, a plan of 8 numbers and as many draws, rank correlation with measured
+noise is 0.94 for 2 to 8 draws, 0.81 for the squares alone, 0.91 for the draws alone and
+0.99 for the sums without chance (a pass for each number)."""
 
 NO_PATH = "no output depends on it but by choices or whole numbers"
 
@@ -70,7 +82,7 @@ def estimate(
     left out; ``outputs`` None asks for all others.
     """
     written = _write(model, plan, grids, outputs)
-    power = np.zeros((len(written.seeds), len(written.readings)))
+    effects = _Effects.of(written)
     signal = np.zeros(len(written.seeds))
     if written.readings:
         session = Session(
@@ -79,14 +91,14 @@ def estimate(
         fed = written.fed(frames, np.random.default_rng(seed))
         for at, values in enumerate(replay(session, fed, [_NOISE, _SIGNAL])):
             turn = at % len(signal)
-            power[turn] += values[_NOISE]
+            effects.add(turn, values[_NOISE])
             signal[turn] += values[_SIGNAL][turn]
-    return tuple(written.costs(plan, power, signal))
+    return tuple(written.costs(plan, effects.power(), signal))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Written:
-    """A graph that gives noise power by reading, and signal power by output.
+    """A graph that gives effects of errors by reading, and signal power by output.
 
     ``seeds`` are the inputs for random signs, by output; ``readings`` name the layers
     that readings belong to, by output, ``missing`` those that lack one.
@@ -112,21 +124,60 @@ class _Written:
                 arrays[str(value.name)] = signs
             yield dataclasses.replace(frame, arrays=arrays)
 
-    def costs(self, plan: QuantPlan, power: Array, signal: Array) -> Iterator[NodeCost]:
+    def costs(
+        self, plan: QuantPlan, power: Mapping[str, Array], signal: Array
+    ) -> Iterator[NodeCost]:
         """Yield what was found of each int8 node; residual Adds follow another's."""
         for each in plan.placed:
             if each.rule == RESIDUAL:
                 continue
-            mine = [at for at, name in enumerate(self.readings) if name == each.output]
-            reason = self.missing.get(each.output, "" if mine else NO_PATH)
+            reason = self.missing.get(
+                each.output, "" if each.output in power else NO_PATH
+            )
             noise = None
             if not reason:
                 noise = {
-                    name: float(np.sqrt(power[turn, mine].sum() / signal[turn]))
+                    name: float(np.sqrt(power[each.output][turn] / signal[turn]))
                     for turn, name in enumerate(self.seeds)
                     if signal[turn] > 0
                 }
             yield NodeCost(each.node, each.output, each.op, each.module, noise, reason)
+
+
+class _Effects:
+    """What errors do to outputs, by layer, summed over draws of signs."""
+
+    def __init__(
+        self, layers: Mapping[str, Sequence[int]], sizes: Sequence[int]
+    ) -> None:
+        self._layers = layers
+        self._prior = PRIOR * (np.array(sizes, np.float64) - 1)
+        self._draws = np.zeros(len(sizes))
+        self._sums = {name: np.zeros((2, len(sizes))) for name in layers}
+
+    @classmethod
+    def of(cls, written: _Written) -> "_Effects":
+        layers = dict[str, list[int]]()
+        for at, name in enumerate(written.readings):
+            layers.setdefault(name, []).append(at)
+        shapes = [static_shape(value) or () for value in written.seeds.values()]
+        return cls(layers, [math.prod(each) for each in shapes])
+
+    def add(self, turn: int, noise: Array) -> None:
+        """Add a draw for one output: squares and sums of every reading."""
+        found = noise.reshape(-1, 2).astype(np.float64)
+        self._draws[turn] += 1
+        for name, mine in self._layers.items():
+            squares, sums = found[mine].sum(0)
+            self._sums[name][:, turn] += squares, sums**2
+
+    def power(self) -> dict[str, Array]:
+        """Return the power of each layer's noise at every output, summed over draws."""
+        weight = self._prior / np.maximum(self._prior + self._draws, 1)
+        return {
+            name: weight * squares + (1 - weight) * squared
+            for name, (squares, squared) in self._sums.items()
+        }
 
 
 def _write(
@@ -154,17 +205,17 @@ def _write(
         main.inputs.append(signs)
         seeds[str(value.name)] = signs
         back.seed(value, signs)
-    names, powers = list[str](), list[ir.Value]()
+    names, effects = list[str](), list[ir.Value]()
     for node in reversed(nodes):
         found = back.found.get(node.outputs[0])
         if found is not None and (layer := sources.layer_of(node)):
             names.append(layer)
-            powers.append(sources.power(tape, node, found))
+            effects.append(sources.effect(tape, node, found))
         back.pass_through(node)
     # one vector of each kind
-    for name, values in ((_NOISE, powers), (_SIGNAL, signal)):
+    for name, values in ((_NOISE, effects), (_SIGNAL, signal)):
         if values:
-            flat = [tape.shaped(each, [1]) for each in values]
+            flat = [tape.shaped(each, [-1]) for each in values]
             joined = tape.op("Concat", flat, {"axis": 0})
             joined.name, joined.type = name, ir.TensorType(ir.DataType.FLOAT)
             main.outputs.append(joined)

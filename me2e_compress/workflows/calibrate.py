@@ -140,7 +140,7 @@ def _ready(
 
     The last is what its nodes made before the passes, for an import.
     """
-    loaded = read_graph(source, listener, options.adapter)
+    loaded = read_graph(source, listener, options.adapter, options.module_map)
     first = _first_files(loaded, output, options)
     # what is read is checked, and the graph is opened, before any pass runs
     if options.imported is not None:

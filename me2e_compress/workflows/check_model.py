@@ -92,11 +92,13 @@ def check_model(
     adapter: str | Path | None = None,
     provider: Provider = CPU,
     listener: Listener = SILENT,
+    module_map: str | Path | None = None,
 ) -> ModelCheck:
     """Check whether a policy could drive: open it, match its ports, run it on zeros.
 
     The policy is an ONNX file or any other that :func:`evaluate` drives; an adapter is
-    the TOML file that adapts a model to the policy contract.
+    the TOML file that adapts a model to the policy contract, a module map says which
+    output is the plan and which are fed back.
 
     Raises:
         EvaluationError: The policy or adapter does not exist, or the file is no model.
@@ -104,7 +106,7 @@ def check_model(
         ProviderError: The provider is not available.
     """
     named = str(policy)
-    driver = driver_of(named, adapter, provider)
+    driver = driver_of(named, adapter, provider, module_map)
     # a policy without a graph has no ports: opening it is the check
     if not isinstance(driver, OnnxDriver):
         opened(driver)
@@ -113,7 +115,9 @@ def check_model(
     try_file(driver.path, listener, provider)
     read = Adapter() if driver.adapter is None else Adapter.load(driver.adapter)
     try:
-        session = open_session(driver.path, threads=1, provider=driver.provider)
+        session = open_session(
+            driver.path, threads=1, provider=driver.provider, said=driver.said()
+        )
     except (GraphError, FramesError) as error:
         raise EvaluationError(str(error)) from error
     recurrent = recurrent_of(session, read)

@@ -9,50 +9,13 @@ from typing import TypeAlias
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.adapter.outputs import plan_of
-from me2e_compress.driving.shipped_adapters import adapter_file
-from me2e_compress.errors import EvaluationError, GraphError, RecipeError
+from me2e_compress.driving.adapter.stated import adapted
+from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.graph.modules import ModuleMap, map_of
 from me2e_compress.graph.opset import lowered
-from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.shapes import unshaped_plugins
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.zoo.shipped import SHIPPED, shipped
-
-
-def adapted(model: ir.Model, adapter: str | Path | None) -> dict[str, str]:
-    """Write an adapter's statements into the metadata of a graph in memory.
-
-    The adapter is a TOML file or the name of one that ships; None changes nothing. The
-    metadata that were written are returned, for a session that opens the file itself.
-    An adapter that does not fit the graph raises EvaluationError.
-    """
-    if adapter is None:
-        return {}
-    found = Adapter.load(adapter_file(Path(adapter)))
-    said = found.metadata(model.metadata_props)
-    inputs, outputs = (
-        [str(each.name) for each in side]
-        for side in (model.graph.inputs, model.graph.outputs)
-    )
-    # every input that the adapter names must exist
-    for name in (*found.feeds, *found.images):
-        if name not in inputs:
-            raise EvaluationError(
-                f"adapter {adapter}: it feeds input {name}; there are"
-                f" {', '.join(inputs)}"
-            )
-    model.metadata_props.update(said)
-    # the plan and the recurrent state must be found under the new metadata
-    try:
-        if found.plan is not None:
-            plan_of(found.plan, {}, outputs)
-        recurrent_inputs(model)
-    except (EvaluationError, GraphError) as error:
-        raise EvaluationError(f"adapter {adapter}: {error}") from error
-    return said
-
 
 LARGEST = 1e15
 """The largest number of an option: beyond, milliseconds are no whole microseconds."""
@@ -78,17 +41,18 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
 
 
 def read_graph(
-    path: Path, listener: Listener, adapter: str | Path | None = None
+    path: Path, listener: Listener, adapter: Given = None, module_map: Given = None
 ) -> graph.LoadedModel:
     """Read a graph; warn of a lowered opset and of missing shapes.
 
-    An adapter's statements become metadata of the graph; see :func:`adapted`.
+    What an adapter and a map state becomes metadata of the graph; see :func:`adapted`.
     """
-    if adapter is not None and graph.is_stack(path):
+    is_stack = graph.is_stack(path)
+    if adapter is not None and is_stack:
         raise RecipeError(f"--adapter is for one file: {path} says state and plan")
     loaded = graph.LoadedModel.load(path)
     model = loaded.model
-    adapted(model, adapter)
+    adapted(model, adapter, None if is_stack else module_map)
     if said := lowered(model):
         listener.on_warning(f"{path}: {said}: onnxruntime reads no newer")
     if lack := lacking_shapes(model):

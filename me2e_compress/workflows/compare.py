@@ -6,6 +6,7 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.fidelity.compare import Fidelity, common_adapter
 from me2e_compress.fidelity.compare import compare as measure
@@ -19,7 +20,10 @@ from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack_session import open_session
-from me2e_compress.workflows.checks import adapted, check_number, model_path
+from me2e_compress.workflows.checks import (
+    check_number,
+    model_path,
+)
 from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, counted, table
@@ -135,6 +139,7 @@ def compare(
     alive: float = ALIVE,
     provider: Provider = CPU,
     adapter: str | Path | None = None,
+    module_map: str | Path | None = None,
 ) -> CompareResult:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres.
 
@@ -162,7 +167,7 @@ def compare(
     # each graph must take the frames, and open in another process first
     for path in dict.fromkeys(paths):
         loaded = LoadedModel.load(path)
-        said[path] = adapted(loaded.model, adapter)
+        said[path] = adapted(loaded.model, adapter, module_map)
         models.append(loaded.model)
         recording.check(loaded.model)
         try_model(loaded, listener, provider, recording)

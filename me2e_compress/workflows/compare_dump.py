@@ -10,11 +10,14 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
 from me2e_compress.driving.adapter.image_inputs import IMAGE, ImageNormalization
+from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.fidelity.dump_readings import HIGHEST_DB
 from me2e_compress.fidelity.engine_loss import OutputLoss, losses
 from me2e_compress.fidelity.engine_run import EngineRun
+from me2e_compress.fidelity.engine_values import first_difference_of_engine
 from me2e_compress.fidelity.feed_faults import Pixels
+from me2e_compress.fidelity.first_difference import FirstDifference
 from me2e_compress.fidelity.host_faults import HostFault, explain
 from me2e_compress.graph import LoadedModel
 from me2e_compress.registry import documents
@@ -22,8 +25,11 @@ from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack_session import open_session
 from me2e_compress.targets.quantized import describe_quantized
-from me2e_compress.workflows.checks import adapted, model_path
+from me2e_compress.workflows.checks import (
+    model_path,
+)
 from me2e_compress.workflows.compress_result import beside
+from me2e_compress.workflows.first_difference import told_of, with_modules
 from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, counted, number, table
@@ -44,6 +50,8 @@ class DumpResult(Result):
         faults: Of the host.
         notes: What is no fault and worth knowing.
         inferences: Of the graph, to find faults.
+        inner: Where the engine's own tensors begin to differ from the graph's; None if
+            the dump has outputs alone.
     """
 
     graph: Path
@@ -56,6 +64,7 @@ class DumpResult(Result):
     faults: tuple[HostFault, ...]
     notes: tuple[str, ...]
     inferences: int
+    inner: FirstDifference | None
 
     @property
     def headline(self) -> str:
@@ -74,8 +83,9 @@ class DumpResult(Result):
         )
 
     def lines(self) -> tuple[str, ...]:
-        """Return the verdict, and what is worth knowing."""
-        return (self.headline, *self.notes)
+        """Return the verdict, what differs inside, and what is worth knowing."""
+        inside = () if self.inner is None else (f"inside: {told_of(self.inner)}",)
+        return (self.headline, *inside, *self.notes)
 
     def alerts(self) -> tuple[str, ...]:
         """Return the faults of the host."""
@@ -117,6 +127,7 @@ def compare_dump(
     float_graph: str | Path | None = None,
     provider: Provider = CPU,
     adapter: str | Path | None = None,
+    module_map: str | Path | None = None,
 ) -> DumpResult:
     """Hold what an engine answered over frames against the graph it was built from.
 
@@ -137,9 +148,9 @@ def compare_dump(
     recording, answered = CalibrationSet(Path(frames)), EngineDump(dump)
     answered.check(recording)
     loaded = LoadedModel.load(path)
-    said = adapted(loaded.model, adapter)
+    said = adapted(loaded.model, adapter, module_map)
     recording.check(loaded.model)
-    notes = _checked_names(answered, loaded)
+    notes, inner = _checked_names(answered, loaded), None
     try_model(loaded, listener, provider, recording)
     session = open_session(
         path, optimize=False, release=True, provider=provider, said=said
@@ -159,9 +170,12 @@ def compare_dump(
     if source is not None:
         opened = open_session(source, release=True, provider=provider, said=said)
     outputs = losses(run, opened)
+    if set(answered.names) - set(session.outputs):
+        named = with_modules(loaded.model)
+        inner = first_difference_of_engine(named, run, provider=provider)
     return DumpResult(
         path, answered.path, source, why, len(recording), _state(run), outputs, faults,
-        (*notes, *_rounded(run)), run.inferences,
+        (*notes, *_rounded(run)), run.inferences, inner,
     )  # fmt: skip
 
 
@@ -174,18 +188,14 @@ def _checked_names(dump: EngineDump, loaded: LoadedModel) -> tuple[str, ...]:
             f" {', '.join(outputs)}: the dump is of another graph"
         )
     made = {value.name for node in loaded.model.graph for value in node.outputs}
-    inner = [each for each in dump.names if each not in outputs]
-    if unknown := [each for each in inner if each not in made]:
+    known = {*made, *outputs}
+    if unknown := [each for each in dump.names if each not in known]:
         raise EvaluationError(
             f"{dump.path}: {unknown[0]} is no tensor of {loaded.path}, whose outputs"
             f" are {', '.join(outputs)}"
         )
-    said = []
-    if lacking := [each for each in outputs if each not in dump.names]:
-        said.append(f"not dumped: {', '.join(lacking)}")
-    if inner:
-        said.append(f"not compared: {counted(len(inner), 'tensor')} inside the graph")
-    return tuple(said)
+    lacking = [each for each in outputs if each not in dump.names]
+    return (f"not dumped: {', '.join(lacking)}",) if lacking else ()
 
 
 def _pixels(metadata: Mapping[str, str]) -> dict[str, Pixels]:

@@ -201,7 +201,7 @@ def compress(
         writing_model(source, output, inputs, force=options.force) as target,
         collector_paused(),
     ):
-        loaded = read_graph(source, listener, options.adapter)
+        loaded = read_graph(source, listener, options.adapter, options.module_map)
         modules = load_map(options.module_map, loaded.model)
         seen = open_frames(loaded, frames, options.provider)
         split = SplitFrames.of(*seen, passes, options.measure_frames)

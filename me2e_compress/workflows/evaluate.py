@@ -34,7 +34,7 @@ from me2e_compress.workflows.result import Result, Table, number
 from me2e_compress.workflows.score import driving_score, score_records, scores_table
 from me2e_compress.zoo.shipped import SHIPPED
 
-_FLAGS = {"frame_limit_s": "frame-limit"}
+_FLAGS = {"frame_limit_s": "frame-limit", "module_map": "map"}
 """Command-line names of options that differ from their Python names."""
 
 
@@ -44,6 +44,8 @@ class EvaluateOptions(DrivingOptions):
 
     Attributes:
         host_stage: changes the model's plan on the host: ``collision-optimizer``.
+        module_map: preset or TOML file that says plan and state of the model; None
+            leaves them to its metadata.
         render: draw these routes as GIF and PNG; chosen as ``routes`` is.
         force: replace outputs that we did not write, too.
         evaluator: ``highway``, whose options are those above; or another by name,
@@ -51,6 +53,7 @@ class EvaluateOptions(DrivingOptions):
     """
 
     host_stage: str = ""
+    module_map: str | None = None
     render: str | None = None
     force: bool = False
     evaluator: str = HIGHWAY
@@ -143,7 +146,8 @@ def evaluate(
     policy = named
     # a trace that is no file is harmless here
     trace = options.latency.removeprefix("trace:")
-    check_folder(output, (policy, options.routes, trace, options.adapter), (MANIFEST,))
+    read = (policy, options.routes, trace, options.adapter, options.module_map)
+    check_folder(output, read, (MANIFEST,))
     logs = [log_beside(output)]
     with writing(logs, folders=[output], force=options.force):
         return _evaluated(policy, output, options, listener)
@@ -172,7 +176,7 @@ def _evaluated(
     routes, set_size = options.picked
     shown = () if options.render is None else pick_routes(routes, options.render)
     # find the driver, and open its graph in a process of its own first
-    driver = driver_of(policy, options.adapter, options.provider)
+    driver = driver_of(policy, options.adapter, options.provider, options.module_map)
     if options.host_stage:
         driver = with_stage(driver, options.host_stage)
     if isinstance(driver, OnnxDriver):
@@ -212,7 +216,10 @@ def _pictures(job: Job, routes: tuple[Route, ...], folder: Path) -> tuple[Path, 
 
 
 def driver_of(
-    text: str, adapter: str | Path | None = None, provider: Provider = CPU
+    text: str,
+    adapter: str | Path | None = None,
+    provider: Provider = CPU,
+    module_map: str | Path | None = None,
 ) -> Driver:
     """Return the driver of a policy name, a path or a shipped model's name.
 
@@ -220,7 +227,7 @@ def driver_of(
     """
     if text in SHIPPED:  # by its path, which a file of that name may be instead
         text = str(model_path(text))
-    driver = driver_named(text, adapter)
+    driver = driver_named(text, adapter, module_map)
     if not isinstance(driver, OnnxDriver):
         return driver
     try:

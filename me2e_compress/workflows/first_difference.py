@@ -8,13 +8,17 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import GraphError, ModuleMapError
 from me2e_compress.fidelity.first_difference import FirstDifference, Source
 from me2e_compress.fidelity.places import Place
 from me2e_compress.graph import LoadedModel, provenance
 from me2e_compress.graph.modules import ModuleMap, assign, map_of
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.workflows.checks import adapted, check_count, model_path
+from me2e_compress.workflows.checks import (
+    check_count,
+    model_path,
+)
 from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, counted, number, table
@@ -34,20 +38,7 @@ class FirstDifferenceResult(Result):
     @property
     def headline(self) -> str:
         """The first wrong module and node."""
-        found, first = self.found, self.found.first
-        if first is not None:
-            return _told(first, found)
-        if not found.different:
-            return (
-                f"no difference: {counted(found.compared, 'value')} at"
-                f" {found.floor_db:g} dB or more"
-            )
-        of = f"{found.different} of {counted(found.compared, 'value')}"
-        if found.outputs_differ:
-            end = "every place that was tried is right on equal inputs: rounding grew"
-        else:
-            end = "none of that reaches an output"
-        return f"{of} are below {found.floor_db:g} dB, but {end}"
+        return told_of(self.found)
 
     def tables(self) -> tuple[Table, ...]:
         """Return the places, and what every module was given and gave."""
@@ -98,6 +89,23 @@ class FirstDifferenceResult(Result):
         return dataclasses.asdict(self.found)
 
 
+def told_of(found: FirstDifference) -> str:
+    """Name the first wrong module and node, or say that there is none."""
+    if found.first is not None:
+        return _told(found.first, found)
+    if not found.different:
+        return (
+            f"no difference: {counted(found.compared, 'value')} at"
+            f" {found.floor_db:g} dB or more"
+        )
+    of = f"{found.different} of {counted(found.compared, 'value')}"
+    if found.outputs_differ:
+        end = "every place that was tried is right on equal inputs: rounding grew"
+    else:
+        end = "none of that reaches an output"
+    return f"{of} are below {found.floor_db:g} dB, but {end}"
+
+
 def _told(first: Place, found: FirstDifference) -> str:
     begin = f"first below {found.floor_db:g} dB" if found.lossy else "first difference"
     module = f"module {first.module}, " if first.module else ""
@@ -124,6 +132,7 @@ def first_difference(
     most_frames: int = FRAMES,
     provider: Provider = CPU,
     adapter: str | Path | None = None,
+    module_map: str | Path | None = None,
 ) -> FirstDifferenceResult:
     """Find the first module and node after which the second graph differs.
 
@@ -148,10 +157,10 @@ def first_difference(
         if loaded.first_files:
             names = ", ".join(loaded.first_files)
             raise GraphError(f"{path}: {names} run at first frames alone: name a file")
-        adapted(loaded.model, adapter)
+        adapted(loaded.model, adapter, module_map)
         recording.check(loaded.model)
         try_model(loaded, listener, provider, recording)
-        models[path] = _with_modules(loaded.model)
+        models[path] = with_modules(loaded.model)
     # the source runs once, then the other graph
     shown = tuple(itertools.islice(recording, most_frames))
     listener.on_progress("sketches", 0, 2, str(paths[0]))
@@ -162,7 +171,7 @@ def first_difference(
     return FirstDifferenceResult(*paths, found)
 
 
-def _with_modules(model: ir.Model) -> ir.Model:
+def with_modules(model: ir.Model) -> ir.Model:
     """Write the module of every node into its metadata, where it does not stand yet."""
     if provenance.missing(model):
         try:

@@ -8,6 +8,7 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import Item, ModuleMap, assign, itemise
@@ -25,7 +26,11 @@ from me2e_compress.runtime.energy.modelled import (
     modelled_energy,
 )
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.workflows.checks import adapted, lacking_shapes, load_map, model_path
+from me2e_compress.workflows.checks import (
+    lacking_shapes,
+    load_map,
+    model_path,
+)
 from me2e_compress.workflows.inspect_result import FedInput, InspectResult
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.module_costs import (
@@ -74,7 +79,7 @@ def inspect(
     if frames is not None:
         taken = _timed(path, module_map, frames, listener, adapter)
     loaded = graph.LoadedModel.load(path)
-    adapted(loaded.model, adapter)
+    adapted(loaded.model, adapter, module_map)
     modules = load_map(module_map, loaded.model)
     found = inspected(path, loaded.model, modules, dims, process, taken)
     return found if loaded.stack is None else _with_joints(found, loaded.stack)

@@ -11,6 +11,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import draw
 from me2e_compress.calibration.stack_frames import recording_of
+from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.manager import recipe
 from me2e_compress.passes import Pass
 from me2e_compress.passes.fix_shapes import FixShapes, with_sizes
@@ -22,7 +23,6 @@ from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
     Given,
-    adapted,
     check_count,
     load_map,
     output_path,
@@ -102,7 +102,7 @@ class TrialFiles:
         rules, place = RULE_SETS.parse(options.rules), TARGETS.parse(target)
         read = graph.LoadedModel.load(self.model)
         loaded = read.model
-        adapted(loaded, options.adapter)
+        adapted(loaded, options.adapter, options.module_map)
         recording = recording_of(read, self.frames, options.provider)
         scheme = QuantScheme.named(options.scheme, load_map(options.module_map, loaded))
         # the graph is opened and prepared once; every trial starts from there

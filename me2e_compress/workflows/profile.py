@@ -10,6 +10,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.stack_frames import recording_of
+from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import EvaluationError, MissingExtraError, RecipeError
 from me2e_compress.graph.modules import assign
 from me2e_compress.metrics.deadlines import BUDGET_MS
@@ -29,7 +30,6 @@ from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
-    adapted,
     check_count,
     load_map,
     model_path,
@@ -122,7 +122,7 @@ def profile(
         # each measurement has inferences of its own: the profiler takes time itself
         recording = CalibrationSet(Path(frames))
         loaded = graph.LoadedModel.load(source)
-        said = adapted(loaded.model, options.adapter)
+        said = adapted(loaded.model, options.adapter, options.module_map)
         trace = _measured(loaded, said, recording, options, listener)
         operators: Microseconds = {}
         if options.by_module or figure is not None:

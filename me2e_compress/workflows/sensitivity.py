@@ -251,7 +251,11 @@ def _on_routes(
     # open the model before hours are spent on variants
     asked = DrivingOptions(routes=routes, workers=options.workers)
     _, set_size = asked.picked
-    opened(driver_of(str(model), options.adapter, options.provider))
+    named = partial(
+        driver_of, adapter=options.adapter, provider=options.provider,
+        module_map=options.module_map,
+    )  # fmt: skip
+    opened(named(str(model)))
 
     def drive(choice: Int8Choice, variant: ir.Model) -> float:
         results = folder / _name_of(choice, variant)
@@ -259,7 +263,7 @@ def _on_routes(
         with TemporaryDirectory() as scratch:
             path = Path(scratch) / "variant.onnx"
             graph.save(variant, path)
-            driver = driver_of(str(path), options.adapter, options.provider)
+            driver = named(str(path))
             episodes = tuple(asked.driven_by(driver, results).episodes())
             found = score(episodes, set_size).driving_score
         if found.value is None:

@@ -129,6 +129,33 @@ def test_the_estimate_is_near_what_one_int8_node_at_a_time_costs(
                 assert noise == 0
 
 
+CANCELS = (
+    HEAD
+    + """
+net (float[1,32,6,6] image, float[32,32,1,1] w0, float[32,1] w1)
+    => (float[1,1] y) <int64[2] row = {1, 32}> {
+    ["/backbone/stem"] a = Conv(image, w0)
+    ["/backbone/Pool"] p = GlobalAveragePool(a)
+    ["/head/Reshape"] r = Reshape(p, row)
+    ["/head/Sum"] y = MatMul(r, w1)
+}"""
+)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_channels_do_to_one_number_cancels_as_it_does(
+    tmp_path: Path, seed: int
+) -> None:
+    random = np.random.default_rng(seed)
+    weights = {"w0": random.normal(0, 0.2, (32, 32, 1, 1)), "w1": np.ones((32, 1))}
+    case = Case.of(tmp_path, net(CANCELS, weights))
+
+    cost = case.told()["/backbone/stem"]
+
+    assert cost.noise is not None
+    assert cost.noise["y"] == pytest.approx(case.measured("/backbone/stem")["y"], 0.005)
+
+
 def test_a_residual_branch_is_counted_to_the_convolution_it_follows(
     tmp_path: Path,
 ) -> None:

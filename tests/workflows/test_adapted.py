@@ -9,12 +9,13 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.driving.adapter import Adapter
+from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import EvaluationError, FramesError, RecipeError
+from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.stack_session import open_session
 from me2e_compress.workflows.calibrate import calibrate
 from me2e_compress.workflows.calibrate_options import CalibrateOptions
-from me2e_compress.workflows.checks import adapted
 from me2e_compress.workflows.compare import compare
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.inspect import inspect
@@ -57,6 +58,21 @@ def mine(tmp_path: Path) -> Path:
 def adapter(tmp_path: Path) -> Path:
     (tmp_path / "a.toml").write_text(ADAPTER)
     return tmp_path / "a.toml"
+
+
+PARTS = """
+[modules.all]
+role = "feature"
+optional = ["**"]
+"""
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> Path:
+    """A module map that says what the adapter says of plan and state."""
+    stated = ADAPTER.replace('[feeds.seen]\nsource = "speed"\n', "")
+    (tmp_path / "parts.toml").write_text(PARTS + stated)
+    return tmp_path / "parts.toml"
 
 
 @pytest.fixture
@@ -168,3 +184,101 @@ def test_what_is_said_of_a_stack_wins_over_its_own(tmp_path: Path) -> None:
 
     assert name not in silent.recurrent
     assert set(plain.recurrent) - set(silent.recurrent) == {name}
+
+
+def test_a_map_says_which_output_is_the_plan_and_what_is_fed_back(
+    mine: Path, frames: Path, parts: Path, tmp_path: Path
+) -> None:
+    small = tmp_path / "small.onnx"
+
+    found = compare(mine, mine, frames, module_map=parts).fidelity
+    compress(mine, small, "exact", frames, CompressOptions(module_map=parts))
+    timed = profile(mine, frames, None, ProfileOptions(module_map=parts))
+
+    assert found.plan_output == "waypoints"
+    assert compare(small, small, frames).fidelity.plan_output == "waypoints"
+    assert len(timed.trace.samples_us) == 4
+
+
+def test_an_adapter_overrides_the_map(mine: Path, adapter: Path, parts: Path) -> None:
+    parts.write_text(parts.read_text() + "step_s = 0.1\n")
+
+    said = adapted(graph.load(mine), adapter, parts)
+
+    assert "step_s" not in said["me2e.plan"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "why"),
+    [
+        ('"waypoints"', '"way"', "no output way, which is named as the plan"),
+        ('"remembered"', '"kept"', "pairs memory with kept"),
+        ("memory =", "past =", "pairs past with remembered"),
+        ('"waypoints"', '"waypoints"\ncommand_input = "turn"', "no input turn"),
+        ("output =", "outptu =", "plan.output: Field required"),
+        ('"waypoints"', '"waypoints"\nstep_s = -1', "plan.step_s: .* greater than 0"),
+    ],
+)
+def test_a_map_of_another_graph_is_refused(
+    mine: Path, parts: Path, before: str, after: str, why: str
+) -> None:
+    parts.write_text(parts.read_text().replace(before, after))
+
+    with pytest.raises(EvaluationError, match=f"^map parts:? .*{why}"):
+        adapted(graph.load(mine), None, parts)
+
+
+@pytest.mark.parametrize(
+    ("table", "expected"),
+    [
+        ('plan = { output = "waypoints" }', "waypoints"),
+        ('plan = { output = "way" }', None),
+        ('plan = { output = "waypoints" }\nrecurrent = { memory = "kept" }', None),
+    ],
+)
+def test_optional_names_hold_where_all_are_there(
+    mine: Path, parts: Path, table: str, expected: str | None
+) -> None:
+    parts.write_text(f"{PARTS}\n[[optional]]\n{table}")
+
+    said = adapted(graph.load(mine), None, parts)
+
+    found = json.loads(said["me2e.plan"])["output"] if said else None
+    assert found == expected
+
+
+def test_optional_names_leave_what_the_graph_says_of_itself(
+    mine: Path, parts: Path
+) -> None:
+    model = graph.load(mine)
+    model.metadata_props["me2e.plan"] = '{"output": "waypoints"}'
+    model.metadata_props["me2e.recurrent"] = '{"memory": null}'
+    optional = '[[optional]]\nplan = { output = "remembered" }'
+    state = 'recurrent = { memory = "remembered" }'
+    parts.write_text(f"{PARTS}\n{optional}\n{state}")
+
+    assert adapted(model, None, parts) == {}
+
+
+PRESETS = [
+    ("vad", "ego_fut_preds", "prev_bev", "bev_embed"),
+    ("uniad", "sdc_traj", "prev_bev", "bev_embed"),
+    ("uniad", "outs_planning", "prev_bev", "bev_embed"),
+    ("tcp", "pred_wp", "state", "state_out"),
+    ("highway", "plan", "prev_bev", "prev_bev_out"),
+]
+
+
+@pytest.mark.parametrize(("preset", "plan", "taken", "given"), PRESETS)
+def test_presets_name_plan_and_state(
+    preset: str, plan: str, taken: str, given: str
+) -> None:
+    text = MINE.replace("WEIGHT", ", ".join(["0.0"] * 144)).replace("waypoints", plan)
+    model = ir.from_onnx_text(
+        text.replace("memory", taken).replace("remembered", given)
+    )
+
+    adapted(model, None, preset)
+
+    assert json.loads(model.metadata_props["me2e.plan"])["output"] == plan
+    assert recurrent_inputs(model) == {taken: given}

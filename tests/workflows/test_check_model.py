@@ -101,7 +101,7 @@ def test_all_that_is_missing_is_told_at_once(tmp_path: Path) -> None:
         ("action[2]", "action[3]", r"action has 3 numbers: there is no action\[3\]"),
         ("step_s = 0.5", "", "step_s must say how far apart"),
         ('output = "wp"', 'output = "value"', r"value has shape \[1\], a plan is"),
-        ('"wp"', '"way"', "no output way, which the adapter names as the plan"),
+        ('"wp"', '"way"', "no output way, which is named as the plan"),
     ],
 )
 def test_what_does_not_fit(tmp_path: Path, old: str, new: str, message: str) -> None:

@@ -146,11 +146,31 @@ def test_rounding_to_half_is_said(files: Path) -> None:
     assert found.notes == ("rounded to float16, no fault: plan, boxes, prev_out",)
 
 
-def test_tensors_inside_the_graph_are_left_out(files: Path) -> None:
-    inner = [each | {"mixed": each["prev_out"]} for each in answered(files)]
-    dumped(files, inner)
+def test_tensors_inside_the_graph_tell_where_it_begins(files: Path) -> None:
+    model = ir.load(files / "m.onnx")
+    weight = model.graph.initializers["w_all"]
+    assert weight.const_value is not None
+    rolled = np.roll(weight.const_value.numpy(), 1, axis=1)
+    weight.const_value = ir.tensor(rolled, name="w_all")
+    inner = ("own", "mixed")
+    model.graph.outputs.extend(
+        each for node in model.graph for each in node.outputs if each.name in inner
+    )
+    shown = list(CalibrationSet(files / "frames"))
+    dumped(files, drive(Session(model), shown))
+
     found = compare_dump(files / "m.onnx", files / "dump", files / "frames")
-    assert "not compared: 1 tensor inside the graph" in found.notes
+
+    assert found.inner is not None
+    assert found.inner.first is not None
+    assert found.inner.first.value == "mixed"
+    assert found.lines()[1].startswith("inside: first below 20 dB: module model, ")
+
+
+def test_outputs_alone_tell_nothing_of_the_inside(files: Path) -> None:
+    dumped(files, answered(files))
+    found = compare_dump(files / "m.onnx", files / "dump", files / "frames")
+    assert found.inner is None
 
 
 def refused(files: Path, error: type[Exception]) -> str:

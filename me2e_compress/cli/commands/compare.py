@@ -47,6 +47,7 @@ def compare(
         ),
     ] = False,
     adapter: given.Adapter = None,
+    module_map: given.ModuleMap = None,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
 ) -> None:
@@ -65,6 +66,7 @@ def compare(
             dumped = against_engine.compare_dump(
                 *(reference, outputs, candidate, listener),
                 float_graph=float_graph, provider=runs_on, adapter=adapter,
+                module_map=module_map,
             )  # fmt: skip
             show(dumped)
             return
@@ -74,13 +76,13 @@ def compare(
         if where:
             place = first_difference(
                 *(reference, candidate, frames, listener),
-                provider=runs_on, adapter=adapter,
+                provider=runs_on, adapter=adapter, module_map=module_map,
             )  # fmt: skip
             show(place)
             return
         found = workflow.compare(
             *(reference, candidate, frames, listener), as_it_stands=as_it_stands,
-            alive=alive, provider=runs_on, adapter=adapter,
+            alive=alive, provider=runs_on, adapter=adapter, module_map=module_map,
         )  # fmt: skip
     show(found)
     found.check()

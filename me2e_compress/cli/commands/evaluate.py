@@ -64,6 +64,7 @@ def evaluate(
     workers: given.Workers = 1,
     dt_ms: Step = 50.0,
     adapter: given.Adapter = None,
+    module_map: given.ModuleMap = None,
     host_stage: Stage = "",
     weather: Weather = "",
     drive_on: DriveOn = False,
@@ -78,13 +79,13 @@ def evaluate(
     """Drive a policy over routes of highway-env; run it again to go on.
 
     Another evaluator takes options of its own; --evaluator and --force alone are
-    for all. --check looks at POLICY, --adapter and --provider alone; 1 if it could
-    not drive.
+    for all. --check looks at POLICY, --adapter, --map and --provider alone; 1 if it
+    could not drive.
     """
     runs = provider_named(provider, plugins or ())
     # --check drives nothing, and needs no folder
     if check:
-        _check(policy, adapter, runs)
+        _check(policy, adapter, module_map, runs)
         return
     if output is None:
         raise typer.BadParameter("driving needs -o RESULTS/", param_hint="-o")
@@ -92,8 +93,8 @@ def evaluate(
     options = workflow.EvaluateOptions(
         routes=routes, road=road, latency=latency, latency_scale=latency_scale,
         latency_model=latency_model, in_order=in_order, seed=seed, workers=workers,
-        dt_ms=dt_ms, adapter=adapter, host_stage=host_stage, weather=weather,
-        drive_on=drive_on,
+        dt_ms=dt_ms, adapter=adapter, module_map=module_map, host_stage=host_stage,
+        weather=weather, drive_on=drive_on,
         frame_limit_s=frame_limit, engine=engine_name, address=address, render=render,
         provider=runs, force=force,
         evaluator=evaluator,
@@ -105,10 +106,12 @@ def evaluate(
         tell(f"wrote {file}")
 
 
-def _check(policy: str | None, adapter: Path | None, runs: Provider) -> None:
+def _check(
+    policy: str | None, adapter: Path | None, module_map: str | None, runs: Provider
+) -> None:
     if policy is None:
         raise typer.BadParameter("--check needs a policy", param_hint="POLICY")
     with listening() as listener:
-        found = check_model(policy, adapter, runs, listener)
+        found = check_model(policy, adapter, runs, listener, module_map)
     show(found)
     found.check()

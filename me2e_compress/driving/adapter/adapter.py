@@ -68,16 +68,22 @@ class Adapter(BaseModel):
         """Read a TOML file."""
         try:
             content = documents.from_toml(documents.content(path))
-            return cls.model_validate(content, context=path.parent)
         except OSError as error:
             raise EvaluationError(f"{path}: {error.strerror}") from error
         except documents.MalformedError as error:
             raise EvaluationError(f"{path}: not TOML: {error}") from error
+        return cls.parse(content, f"{path}: adapter", path.parent)
+
+    @classmethod
+    def parse(cls, content: object, origin: str, folder: Path | None = None) -> Self:
+        """Read what a document holds; ``origin`` is its name in error messages."""
+        try:
+            return cls.model_validate(content, context=folder)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"]))
             words = first["msg"].removeprefix("Value error, ")
-            raise EvaluationError(f"{path}: adapter {where}: {words}") from error
+            raise EvaluationError(f"{origin} {where}: {words}") from error
 
     @classmethod
     def digest(cls, path: Path) -> str:

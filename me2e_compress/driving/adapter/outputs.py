@@ -120,12 +120,10 @@ def plan_of(
         )
     if found.output not in outputs:
         raise EvaluationError(
-            f"no output {found.output}, which the adapter names as the plan; there "
-            f"are {there}"
+            f"no output {found.output}, which is named as the plan; there are {there}"
         )
     if found.scores is not None and found.scores not in outputs:
         raise EvaluationError(
-            f"no output {found.scores}, which the adapter names as the scores; "
-            f"there are {there}"
+            f"no output {found.scores}, which is named as the scores; there are {there}"
         )
     return found

@@ -13,7 +13,8 @@ from me2e_compress.driving.policies import POLICIES, Driver, SizedPolicy
 from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import EvaluationError
-from me2e_compress.graph import sha256_of
+from me2e_compress.graph import LoadedModel, sha256_of
+from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.runtime.providers import CPU, Provider
 
 
@@ -63,6 +64,8 @@ class OnnxDriver(Driver):
         path: The file, or the TOML of the stack.
         adapter: TOML file that adapts the model to the contract, or the name of one
             that ships; None where the model keeps it as it is.
+        module_map: Preset or TOML file that says which output is the plan and which are
+            fed back; None leaves that to the model.
         provider: What runs it; as a text ``cpu``, ``tensorrt{cache=engines}``.
         host_stage: Changes the plan on the host, as a text ``collision-optimizer``;
             None leaves it as the network has it.
@@ -71,6 +74,7 @@ class OnnxDriver(Driver):
     name: ClassVar[str] = "onnx"
     path: Path
     adapter: Path | None = None
+    module_map: str | None = None
     provider: Provider = CPU
     host_stage: HostStage | None = None
 
@@ -89,7 +93,16 @@ class OnnxDriver(Driver):
                 f" are {', '.join(POLICIES.names())}"
             )
         adapter = None if self.adapter is None else Adapter.load(self.adapter)
-        return OnnxPolicy.open(self.path, adapter, self.provider, self.host_stage)
+        stage, said = self.host_stage, self.said()
+        return OnnxPolicy.open(self.path, adapter, self.provider, stage, said)
+
+    def said(self) -> dict[str, str]:
+        """Return what the map says, as metadata of the graph."""
+        from me2e_compress.driving.adapter.stated import adapted
+
+        if self.module_map is None:
+            return {}
+        return adapted(LoadedModel.load(self.path).model, None, self.module_map)
 
     @property
     def label(self) -> str:
@@ -103,6 +116,8 @@ class OnnxDriver(Driver):
             from me2e_compress.driving.adapter import Adapter
 
             digests.append(Adapter.digest(self.adapter))
+        if self.module_map is not None:
+            digests.append(repr(ModuleMap.load(self.module_map)))
         if self.provider != CPU:
             digests.append(str(self.provider))
         if self.host_stage is not None:

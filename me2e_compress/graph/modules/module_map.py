@@ -51,6 +51,21 @@ class Module:
     substitutes: tuple[Substitute, ...] = ()
 
 
+class _Strict(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+class Ports(_Strict):
+    """Which output is the plan, and which inputs are fed back.
+
+    ``plan`` has the keys of an adapter's ``[plan]``, None to leave it open;
+    ``recurrent`` maps an input to the output that answers it.
+    """
+
+    plan: dict[str, pydantic.JsonValue] | None = None
+    recurrent: dict[str, str] = {}
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class ModuleMap(Displayed):
     """The modules of a stack and the names they go by.
@@ -66,11 +81,16 @@ class ModuleMap(Displayed):
         modules: in the order of the file.
         strip: leading components that wrappers add, dropped from every path
             (``module.img_neck`` is ``img_neck``).
+        ports: plan and state of the graph.
+        optional: those of several exports of a stack; each holds where all its names
+            are there, and the graph's metadata do not say it.
     """
 
     name: str
     modules: tuple[Module, ...]
     strip: tuple[str, ...] = ()
+    ports: Ports = dataclasses.field(default=Ports(), hash=False)
+    optional: tuple[Ports, ...] = dataclasses.field(default=(), hash=False)
 
     @classmethod
     def load(cls, source: str | Path) -> Self:
@@ -88,6 +108,10 @@ class ModuleMap(Displayed):
         scope = "*.ego_map_decoder"
         by = "*.ego_agent_decoder"            # left out: zeros
         reader = "planner"                    # left out: whoever read it
+        [plan]                                # or [recurrent]: as in an adapter
+        output = "ego_fut_preds"
+        [[optional]]                          # where all names are there
+        recurrent = { prev_bev = "bev_embed" }
         ```
 
         Raises:
@@ -128,6 +152,8 @@ class ModuleMap(Displayed):
             name,
             tuple(table.module(key) for key, table in draft.modules.items()),
             draft.strip,
+            Ports(plan=draft.plan, recurrent=draft.recurrent),
+            draft.optional,
         )
 
     @classmethod
@@ -229,10 +255,6 @@ def _checked(texts: tuple[str, ...]) -> tuple[str, ...]:
     return texts
 
 
-class _Strict(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
-
-
 class _SubstituteTable(_Strict):
     scope: str
     by: str | None = None
@@ -272,6 +294,7 @@ class _ModuleTable(_Strict):
         )
 
 
-class _File(_Strict):
+class _File(Ports):
+    optional: tuple[Ports, ...] = ()
     strip: tuple[str, ...] = ()
     modules: dict[str, _ModuleTable] = pydantic.Field(min_length=1)

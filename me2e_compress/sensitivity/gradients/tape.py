@@ -53,6 +53,15 @@ class Tape:
         self.graph.append(node)
         return node.outputs[-1]
 
+    def zero_after(self, values: Sequence[ir.Value]) -> ir.Value:
+        """Return a zero that is known once some floats are.
+
+        What reads it waits for them: onnxruntime runs nodes as soon as it may, and
+        would keep what they give.
+        """
+        sums = [self.op("ReduceSum", [each], {"keepdims": 0}) for each in values]
+        return self.times(self.op("Sum", sums), self.number(0, values[0]))
+
     def _name(self, what: str) -> str:
         return rewrite.fresh_name(f"me2e_{what}_{len(self._names)}", self._names)
 

@@ -16,6 +16,7 @@ from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.trajectory import Floats
+from me2e_compress.workflows.check_model import check_model
 from tests.evaluators.highway.drivers import EXIT, straight_on
 from tests.evaluators.highway.test_onnx_policy import observation
 
@@ -131,3 +132,38 @@ def test_a_host_stage_takes_six_waypoints_of_any_plan(tmp_path: Path) -> None:
     assert isinstance(found, Trajectory)
     assert found.points[:, 0].tolist() == [2.0, 4.0, 6.0, 8.0, 10.0, 12.0]
     assert found.points[2].tolist() == [6.0, 0.5]
+
+
+MAP = """
+[plan]
+output = "way"
+[modules.all]
+role = "feature"
+optional = ["**"]
+"""
+
+
+def test_a_module_map_names_the_plan(tmp_path: Path) -> None:
+    model = straight_on(
+        tmp_path / "m.onnx",
+        outputs="float[1, 6, 2] way",
+        body="way = Identity (ahead)",
+    )
+    (tmp_path / "map.toml").write_text(MAP)
+    driver = OnnxDriver(model, module_map=str(tmp_path / "map.toml"))
+    with pytest.raises(EvaluationError, match="no output plan"):
+        OnnxDriver(model).open()
+
+    policy = driver.open()
+    policy.reset(EXIT)
+
+    assert isinstance(policy.plan(observation()), Trajectory)
+    assert driver.fingerprint() != OnnxDriver(model).fingerprint()
+    assert check_model(model, module_map=driver.module_map).problems == ()
+
+
+def test_a_module_map_of_another_graph_does_not_drive(tmp_path: Path) -> None:
+    (tmp_path / "map.toml").write_text(MAP.replace("way", "path"))
+    driver = OnnxDriver(controlled(tmp_path), module_map=str(tmp_path / "map.toml"))
+    with pytest.raises(EvaluationError, match=r"^map map: no output path"):
+        driver.open()

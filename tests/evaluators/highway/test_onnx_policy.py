@@ -274,7 +274,7 @@ def test_a_model_that_breaks_the_contract_never_drives(
         ("[inputs]\npicture = 'img'", "adapter inputs.picture"),
         (
             "[plan]\noutput = 'way'",
-            "no output way, which the adapter names as the plan; there are plan",
+            "no output way, which is named as the plan; there are plan",
         ),
         ("[inputs]\nimg = 'image'", "the adapter names input image; there are command"),
         ("[recurrent]\ncommand = 'x'", "the adapter names output x; there are plan"),
