@@ -7,9 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress import graph
+from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import QuantPlan, make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.targets import TARGETS
 from me2e_compress.targets.weights import (
     QuantizedWeight,
     balanced_steps,
@@ -100,6 +102,20 @@ def test_the_paper_rounds_to_nearest(rules: str) -> None:
     assert not plan.balanced
     assert "c" in found
     assert all((found[n].integers == nearest(model, n)).all() for n in found)
+
+
+@pytest.mark.parametrize("target", ["tensorrt", "onnxruntime"])
+@pytest.mark.parametrize("rules", ["paper", LOOSE])
+def test_targets_round_as_the_plan_says(target: str, rules: str) -> None:
+    model = made()
+    plan, found = stored(model, rules)
+    runtime = TARGETS.parse(target)
+    tensors = dict.fromkeys(runtime.tensors(plan, model), (-3.0, 3.0))
+    placed = runtime.place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
+    arrays = map(graph.array_of, placed.graph.initializers.values())
+    (filters,) = (a for a in arrays if a is not None and a.shape == (16, 16, 3, 3))
+    assert (filters == found["c"].integers).all()
+    assert bool((filters != nearest(model, "c")).any()) == plan.balanced
 
 
 def test_a_weight_that_two_layers_share_is_stored_once() -> None:
