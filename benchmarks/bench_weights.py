@@ -6,7 +6,7 @@
 Each layer reads the float graph's tensors and is computed once with its weight and
 once with what rounding adds to it, so that nothing else is in the figures. Rows are
 kinds of layers by what makes their input, ``Conv 3x3`` standing for every kernel of
-more than one tap; the gain is in dB, mean and least over the layers of a row. All of
+more than one pixel; the gain is in dB, mean and least over the layers of a row. All of
 them are balanced here: the rule of ``targets/weights.py`` follows from the rows.
 """
 
@@ -82,8 +82,9 @@ def rows(subject: subjects.Subject, count: int) -> Iterator[tuple[str, ...]]:
 def kind_of(node: ir.Node) -> tuple[str, str]:
     """Name a layer and what makes its input."""
     weight, made = graph.static_shape(node.inputs[1]), producer_of(node.inputs[0])
-    taps = int(np.prod((weight or ())[2:])) if node.op_type in graph.CONVOLUTIONS else 0
-    size = {0: "", 1: " 1x1"}.get(taps, " 3x3")
+    size = ""
+    if node.op_type in graph.CONVOLUTIONS:
+        size = " 1x1" if np.prod((weight or ())[2:]) == 1 else " 3x3"
     return node.op_type + size, "an input" if made is None else made.op_type
 
 

@@ -6,6 +6,7 @@ the actions. Who exports that model gets all eight.
 """
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -52,7 +53,7 @@ class Branches(nn.Module):
             model.add_module(name, _branch(width, size, seed))
             module.register_forward_hook(self._keep(name))
 
-    def _keep(self, name: str):  # type: ignore[no-untyped-def]
+    def _keep(self, name: str) -> Callable[[nn.Module, object, Tensor], None]:
         def keep(module: nn.Module, given: object, answer: Tensor) -> None:
             self.seen[name] = answer
 

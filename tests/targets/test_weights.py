@@ -55,10 +55,10 @@ def nearest(model: ir.Model, output: str) -> np.ndarray:
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.integers(1, 40))
 def test_errors_of_a_channel_and_its_kernels_cancel(
-    seed: int, taps: int, inputs: int
+    seed: int, elements: int, inputs: int
 ) -> None:
     random = np.random.default_rng(seed)
-    exact = random.uniform(-127, 127, (3, inputs, taps)).astype(np.float32)
+    exact = random.uniform(-127, 127, (3, inputs, elements)).astype(np.float32)
     error = balanced_steps(exact) - exact
     assert np.abs(error).max() < 1
     assert np.abs(error.sum(2)).max() <= 1 + 1e-9
