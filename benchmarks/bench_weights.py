@@ -69,12 +69,12 @@ def rows(subject: subjects.Subject, count: int) -> Iterator[tuple[str, ...]]:
     groups = defaultdict[tuple[str, str], list[tuple[float, float]]](list)
     for kind, (signal, *noises) in zip(kinds, names, strict=True):
         if power[signal]:
-            near, even = (10 * np.log10(power[signal] / power[e]) for e in noises)
-            groups[kind].append((near, even - near))
-    for (layer, reads), found in sorted(groups.items()):
-        near, gain = np.array(found).T
+            nearest, even = (10 * np.log10(power[signal] / power[e]) for e in noises)
+            groups[kind].append((nearest, even - nearest))
+    for (layer, reads), pairs in sorted(groups.items()):
+        near, gain = np.array(pairs).T
         yield (
-            *(layer, reads, str(len(found)), f"{near.mean():.1f}"),
+            *(layer, reads, str(len(pairs)), f"{near.mean():.1f}"),
             f"{gain.mean():+.1f}, {gain.min():+.1f}",
         )
 
@@ -90,17 +90,18 @@ def kind_of(node: ir.Node) -> tuple[str, str]:
 
 def watch(model: ir.Model, node: ir.Node, axis: int | None) -> list[str]:
     """Add the power of a layer's answer and of both roundings' errors as outputs."""
-    exact = array_of(node.inputs[1])
-    assert exact is not None
+    stored = array_of(node.inputs[1])
+    assert stored is not None
     assert axis is not None
+    exact = stored.astype(np.float32)
     flat = exact.reshape(exact.shape[-2:]) if node.op_type == "MatMul" else exact
     side = 1 if node.op_type == "MatMul" else axis
     weights = [exact]
     for balanced in (False, True):
         integers, scales = quantize_weight(flat, side, balanced=balanced)
         sides = [-1 if at == side else 1 for at in range(flat.ndim)]
-        stored = integers * scales.reshape(sides)
-        weights.append((stored - flat).reshape(exact.shape).astype(np.float32))
+        error = integers * scales.reshape(sides) - flat
+        weights.append(error.reshape(exact.shape).astype(np.float32))
     names = [f"{node.outputs[0].name}_power_{at}" for at in range(len(weights))]
     for name, array in zip(names, weights, strict=True):
         weight = ir.Value(name=f"{name}_of", const_value=ir.tensor(array))

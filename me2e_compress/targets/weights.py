@@ -106,8 +106,9 @@ def balanced_steps(exact: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
     It is SQuant's rounding (Guo et al., ICLR 2022, arXiv 2202.07471), in one pass over
     kernels and one over channels. It needs no frames.
     """
-    steps = np.rint(exact.astype(np.float64))
-    error = steps - exact
+    wide = exact.astype(np.float64)
+    steps: npt.NDArray[np.float64] = np.rint(wide)
+    error: npt.NDArray[np.float64] = steps - wide
     # The elements of a kernel
     moved = _excess(error)
     steps, error = steps - moved, error - moved

@@ -50,7 +50,8 @@ def nearest(model: ir.Model, output: str) -> np.ndarray:
     node = next(n for n in model.graph if n.outputs[0].name == output)
     weight = graph.array_of(node.inputs[1])
     assert weight is not None
-    return quantize_weight(weight, 0 if node.op_type == "Conv" else 1)[0]
+    wide = weight.astype(np.float32)
+    return quantize_weight(wide, 0 if node.op_type == "Conv" else 1)[0]
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.integers(1, 40))
