@@ -1,7 +1,7 @@
 """Int8 on onnxruntime's CPU: our files beside those of other tools, in one run.
 
     python -m benchmarks.bench_int8_cpu OUT [--subjects resnet50,vad-tiny]
-        [--peer-python PYTHON] [--frames 2] [--rounds 4]
+        [--peer-python PYTHON] [--frames 2] [--held-out 2] [--rounds 4]
 
 Every tool quantizes the same graph, after the exact passes, with the same frames, all
 modules; the frames compared on are of another seed. Files stay in OUT and are not made
@@ -57,6 +57,10 @@ PEERS = {
 OURS: dict[str, tuple[str, Pass]] = {
     "ours for TensorRT, rules paper": (FLOAT, QuantizeInt8(rules="paper")),
     "ours": (FLOAT, QuantizeInt8(target="onnxruntime")),
+    "ours, weights to nearest": (
+        FLOAT,
+        QuantizeInt8(target="onnxruntime", rules="safe{balance=false}"),
+    ),
     "ours, rules paper": (FLOAT, QuantizeInt8(target="onnxruntime", rules="paper")),
     "ModelOpt, lowered": ("ModelOpt", LowerInt8()),
 }
@@ -84,6 +88,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--subjects", default="resnet50,vad-tiny")
     parser.add_argument("--frames", type=int, default=2)
+    parser.add_argument("--held-out", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--limit-gb", type=float, default=14)
@@ -98,7 +103,8 @@ def main() -> None:
         return
     chosen.out.mkdir(parents=True, exist_ok=True)
     for name in chosen.subjects.split(","):
-        subject = subjects.make(name, chosen.out, chosen.frames)
+        held_out = max(chosen.held_out, subjects.HELD_OUT)
+        subject = subjects.make(name, chosen.out, chosen.frames, held_out)
         print(f"\n{name}, {chosen.frames} frames, {chosen.threads} threads", flush=True)
         done, missing = files(subject, chosen)
         show(measure(subject, done, missing, chosen), missing)
@@ -168,6 +174,7 @@ def own(
     """Give the command of a child process."""
     command = [sys.executable, "-m", "benchmarks.bench_int8_cpu", str(subject.folder)]
     command += ["--child", job, "--file", name, "--threads", str(chosen.threads)]
+    command += ["--held-out", str(chosen.held_out)]
     return [*command, "--frames", str(chosen.frames)]
 
 
@@ -238,7 +245,9 @@ def weigh(chosen: argparse.Namespace) -> dict[str, object]:
         frames = CalibrationSet(subject.held_out)
         reference = Session(subject.model, threads=chosen.threads, release=True)
         try:
-            fidelity = compare(reference, session, [frames[0], frames[1]])
+            fidelity = compare(
+                reference, session, [frames[at] for at in range(chosen.held_out)]
+            )
         except GraphError as error:
             return {"refused": str(error)}
         found = {each.name: each.sqnr_db for each in fidelity.outputs}

@@ -94,6 +94,7 @@ def int8_row(subject: subjects.Subject, chosen: argparse.Namespace) -> str:
     given = argparse.Namespace(
         without=";".join(OTHERS),
         frames=4,
+        held_out=2,
         threads=exact.THREADS,
         limit_gb=14.0,
         rounds=chosen.rounds,

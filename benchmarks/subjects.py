@@ -5,6 +5,7 @@
 * ``vad-tiny``: the reference stack.
 * ``vad-tiny-original``: the same, see :mod:`benchmarks.original_patterns`.
 * ``uniad-tiny``, ``tcp``: other stacks of the zoo.
+* ``tcp-original``: with all eight outputs, see :mod:`benchmarks.original_tcp`.
 * ``highway``: the driver that ships; its frames need the extra ``highway``.
 * the models of :mod:`benchmarks.model_kinds`, which need the extra ``models``.
 
@@ -17,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import bev_head, original_patterns, resnet50
+from benchmarks import bev_head, original_patterns, original_tcp, resnet50
 from benchmarks.subject import Subject, at
 from me2e_compress import graph
 from me2e_compress.workflows.compress import CompressOptions, compress
@@ -26,12 +27,14 @@ from me2e_compress.workflows.frames import FramesOptions, record_frames
 
 __all__ = ["SUBJECTS", "Subject", "at", "make"]
 
-ORIGINAL = original_patterns.NAME
+ORIGINALS = {each.NAME: each for each in (original_patterns, original_tcp)}
+"""Stacks of the zoo in the forms of the published code."""
 PRESETS = {
     "vad-tiny": "vad",
-    ORIGINAL: "vad",
+    "vad-tiny-original": "vad",
     "uniad-tiny": "uniad",
     "tcp": "tcp",
+    "tcp-original": "tcp",
     "highway": "highway",
 }
 """Module maps of the stacks of the zoo."""
@@ -41,11 +44,12 @@ WHOLE = """
 role = "feature"
 optional = ["*"]
 """
+HELD_OUT = 4
 SCENE = 4
 """Frames a scene, where frames follow each other."""
 
 
-def make(name: str, out: Path, frames: int) -> Subject:
+def make(name: str, out: Path, frames: int, held_out: int = HELD_OUT) -> Subject:
     """Write a subject, unless it is there with as many frames."""
     subject = Subject(name, out / name)
     if name not in SUBJECTS:
@@ -53,7 +57,8 @@ def make(name: str, out: Path, frames: int) -> Subject:
     subject.folder.mkdir(parents=True, exist_ok=True)
     if not subject.model.is_file():
         _export(subject)
-    for folder, count, seed in ((subject.frames, frames, 0), (subject.held_out, 4, 1)):
+    recordings = (subject.frames, frames, 0), (subject.held_out, held_out, 1)
+    for folder, count, seed in recordings:
         if len(list(folder.glob("*.npz"))) < count:
             shutil.rmtree(folder, ignore_errors=True)
             _record(name, folder, count, seed)
@@ -74,8 +79,8 @@ def _make_kind(subject: Subject) -> Subject:
 
 def _export(subject: Subject) -> None:
     if subject.name in PRESETS:
-        if subject.name == ORIGINAL:
-            original_patterns.export(subject.source)
+        if subject.name in ORIGINALS:
+            ORIGINALS[subject.name].export(subject.source)
         else:
             export_stack(subject.name, subject.source)
         preset = f"modules/presets/{PRESETS[subject.name]}.toml"
@@ -91,7 +96,7 @@ def _export(subject: Subject) -> None:
 
 def _record(name: str, folder: Path, count: int, seed: int) -> None:
     if name in PRESETS:
-        stack = original_patterns.OF if name == ORIGINAL else name
+        stack = ORIGINALS[name].OF if name in ORIGINALS else name
         record_frames(stack, folder, FramesOptions(count, seed, SCENE))
     elif name == "bev-head":
         bev_head.record(folder, count, seed)

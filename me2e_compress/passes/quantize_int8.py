@@ -255,7 +255,7 @@ def store_weights(model: ir.Model, plan: QuantPlan) -> None:
     chosen = plan.weight_only
     if not chosen:
         return
-    weights = weights_of(model, chosen)
+    weights = weights_of(model, chosen, balanced=plan.balanced)
     nodes = {str(node.outputs[0].name): node for node in model.graph}
     writer = Writer(model.graph)
     for decision in chosen:

@@ -55,7 +55,7 @@ class ErrorSources:
         made_of, _ = compiled_or_expanded(copy, compiled=False)
         graph.infer_shapes(made_of)
         values = {str(v.name): v for node in made_of.graph for v in node.outputs}
-        weights = weights_of(model, plan.placed)
+        weights = weights_of(model, plan.placed, balanced=plan.balanced)
         return cls(
             made_of,
             {values[name]: layer for name, layer in probes.items()},

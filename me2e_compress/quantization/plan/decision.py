@@ -110,6 +110,7 @@ class QuantPlan(Displayed):
         groups: what was decided together.
         kept_float: int8 nodes that stay float on the target; empty before the plan was
             carried out for one.
+        balanced: whether weights are rounded so that their errors cancel.
     """
 
     scheme: QuantScheme
@@ -117,6 +118,7 @@ class QuantPlan(Displayed):
     rules: str = "paper"
     groups: tuple[ScaleGroup, ...] = ()
     kept_float: tuple[KeptFloat, ...] = ()
+    balanced: bool = False
 
     @property
     def chosen(self) -> tuple[Decision, ...]:

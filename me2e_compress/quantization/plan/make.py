@@ -80,7 +80,8 @@ def make_plan(
     pins.check(decided)
     decisions = tuple(decided.values())
     groups = find_groups(main, decided, pins, concat=asked.share_concat)
-    return QuantPlan(scheme, decisions, RULE_SETS.text(asked), groups)
+    text = RULE_SETS.text(asked)
+    return QuantPlan(scheme, decisions, text, groups, balanced=asked.balance)
 
 
 def tensors_of(plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:

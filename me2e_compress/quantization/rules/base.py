@@ -151,12 +151,15 @@ class RuleSet(abc.ABC):
         without: names of rules that are switched off.
         extra: more rules, asked last: ``my-rule``, ``my-rule{limit=3}``, or the rule
             itself, which need not be registered.
+        balance: whether weights are rounded so that the errors of a kernel and of a
+            channel cancel, instead of each to the nearest.
     """
 
     name: ClassVar[str]
     share_concat: ClassVar[bool] = False
     without: tuple[str, ...] = dataclasses.field(default=(), kw_only=True)
     extra: tuple[str | Rule, ...] = dataclasses.field(default=(), kw_only=True)
+    balance: bool = dataclasses.field(default=False, kw_only=True)
 
     def __str__(self) -> str:
         """Return its text, as recipes name it."""

@@ -185,10 +185,12 @@ class SafeRules(PaperRules):
     Attributes:
         attention_limit: longest attention that the paper's stage 1 would make int8, in
             tokens; without ``attention-weights`` it counts.
+        balance: as in every rule set; here weights are balanced unless it is off.
     """
 
     name: ClassVar[str] = "safe"
     share_concat: ClassVar[bool] = True
+    balance: bool = dataclasses.field(default=True, kw_only=True)
 
     def own_rules(self) -> tuple[Rule, ...]:
         """Return rules of operators, safety, the paper's stages, kernels and cost."""

@@ -49,7 +49,7 @@ class OnnxRuntime(Target):
         that :meth:`tensors` lists.
         """
         self.check_types(plan, model)
-        weights = weights_of(model, _layers_of(plan))
+        weights = weights_of(model, _layers_of(plan), balanced=plan.balanced)
         reach = {name: max(-low, high) for name, (low, high) in ranges.tensors.items()}
         sampled = [each.output for each in _sampling(plan)]
         return lower(Draft(model.clone(), weights, reach, sampled))

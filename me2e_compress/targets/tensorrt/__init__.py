@@ -71,7 +71,7 @@ class TensorRT(Target):
         become int8 initializers before a DequantizeLinear.
         """
         self.check_types(plan, model)
-        weights = weights_of(model, plan.chosen)
+        weights = weights_of(model, plan.chosen, balanced=plan.balanced)
         copy = model.clone()
         nodes = {str(node.outputs[0].name): node for node in copy.graph}
         pairs = _Pairs(copy.graph, share_scales(plan, ranges))
