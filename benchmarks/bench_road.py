@@ -34,6 +34,7 @@ from me2e_compress.evaluators.highway.generate import (
 from me2e_compress.evaluators.highway.results import ResultsFolder, log_beside
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.driving_score import route_score
+from me2e_compress.metrics.surrogate_safety import room_kept
 from me2e_compress.runtime.children import pool
 from me2e_compress.simulator.routes import SETS, Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
@@ -158,23 +159,19 @@ def admission(path: Path) -> None:
 
 def compare(folders: Sequence[Path]) -> None:
     """Print how drives of one set differ."""
+    driven = [ResultsFolder.open(path).episodes() for path in folders]
     scores = [
-        {
-            name: route_score(one).composed
-            for name, one in ResultsFolder.open(path).episodes().items()
-        }
-        for path in folders
+        {name: route_score(one).composed for name, one in own.items()} for own in driven
     ]
-    for path, own in zip(folders, scores, strict=True):
+    for path, own, episodes in zip(folders, scores, driven, strict=True):
         whole = fmean(score == 100.0 for score in own.values())
-        log = log_beside(path).read_text().splitlines()
-        costs = [json.loads(line) for line in log]
-        frames, seconds = (
-            fmean(e[key] for e in costs) for key in ("frames", "seconds")
-        )
+        room = [room_kept(one).value for one in episodes.values()]
+        room_100 = fmean(each == 100.0 for each in room)
+        costs = [json.loads(line) for line in log_beside(path).open()]
+        frames, seconds = (fmean(e[k] for e in costs) for k in ("frames", "seconds"))
         print(
-            f"{path}: {len(own)} routes, {whole:.1%} at exactly 100,"
-            f" {frames:.0f} frames and {seconds:.1f} s a route"
+            f"{path}: {len(own)} routes, {whole:.1%} at exactly 100 (room kept:"
+            f" {room_100:.1%}), {frames:.0f} frames and {seconds:.1f} s a route"
         )
     shared = [name for name in scores[0] if all(name in own for own in scores)]
     unlike = [name for name in shared if len({own[name] for own in scores}) > 1]
