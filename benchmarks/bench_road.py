@@ -41,7 +41,6 @@ from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from me2e_compress.simulator.scene import EventKind, Scene, SignalKind, SignalState
 from me2e_compress.simulator.world import World
 
-SPEEDS_MPS = (4.0, 6.0, 8.0, 10.0, 12.0)
 NEAR_M, MOVING_MPS = 80.0, 0.3
 AHEAD_M = 40.0
 """A light that is this near shows the ego its phase."""
@@ -98,19 +97,28 @@ def blind_drive(route: Route, speed_mps: float) -> BlindDrive:
     return BlindDrive(EventKind.TRIGGER in kinds, bool(episode.infractions), any(lit))
 
 
-def look_at(route: Route) -> Look:
+def look_at(route: Route, speeds: Sequence[float]) -> Look:
     """Look at one route."""
     scene = World(route).scene()
-    drives = tuple(blind_drive(route, speed) for speed in SPEEDS_MPS)
+    drives = tuple(blind_drive(route, speed) for speed in speeds)
     has_sign = any(each.kind in SIGNS for each in scene.signals)
     return Look(route, moving_near(scene), has_sign, drives)
 
 
-def show(routes: Sequence[Route], workers: int) -> None:
-    """Print the tables of some routes."""
+def show(
+    routes: Sequence[Route], speeds: Sequence[float], variants: int, workers: int
+) -> None:
+    """Print the tables of some routes, of which so many of each type are driven."""
+    count = Counter[str]()
     with pool(workers) as processes:
-        looks = list(processes.map(look_at, routes))
-    print("type | moving | meets at 4, 6, 8, 10, 12 m/s | infractions at these")
+        waiting = []
+        for route in routes:
+            driven = speeds if count[route.scenario] < variants else ()
+            waiting.append(processes.submit(look_at, route, driven))
+            count[route.scenario] += 1
+        looks = [each.result() for each in waiting]
+    words = ", ".join(f"{speed:g}" for speed in speeds)
+    print(f"type | moving | meets at {words} m/s | infractions at these")
     print("---|---|---|---")
     lit, signed = set[str](), set[str]()
     for name in dict.fromkeys(route.scenario for route in routes):
@@ -126,7 +134,7 @@ def show(routes: Sequence[Route], workers: int) -> None:
 
 
 def _shares(looks: Sequence[Look]) -> str:
-    columns = list(zip(*(each.drives for each in looks), strict=True))
+    columns = list(zip(*(each.drives for each in looks if each.drives), strict=True))
     met = " ".join(f"{fmean(e.met for e in drives):.0%}" for drives in columns)
     failed = " ".join(
         f"{fmean(e.infraction for e in drives):.0%}" for drives in columns
@@ -185,11 +193,14 @@ def main() -> None:
     parser.add_argument("--road", type=int, default=2)
     parser.add_argument("--fresh", type=int, help="proposals of each type, no set")
     parser.add_argument("--types", default=",".join(SCENARIO_ABILITIES))
+    parser.add_argument("--speeds", default="4,6,8,10,12", help="of blind drivers")
+    parser.add_argument("--variants", type=int, default=5, help="driven of each type")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--admission", type=Path, help="what routes --json printed")
     parser.add_argument("--compare", type=Path, nargs="+", help="results folders")
     given = parser.parse_args()
+    speeds = [float(each) for each in given.speeds.split(",")]
     if given.compare:
         compare(given.compare)
     elif given.admission:
@@ -200,11 +211,12 @@ def main() -> None:
             for name in given.types.split(",")
             for k in range(given.fresh)
         ]
-        show(proposals, given.workers)
+        show(proposals, speeds, given.variants, given.workers)
     else:
         there = load_routes(given.routes or SETS[given.road])
         types = given.types.split(",")
-        show([each for each in there if each.scenario in types], given.workers)
+        picked = [each for each in there if each.scenario in types]
+        show(picked, speeds, given.variants, given.workers)
 
 
 if __name__ == "__main__":
