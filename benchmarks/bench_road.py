@@ -34,13 +34,13 @@ from me2e_compress.evaluators.highway.generate import (
 from me2e_compress.evaluators.highway.results import ResultsFolder, log_beside
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.driving_score import route_score
+from me2e_compress.metrics.surrogate_safety import room_kept
 from me2e_compress.runtime.children import pool
 from me2e_compress.simulator.routes import SETS, Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from me2e_compress.simulator.scene import EventKind, Scene, SignalKind, SignalState
 from me2e_compress.simulator.world import World
 
-SPEEDS_MPS = (4.0, 6.0, 8.0, 10.0, 12.0)
 NEAR_M, MOVING_MPS = 80.0, 0.3
 AHEAD_M = 40.0
 """A light that is this near shows the ego its phase."""
@@ -97,19 +97,28 @@ def blind_drive(route: Route, speed_mps: float) -> BlindDrive:
     return BlindDrive(EventKind.TRIGGER in kinds, bool(episode.infractions), any(lit))
 
 
-def look_at(route: Route) -> Look:
+def look_at(route: Route, speeds: Sequence[float]) -> Look:
     """Look at one route."""
     scene = World(route).scene()
-    drives = tuple(blind_drive(route, speed) for speed in SPEEDS_MPS)
+    drives = tuple(blind_drive(route, speed) for speed in speeds)
     has_sign = any(each.kind in SIGNS for each in scene.signals)
     return Look(route, moving_near(scene), has_sign, drives)
 
 
-def show(routes: Sequence[Route], workers: int) -> None:
-    """Print the tables of some routes."""
+def show(
+    routes: Sequence[Route], speeds: Sequence[float], variants: int, workers: int
+) -> None:
+    """Print the tables of some routes, of which so many of each type are driven."""
+    count = Counter[str]()
     with pool(workers) as processes:
-        looks = list(processes.map(look_at, routes))
-    print("type | moving | meets at 4, 6, 8, 10, 12 m/s | infractions at these")
+        waiting = []
+        for route in routes:
+            driven = speeds if count[route.scenario] < variants else ()
+            waiting.append(processes.submit(look_at, route, driven))
+            count[route.scenario] += 1
+        looks = [each.result() for each in waiting]
+    words = ", ".join(f"{speed:g}" for speed in speeds)
+    print(f"type | moving | meets at {words} m/s | infractions at these")
     print("---|---|---|---")
     lit, signed = set[str](), set[str]()
     for name in dict.fromkeys(route.scenario for route in routes):
@@ -125,7 +134,7 @@ def show(routes: Sequence[Route], workers: int) -> None:
 
 
 def _shares(looks: Sequence[Look]) -> str:
-    columns = list(zip(*(each.drives for each in looks), strict=True))
+    columns = list(zip(*(each.drives for each in looks if each.drives), strict=True))
     met = " ".join(f"{fmean(e.met for e in drives):.0%}" for drives in columns)
     failed = " ".join(
         f"{fmean(e.infraction for e in drives):.0%}" for drives in columns
@@ -158,23 +167,19 @@ def admission(path: Path) -> None:
 
 def compare(folders: Sequence[Path]) -> None:
     """Print how drives of one set differ."""
+    driven = [ResultsFolder.open(path).episodes() for path in folders]
     scores = [
-        {
-            name: route_score(one).composed
-            for name, one in ResultsFolder.open(path).episodes().items()
-        }
-        for path in folders
+        {name: route_score(one).composed for name, one in own.items()} for own in driven
     ]
-    for path, own in zip(folders, scores, strict=True):
+    for path, own, episodes in zip(folders, scores, driven, strict=True):
         whole = fmean(score == 100.0 for score in own.values())
-        log = log_beside(path).read_text().splitlines()
-        costs = [json.loads(line) for line in log]
-        frames, seconds = (
-            fmean(e[key] for e in costs) for key in ("frames", "seconds")
-        )
+        room = [room_kept(one).value for one in episodes.values()]
+        room_100 = fmean(each == 100.0 for each in room)
+        costs = [json.loads(line) for line in log_beside(path).open()]
+        frames, seconds = (fmean(e[k] for e in costs) for k in ("frames", "seconds"))
         print(
-            f"{path}: {len(own)} routes, {whole:.1%} at exactly 100,"
-            f" {frames:.0f} frames and {seconds:.1f} s a route"
+            f"{path}: {len(own)} routes, {whole:.1%} at exactly 100 (room kept:"
+            f" {room_100:.1%}), {frames:.0f} frames and {seconds:.1f} s a route"
         )
     shared = [name for name in scores[0] if all(name in own for own in scores)]
     unlike = [name for name in shared if len({own[name] for own in scores}) > 1]
@@ -188,11 +193,14 @@ def main() -> None:
     parser.add_argument("--road", type=int, default=2)
     parser.add_argument("--fresh", type=int, help="proposals of each type, no set")
     parser.add_argument("--types", default=",".join(SCENARIO_ABILITIES))
+    parser.add_argument("--speeds", default="4,6,8,10,12", help="of blind drivers")
+    parser.add_argument("--variants", type=int, default=5, help="driven of each type")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--admission", type=Path, help="what routes --json printed")
     parser.add_argument("--compare", type=Path, nargs="+", help="results folders")
     given = parser.parse_args()
+    speeds = [float(each) for each in given.speeds.split(",")]
     if given.compare:
         compare(given.compare)
     elif given.admission:
@@ -203,11 +211,12 @@ def main() -> None:
             for name in given.types.split(",")
             for k in range(given.fresh)
         ]
-        show(proposals, given.workers)
+        show(proposals, speeds, given.variants, given.workers)
     else:
         there = load_routes(given.routes or SETS[given.road])
         types = given.types.split(",")
-        show([each for each in there if each.scenario in types], given.workers)
+        picked = [each for each in there if each.scenario in types]
+        show(picked, speeds, given.variants, given.workers)
 
 
 if __name__ == "__main__":

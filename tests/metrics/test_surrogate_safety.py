@@ -51,6 +51,7 @@ def test_the_smallest_of_a_route() -> None:
 
 
 def test_room_is_kept_by_who_comes_near_nobody() -> None:
+    assert NEAR_MISS.conflicts is not None
     close = dataclasses.replace(
         NEAR_MISS.conflicts, encounters=(encounter(0.3, 60.0), encounter(2.0, 90.0))
     )

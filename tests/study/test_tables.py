@@ -42,19 +42,20 @@ def test_the_numbers_are_those_of_the_drives(found: StudyResult) -> None:
     row = scoreboards(found)[0].rows[3]
 
     assert row[1] == estimate_cell(scores.driving_score)
-    assert row[6] == measure_cell(found.variants[3].latency_ms[50], ".1f")
-    assert row[8].text == "7.000"
+    assert row[2] == estimate_cell(scores.safety.room_kept)
+    assert row[7] == measure_cell(found.variants[3].latency_ms[50], ".1f")
+    assert row[9].text == "7.000"
 
 
 def test_a_driver_without_a_model_has_reasons_not_numbers(found: StudyResult) -> None:
     row = scoreboards(found)[0].rows[0]
 
-    assert [cell.text for cell in row[5:]] == [MISSING] * 5
-    assert all(cell.reason for cell in row[5:])
+    assert [cell.text for cell in row[6:]] == [MISSING] * 5
+    assert all(cell.reason for cell in row[6:])
 
 
 def test_no_noise_is_not_a_gap(found: StudyResult) -> None:
-    assert scoreboards(found)[0].rows[2][9].text == INFINITE
+    assert scoreboards(found)[0].rows[2][10].text == INFINITE
 
 
 def test_the_baseline_is_not_compared_with_itself(found: StudyResult) -> None:
@@ -104,7 +105,7 @@ def test_one_variant_has_one_scoreboard_of_its_conditions(found: StudyResult) ->
     [table] = scoreboards(alone)
     [mastered] = abilities(alone)
 
-    assert table.columns == ("condition", "DS", "SR %", "DE %", "DC")
+    assert table.columns == ("condition", "DS", "room %", "SR %", "DE %", "DC")
     assert [row[0].text for row in mastered.rows] == ["ideal", "slow"]
     assert [row[0].text for row in table.rows] == ["ideal", "slow"]
     assert "Difference" not in "".join(each.title for each in alone.tables())

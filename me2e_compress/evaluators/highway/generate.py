@@ -201,7 +201,7 @@ OTHER_TRAFFIC = 1_000_003
 """Any number: the seed of the route decides beside it."""
 
 
-MOST_TRIES = 12
+MOST_TRIES = 20
 """Most proposals of a type per wanted route."""
 
 

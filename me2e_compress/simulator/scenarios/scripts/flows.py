@@ -155,7 +155,9 @@ def _platoon(
     """
     route_s, station = meeting(stage, chain)
     if stage.schedule is not None:
-        yield from across(stage, chain, route_s, name)
+        late = sign is not None and sign.kind is SignalKind.TRAFFIC_LIGHT
+        late &= name == "platoon_to_enter"
+        yield from across(stage, chain, route_s, name, late=late)
         return
     ratio = stage.uniform("flow_ratio", 0.9, 1.05)
     gap = stage.uniform("flow_gap_m", 11.0, 15.0)
