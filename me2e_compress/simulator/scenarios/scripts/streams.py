@@ -159,7 +159,10 @@ def across(
     gap_s: tuple[float, float] = (5.0, 9.0),
     late: bool = False,
 ) -> Script:
-    """Drive traffic that the ego's route crosses or joins; see `encounter`."""
+    """Drive traffic that the ego's route crosses or joins; see `encounter`.
+
+    With ``late``, some of it comes through a light that is red.
+    """
     reckless = 0.45 if late or name == "crossing_car" else 0.0
     gap = stage.uniform(f"{name}_gap_s", *gap_s)
     traffic = Traffic(gap, reckless=reckless, blind_to_ego=BLIND_TO_EGO)
