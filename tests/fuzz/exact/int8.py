@@ -135,7 +135,8 @@ def _without_int8(
 ) -> Verdict:
     """Take int8 out again and compare with the graph as drawn."""
     try:
-        plain = stripped(written, weights)
+        most = HALF if "rules=paper" in pipeline else WHOLE
+        plain = stripped(written, weights, most)
     except StrippingError as error:
         return Verdict("wrong", pipeline, str(error))
     try:
@@ -170,20 +171,23 @@ def _unlike(
 
 HALF = 0.5 * (1 + 1e-4)
 """How many steps a weight may be off; its scale is a rounded number itself."""
+WHOLE = 2 * HALF
+"""The same of rules that round so that errors cancel."""
 
 
 class StrippingError(Exception):
-    """A weight is none of the float graph's, to half a step."""
+    """A weight is none of the float graph's, to the steps that it may be off."""
 
 
 def stripped(
-    model: onnx.ModelProto, weights: Sequence[npt.NDArray[Any]]
+    model: onnx.ModelProto, weights: Sequence[npt.NDArray[Any]], most: float = HALF
 ) -> onnx.ModelProto:
     """Take every QuantizeLinear and DequantizeLinear out.
 
     Args:
         model: quantized for TensorRT.
         weights: those of the float graph.
+        most: steps that a weight may be off.
 
     Raises:
         StrippingError: a weight is none of these.
@@ -202,7 +206,7 @@ def stripped(
             _become(node, "Identity", [source[node.input[0]]])
             continue
         name = f"{node.output[0]}__float"
-        original = _original(node, held, weights)
+        original = _original(node, held, weights, most)
         copy.graph.initializer.append(numpy_helper.from_array(original, name))
         _become(node, "Identity", [name])
     kept = [node for node in copy.graph.node if node.op_type != "QuantizeLinear"]
@@ -222,6 +226,7 @@ def _original(
     node: onnx.NodeProto,
     held: Mapping[str, npt.NDArray[Any]],
     weights: Sequence[npt.NDArray[Any]],
+    most: float,
 ) -> npt.NDArray[Any]:
     """Find the float weight that an integer one stands for."""
     if node.input[0] not in held:
@@ -242,7 +247,7 @@ def _original(
                 continue
             array = each.reshape(found.shape)
             off = np.abs(array - found) / scale
-            if off.size == 0 or off.max() <= HALF:
+            if off.size == 0 or off.max() <= most:
                 return np.asarray(array, scale.dtype)
             best = min(best, float(off.max()))
     raise StrippingError(
