@@ -23,6 +23,7 @@ from me2e_compress.fidelity.output_liveness import (
     gap,
     length,
     share_of,
+    share_without_jumps,
 )
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
@@ -236,9 +237,14 @@ class LivenessTally:
         changed = [self._exchanged(side, base, part, donor) for side in (0, 1)]
         found = dict[str, float | None]()
         for name in self._movements:
-            before = [side[name] for side in base.answers]
-            moved = [gap(x, y[name]) for x, y in zip(before, changed, strict=True)]
-            found[name] = share_of(moved, length(before[0]))
+            sides = [
+                (side[name], now[name])
+                for side, now in zip(base.answers, changed, strict=True)
+            ]
+            moved = [gap(*pair) for pair in sides]
+            share = found[name] = share_of(moved, length(sides[0][0]))
+            if share is not None:
+                found[name] = max(share, share_without_jumps(*sides))
         return found
 
     def _exchanged(

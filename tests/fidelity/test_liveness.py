@@ -17,7 +17,7 @@ from me2e_compress.fidelity.liveness import (
     measure_liveness,
     parts_of,
 )
-from me2e_compress.fidelity.output_liveness import Liveness
+from me2e_compress.fidelity.output_liveness import Liveness, share_without_jumps
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
 from tests.command import Command, command
@@ -326,3 +326,16 @@ def test_a_share_beyond_0_to_1_is_refused(
     assert command("compare", "a.onnx", "a.onnx", "frames", "--alive", share) == 1
 
     assert f"--alive is {share}: it must be a finite" in capsys.readouterr().err
+
+
+def test_a_slot_that_jumps_in_one_graph_alone_does_not_hide_the_others() -> None:
+    draws = np.random.default_rng(3)
+    before, move = draws.normal(size=20), 0.01 * draws.normal(size=20)
+    jumped = before + move
+    jumped[4] += 5.0
+
+    alike = share_without_jumps((before, jumped), (before, before + 0.9 * move))
+    deaf = share_without_jumps((before, jumped), (before, before))
+
+    assert alike == pytest.approx(0.9)
+    assert deaf == 0
