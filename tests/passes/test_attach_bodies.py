@@ -122,7 +122,7 @@ def test_nodes_that_differ_in_attributes_get_a_body_each() -> None:
     once = FusedMultiHeadAttention().reference([rows] * 3, {"heads": 4})
     twice = FusedMultiHeadAttention().reference([once] * 3, {"heads": 1})
     expected = FusedMultiHeadAttention().reference([twice] * 3, {"heads": 4})
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(found), expected, atol=1e-5)
     assert model.ir_version == 10
     (kernels,) = compute(model, {"q": rows})
     np.testing.assert_allclose(kernels, expected, atol=1e-5)
