@@ -1,11 +1,11 @@
-"""A shipped study over all routes: what benchmarks/NAME keeps of it.
+"""A study over all routes: what benchmarks/ keeps of it.
 
     python -m benchmarks.bench_study shifts OUT [--tables A,B] [--workers N]
-    python -m benchmarks.bench_study tail OUT [--tables A,B] [--workers N]
+    python -m benchmarks.bench_study benchmarks/observers/seed-10.toml OUT
 
 Drives what OUT lacks, as ``me2e-compress study NAME -o OUT`` does: hours, and it goes
-on where it was ended. OUT/NAME gets its report; benchmarks/NAME its tables and a line a
-route.
+on where it was ended. OUT/NAME gets its report; benchmarks/NAME (of a file the folder
+beside it that has its name) its tables and a line a route.
 """
 
 import argparse
@@ -21,7 +21,6 @@ from me2e_compress.study import Study, load_study, run_study
 from me2e_compress.study.write import write_study
 
 KEPT = Path(__file__).parent
-STUDIES = ("shifts", "tail")
 
 
 def keep(name: str, study: Study, out: Path, workers: int) -> None:
@@ -32,8 +31,8 @@ def keep(name: str, study: Study, out: Path, workers: int) -> None:
     """
     found = run_study(study, out, LocalEngine(workers), told())
     command = ("python", "-m", "benchmarks.bench_study", name, str(out))
-    written = write_study(found, out / name, command)
-    folder = KEPT / name
+    written = write_study(found, out / Path(name).stem, command)
+    folder = KEPT / name if Path(name).suffix == "" else Path(name).with_suffix("")
     folder.mkdir(exist_ok=True)
     write_bytes(folder / "tables.md", written.tables.read_bytes())
     write_bytes(folder / "routes.csv", routes_csv(found).encode())
@@ -43,7 +42,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("study", choices=STUDIES)
+    parser.add_argument("study", help="a name, or a study's file")
     parser.add_argument("out", type=Path)
     parser.add_argument("--tables", help="of its blocks only these")
     parser.add_argument("--workers", type=int, default=1)
