@@ -43,8 +43,8 @@ class KeptDrive:
 
     @property
     def types(self) -> list[str]:
-        """Scenario type of each route."""
-        return [route.rpartition("_")[0] for route in self.scores]
+        """Scenario type of each route; one of the second road has _R2 behind it."""
+        return [route.rpartition("_")[0].removesuffix("_R2") for route in self.scores]
 
     def mean(self, column: int = 0) -> Estimate:
         """Return the mean of the driving score (0) or of the success (1)."""
