@@ -145,6 +145,18 @@ def test_noise_is_no_fault(decibels: float) -> None:
     assert named(drive(opened(), frames()), noise=decibels) == ()
 
 
+@pytest.mark.parametrize(("decibels", "kinds"), [(6.0, []), (14.0, ["slots"])])
+def test_an_order_that_explains_little_is_no_fault(
+    decibels: float, kinds: list[str]
+) -> None:
+    dump = drive(opened(), frames())
+    read = [each | {"boxes": each["boxes"][:, [4, 3, 2, 1, 0]]} for each in dump]
+
+    found = named(noisy(read, decibels), noise=None)
+
+    assert [each.kind for each in found] == kinds
+
+
 def test_half_precision_is_no_fault() -> None:
     dump = drive(opened(), frames())
     half = [{n: each.astype(np.float16) for n, each in of.items()} for of in dump]
