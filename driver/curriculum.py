@@ -107,7 +107,14 @@ class Course:
         """Return the course whose planner is not told of a share of the agents.
 
         It then always has occupancy, see `driver.step.without_rivals`.
+
+        Raises:
+            TrainingError: the share is not between 0 and 1.
         """
+        if not 0.0 <= share <= 1.0:
+            raise TrainingError(
+                f"course: overlooks {share} of the agents; it must be between 0 and 1"
+            )
 
         def change(each: Training) -> Training:
             how = replace(each.augmentation, no_occ=0.0, overlooked=share)

@@ -210,6 +210,12 @@ def test_a_course_that_overlooks_agents_tells_its_folder_so() -> None:
     assert told == ("rounds.0.trainings.0.augmentation.no_occ", "0.2", "0.0")
 
 
+@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
+def test_a_share_of_agents_that_is_none(share: float) -> None:
+    with pytest.raises(TrainingError, match=f"overlooks {share} of the agents; it"):
+        FULL.overlooking(share)
+
+
 def test_more_workers_than_it_trains_with_do_not_matter() -> None:
     assert FULL.on(8) == FULL.on(4) != FULL.on(2)
     trainings = [one for each in FULL.on(8).rounds for one in each.trainings]
