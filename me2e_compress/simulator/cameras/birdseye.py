@@ -108,7 +108,7 @@ def _near(actors: Sequence[Actor], ego: Ego, grid: BirdseyeGrid) -> list[Actor]:
     cells = grid.cells(ego.seen(boxes[:, 0], boxes[:, 1]))
     # half a diagonal, and a cell for the rounding of what is drawn
     reach = np.hypot(boxes[:, 2], boxes[:, 3])[:, None] / (2 * grid.cell_m) + 1
-    far = (cells < -reach) | (cells > (grid.columns, grid.rows) + reach)
+    far = (cells < -reach) | (cells - reach > (grid.columns, grid.rows))
     return [actors[i] for i in np.flatnonzero(~far.any(1))]
 
 
