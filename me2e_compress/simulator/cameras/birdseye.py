@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import cv2
 import numpy as np
@@ -109,7 +110,7 @@ def _near(actors: Sequence[Actor], ego: Ego, grid: BirdseyeGrid) -> list[Actor]:
     # half a diagonal, and a cell for the rounding of what is drawn
     reach = np.hypot(boxes[:, 2], boxes[:, 3])[:, None] / (2 * grid.cell_m) + 1
     far = (cells < -reach) | (cells - reach > (grid.columns, grid.rows))
-    return [actors[i] for i in np.flatnonzero(~far.any(1))]
+    return list(compress(actors, ~far.any(1)))
 
 
 def _footprint(box: Actor | Ego, ego: Ego) -> Floats:
