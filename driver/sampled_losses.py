@@ -63,7 +63,8 @@ class PlannerInputCache:
             if (found := _read(file)) is None:
                 found = _episode(model, episodes, picked, lidar2img)
                 content = io.BytesIO()
-                np.savez(content, **{k: part.numpy() for k, part in found.items()})
+                arrays = {name: part.numpy() for name, part in found.items()}
+                np.savez(content, allow_pickle=False, **arrays)
                 write_bytes(file, content.getvalue())
             for name, part in found.items():
                 if name not in rows:
