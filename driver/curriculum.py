@@ -103,6 +103,25 @@ class Course:
             lambda each: replace(each, seed=each.seed + SEEDS_APART * seed)
         )
 
+    def overlooking(self, share: float) -> Self:
+        """Return the course whose planner is not told of a share of the agents.
+
+        It then always has occupancy, see `driver.step.without_rivals`.
+
+        Raises:
+            TrainingError: the share is not between 0 and 1.
+        """
+        if not 0.0 <= share <= 1.0:
+            raise TrainingError(
+                f"course: overlooks {share} of the agents; it must be between 0 and 1"
+            )
+
+        def change(each: Training) -> Training:
+            how = replace(each.augmentation, no_occ=0.0, overlooked=share)
+            return replace(each, augmentation=how)
+
+        return self._training(change)
+
     def _training(self, change: Callable[[Training], Training]) -> Self:
         rounds = tuple(
             replace(each, trainings=tuple(map(change, each.trainings)))

@@ -1,6 +1,7 @@
 """Training in several processes that average their gradients; resumes after a kill."""
 
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -13,6 +14,7 @@ from driver.network.config import HighwayConfig
 from driver.options import difference
 from driver.process import (
     CHECKPOINT,
+    INPUTS,
     StageTask,
     Training,
     TrainingProcess,
@@ -71,10 +73,23 @@ def train(
         )
     folder.mkdir(parents=True, exist_ok=True)
     last = folder / CHECKPOINT
-    if last.exists() and _steps(last, what) >= what.steps:
-        return last
-    task = StageTask(what, config, tuple(files), tuple(held_out), start, folder)
-    group = ProcessGroup.of(what.workers, config)
+    if not last.exists() or _steps(last, what) < what.steps:
+        _run(
+            StageTask(what, config, tuple(files), tuple(held_out), start, folder),
+            on_step,
+        )
+    shutil.rmtree(folder / INPUTS, ignore_errors=True)
+    return last
+
+
+def _run(task: StageTask, on_step: Callable[[int, int], None]) -> None:
+    """Run the processes of a stage to its end.
+
+    Raises:
+        TrainingError: one of them died.
+    """
+    what, folder = task.what, task.folder
+    group = ProcessGroup.of(what.workers, task.config)
     try:
         with killed_on_error():
             with sheltered():
@@ -84,7 +99,6 @@ def train(
     except ProcessException as error:
         raise TrainingError(f"{folder}: training failed: {_cause(error)}") from error
     on_step(what.steps, what.steps)
-    return last
 
 
 def _process(rank: int, task: StageTask, group: ProcessGroup) -> None:

@@ -26,6 +26,8 @@ from driver.validation import validate
 from me2e_compress.simulator.cameras import CameraRig
 
 CHECKPOINT, LOG = "last.pt", "log.jsonl"
+INPUTS = "planner-inputs"
+"""Folder of what the planner alone learns from, while it learns."""
 WARM_UP = 100
 """Steps in which the learning rate grows."""
 LAST_SHARE = 0.01
@@ -59,7 +61,7 @@ class Training:
     workers: int = 4
     rate: float = 1.5e-3
     seed: int = 0
-    save_every: int = 100
+    save_every: int = 25
     check_every: int = 200
     check_count: int = 240
     modules: tuple[str, ...] = ()
@@ -122,7 +124,7 @@ class TrainingProcess:
         self.log, self.running = Log(task.folder / LOG), dict[str, float]()
         self._resume()
         if what.modules == PLANNER_ALONE and self.step < what.steps:
-            self.sampled.freeze(self.model)
+            self.sampled.freeze(self.model, task.folder / INPUTS)
         self.begun = time.monotonic() - self._spent_s()
 
     def _begin(self, episodes: Episodes) -> None:

@@ -12,8 +12,9 @@ from driver.network.config import HighwayConfig
 from driver.network.stack import Highway
 from me2e_compress.runtime.children import spawn_context
 
-PATIENCE_S = 900.0
-"""A process that keeps the others waiting longer has died or hangs."""
+PATIENCE_S = 3600.0
+"""A process that keeps the others waiting longer hangs; one that dies ends them all.
+Before its first step the planner's inputs take each its time on a busy machine."""
 
 
 @dataclass

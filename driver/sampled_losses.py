@@ -1,7 +1,11 @@
 """Losses of the samples that one process draws from its share of the episodes."""
 
+import hashlib
+import io
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Self
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -19,6 +23,7 @@ from driver.step import (
     run,
     run_planner,
 )
+from me2e_compress.runtime.atomic import write_bytes
 
 GRIDS = ("raster", "occupancy")
 """Probabilities of whole grids: kept in 256 steps."""
@@ -37,18 +42,31 @@ class PlannerInputCache:
     rows: dict[str, Tensor]
 
     @classmethod
-    def of(cls, model: Highway, episodes: Episodes, lidar2img: Tensor) -> Self:
+    def of(
+        cls, model: Highway, episodes: Episodes, lidar2img: Tensor, folder: Path
+    ) -> Self:
         """Run the model over every episode, its memory fed forward.
 
         Args:
             model: in evaluation mode; its planner is not used.
             episodes: all samples.
             lidar2img: [6, 4, 4].
+            folder: gets a file an episode: all of them take longer than the stage that
+                needs them, and a stage that was interrupted reads what it finds.
         """
         rows: dict[str, Tensor] = {}
+        folder.mkdir(exist_ok=True)
+        said = _digest_of(model)
         for last in np.unique(episodes.last):
             picked = np.nonzero(episodes.last == last)[0]
-            for name, part in _episode(model, episodes, picked, lidar2img).items():
+            file = folder / f"{_name_of(episodes, picked, said)}.npz"
+            if (found := _read(file)) is None:
+                found = _episode(model, episodes, picked, lidar2img)
+                content = io.BytesIO()
+                arrays = {name: part.numpy() for name, part in found.items()}
+                np.savez(content, allow_pickle=False, **arrays)
+                write_bytes(file, content.getvalue())
+            for name, part in found.items():
                 if name not in rows:
                     shape = (len(episodes), *part.shape[1:])
                     rows[name] = torch.empty(shape, dtype=part.dtype)
@@ -63,6 +81,34 @@ class PlannerInputCache:
             part = rows[index].float()
             found[name] = part / 255 if name in GRIDS else part
         return PlannerInput(**found)
+
+
+def _digest_of(model: Highway) -> bytes:
+    """Return a digest of all weights but the planner's."""
+    digest = hashlib.sha256()
+    for name, value in model.state_dict().items():
+        if not name.startswith("planner."):
+            digest.update(value.contiguous().numpy().tobytes())
+    return digest.digest()
+
+
+def _name_of(episodes: Episodes, picked: Indices, said: bytes) -> str:
+    """Return a digest of the model and of what it reads of an episode."""
+    digest = hashlib.sha256(said)
+    for name in ("time_us", "pose", "can_bus", "command"):
+        digest.update(episodes.tables[name][picked].tobytes())
+    for index in picked:
+        digest.update(episodes.pictures[index].tobytes())
+    return digest.hexdigest()
+
+
+def _read(file: Path) -> dict[str, Tensor] | None:
+    """Return what a file holds; None if it is not there or damaged."""
+    try:
+        with file.open("rb") as source, np.load(source) as content:
+            return {name: torch.from_numpy(content[name]) for name in content}
+    except (OSError, EOFError, ValueError, BadZipFile):
+        return None
 
 
 @torch.no_grad()
@@ -133,10 +179,16 @@ class SampledLosses:
         self.sequences, self.augmentation = sequences, augmentation
         self._cache: PlannerInputCache | None = None
 
-    def freeze(self, model: Highway) -> None:
-        """Freeze all modules but the planner: run the others once, and cache."""
+    def freeze(self, model: Highway, folder: Path) -> None:
+        """Freeze all modules but the planner: run the others once, and cache.
+
+        Args:
+            model: the stack.
+            folder: for the cache, see `PlannerInputCache.of`.
+        """
         model.eval()
-        self._cache = PlannerInputCache.of(model, self.episodes, self.lidar2img)
+        episodes, lidar2img = self.episodes, self.lidar2img
+        self._cache = PlannerInputCache.of(model, episodes, lidar2img, folder)
         self.episodes.forget_pictures()
 
     def draw(

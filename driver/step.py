@@ -59,6 +59,8 @@ class Augmentation:
         forget: share of samples that lose the memory of standing.
         hints: share of samples whose agents are certain to be among the queries.
         no_occ: share that plan on the mean occupancy, so that boxes are used too.
+        overlooked: share of agents that boxes and futures do not show to the planner,
+            so that occupancy is used too: see `without_rivals`.
     """
 
     light: float = 0.12
@@ -66,6 +68,7 @@ class Augmentation:
     forget: float = 0.1
     hints: float = 0.7
     no_occ: float = 0.2
+    overlooked: float = 0.0
 
 
 NO_AUGMENTATION = Augmentation(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -109,7 +112,7 @@ def run_planner(
     wanted = labels_of(batch, model.config.area)
     with torch.autocast("cpu", torch.bfloat16):
         ego = _ego(batch, rng, how)
-        damaged = _without_occ(world, rng, how)
+        damaged = without_rivals(world, rng, how)
         candidates = model.planner.consider(damaged, ego, wanted.command)
     return plan_losses(candidates, wanted, model.config.area)
 
@@ -153,7 +156,7 @@ def run(
         seen = model.understand(bev, model.bev_encoder.tokens(bev), middle, hints)
         # the planner, on augmented inputs
         world = model.world(seen, wanted.command)
-        world = _without_occ(world, rng, how)
+        world = without_rivals(world, rng, how)
         ego = _ego(flat, rng, how)
         candidates = model.planner.consider(_settled(world), ego, wanted.command)
         lamp_loss = lamps(fine, calibration, wanted)
@@ -227,10 +230,24 @@ def _ego(flat: dict[str, Array], rng: np.random.Generator, how: Augmentation) ->
     return EgoState(bus, stood).features()
 
 
-def _without_occ(
+def without_rivals(
     world: PlannerInput, rng: np.random.Generator, how: Augmentation
 ) -> PlannerInput:
+    """Take from the planner what tells it the same as another module.
+
+    Boxes with futures and occupancy both tell where others will be. A network leans on
+    what it learns from first, and leaves the other unused (Wu et al., ICML 2022).
+    Dropping an input (ModDrop, Neverova et al., 2016) teaches to do without it; what
+    makes it matter is dropping its rival, so that nothing else gives the answer.
+    Agents go one by one, as if overlooked: were all of a sample gone, the planner could
+    learn to read occupancy then only. An agent of score 0 is in no cost and no token.
+    """
     gone = torch.from_numpy(rng.random(len(world.occupancy)) < how.no_occ)
     mean = world.occupancy.mean(0, keepdim=True)
     kept = torch.where(gone[:, None, None, None], mean, world.occupancy)
-    return replace(world, occupancy=kept)
+    if not how.overlooked:
+        return replace(world, occupancy=kept)
+    shown = torch.from_numpy(rng.random(world.score.shape) >= how.overlooked)
+    # without occupancy every agent is shown: something must tell where the others are
+    score = world.score * (shown | gone[:, None])
+    return replace(world, occupancy=kept, score=score)

@@ -1,6 +1,7 @@
 """Train the driver from nothing.
 
-    python -m driver.train -o FOLDER [--road 2] [--seed N] [--workers N] [--small]
+    python -m driver.train -o FOLDER [--road 2] [--seed N] [--overlook SHARE]
+                           [--workers N] [--small]
 
 The same command again goes on where it was interrupted.
 """
@@ -26,6 +27,14 @@ Small = Annotated[
 
 Road = Annotated[int, typer.Option(help="the generation of the road: 1 or 2")]
 Seed = Annotated[int, typer.Option(help="of the first weights, not of the routes")]
+Overlook = Annotated[
+    float | None,
+    typer.Option(
+        min=0.0,
+        max=1.0,
+        help="share of agents the planner is not told of: only occupancy shows them",
+    ),
+]
 
 
 def command(
@@ -34,6 +43,7 @@ def command(
     small: Small = False,
     road: Road = 1,
     seed: Seed = 0,
+    overlook: Overlook = None,
     json: given.Json = False,
 ) -> None:
     """Train the driver from nothing: collect, learn, drive, learn again (hours)."""
@@ -41,7 +51,15 @@ def command(
     from driver.workflow import train  # takes torch seconds to import
 
     with listening(stages=True) as listener:
-        found = train(output, workers, listener, small=small, road=road, seed=seed)
+        found = train(
+            output,
+            workers,
+            listener,
+            small=small,
+            road=road,
+            seed=seed,
+            overlook=overlook,
+        )
     show(found)
 
 

@@ -11,17 +11,13 @@ from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
-from me2e_compress.evaluators.highway.generate import generate
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores, score
-from me2e_compress.simulator.routes import (
-    Route,
-    load_routes,
-    pick_routes,
-    save_routes,
-)
+from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.routes import RoutesOptions, make_routes
 
 OnDone = Callable[[int, int], None]
 
@@ -30,6 +26,8 @@ def routes_of(
     what: Trial, path: Path, workers: int, on_done: OnDone, road: int = 1
 ) -> tuple[Route, ...]:
     """Return the routes of a trial, from its file once they were found.
+
+    An interrupted search goes on where it was: on the second road it takes hours.
 
     Args:
         what: the trial.
@@ -42,19 +40,16 @@ def routes_of(
         TrainingError: one of them is a route that ships: those are for evaluation.
         EvaluationError: a type has no such routes, or the manifest is not one.
     """
-    if path.exists():
-        return load_routes(path, road)
-    types = what.scenarios or tuple(SCENARIO_ABILITIES)
-    variants = -(-what.routes // len(types))
-    found = list[Route]()
-    harvests = generate(what.seed, types, variants, workers, road)
-    for done, harvest in enumerate(harvests, 1):
-        found += harvest.routes
-        on_done(done, len(types))
+    if not path.exists():
+        types = what.scenarios or tuple(SCENARIO_ABILITIES)
+        variants = -(-what.routes // len(types))
+        options = RoutesOptions(
+            what.seed, variants, ",".join(types), workers, road=road
+        )
+        make_routes(path, options, Listener(lambda _, *told: on_done(*told[:2])))
+    found = load_routes(path, road)
     refuse_shipped("trial", what.seed, [(e.scenario, e.seed) for e in found])
-    picked = pick_routes(found, str(what.routes))
-    save_routes(picked, path)
-    return picked
+    return pick_routes(found, str(what.routes))
 
 
 def drive(

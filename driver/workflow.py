@@ -72,6 +72,7 @@ def train(
     small: bool = False,
     road: int = 1,
     seed: int = 0,
+    overlook: float | None = None,
 ) -> TrainResult:
     """Train the driver ``highway``: collect, learn, drive, learn again (hours).
 
@@ -82,9 +83,12 @@ def train(
         small: go through every part in a minute, and learn nothing.
         road: generation of the road that is driven.
         seed: of the first weights and of the samples' order, not of the routes.
+        overlook: share of agents that the planner is not told of, see
+            `driver.step.without_rivals`; None tells it all, but drops occupancy.
 
     Raises:
-        TrainingError: the folder is of another course, or a part failed.
+        TrainingError: the folder is of another course, the share is none, or a part
+            failed.
         EvaluationError: there is no such road.
         GraphError: the folder is a file.
     """
@@ -94,6 +98,8 @@ def train(
     check_count("--seed", seed)
     course, latency = (SMALL, SMALL_LATENCY) if small else (FULL, NO_LATENCY)
     course = dataclasses.replace(course.seeded(seed), road=road)
+    if overlook is not None:
+        course = course.overlooking(overlook)
     with writing(folders=[output]):
         return TrainResult(run(course, output, workers, listener, latency))
 

@@ -6,7 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from driver.curriculum import (
 )
 from driver.episodes.collection import Collection, tasks_of
 from driver.log import Log
+from driver.options import difference
 from driver.process import Training
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import TrainingError
@@ -199,6 +200,20 @@ def test_another_seed_draws_other_weights_for_every_stage_and_the_same_routes() 
     assert not set(before) & set(after)
     assert [each.seed for each in other.rounds] == [each.seed for each in FULL.rounds]
     assert FULL.seeded(0) == FULL
+
+
+def test_a_course_that_overlooks_agents_tells_its_folder_so() -> None:
+    course = FULL.overlooking(0.25)
+    found = [one.augmentation for each in course.rounds for one in each.trainings]
+    assert {(how.no_occ, how.overlooked) for how in found} == {(0.0, 0.25)}
+    told = difference(json.loads(json.dumps(asdict(FULL))), asdict(course))
+    assert told == ("rounds.0.trainings.0.augmentation.no_occ", "0.2", "0.0")
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
+def test_a_share_of_agents_that_is_none(share: float) -> None:
+    with pytest.raises(TrainingError, match=f"overlooks {share} of the agents; it"):
+        FULL.overlooking(share)
 
 
 def test_more_workers_than_it_trains_with_do_not_matter() -> None:

@@ -71,9 +71,12 @@ class Killed:
         return self.sampled.draw(model, lamps, rng)
 
 
+@pytest.mark.parametrize("modules", [(), ("planner",)])
 def test_an_interrupted_stage_comes_to_the_same_weights(
-    task: StageTask, tmp_path: Path
+    task: StageTask, tmp_path: Path, modules: tuple[str, ...]
 ) -> None:
+    how = replace(WHAT.augmentation, overlooked=0.3)
+    task = replace(task, what=replace(WHAT, modules=modules, augmentation=how))
     whole = replace(task, folder=tmp_path / "whole")
     broken = replace(task, folder=tmp_path / "broken")
     for each in (whole, broken):
@@ -163,9 +166,11 @@ def test_a_finished_stage_is_not_begun_again(
     task: StageTask, files: tuple[Path, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage(task).run()
+    (inputs := task.folder / "planner-inputs").mkdir()
     monkeypatch.setattr(ProcessGroup, "of", None)  # nobody is started
     found = train(WHAT, LITTLE, files[1:], files[:1], None, task.folder)
     assert found == task.folder / "last.pt"
+    assert not inputs.exists()
 
 
 def test_a_start_of_another_model_is_refused(task: StageTask, tmp_path: Path) -> None:
@@ -203,3 +208,4 @@ def test_a_checkpoint_says_what_trained_it(task: StageTask) -> None:
     stage(replace(task, what=replace(WHAT, steps=2))).run()
     told = json.loads(TrainingCheckpoint.load(task.folder / "last.pt").what)
     assert (told["steps"], told["augmentation"]["hints"]) == (2, 0.7)
+    assert told["augmentation"]["overlooked"] == WHAT.augmentation.overlooked

@@ -1,6 +1,7 @@
 """One training step on a small batch."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from torch import nn
 from driver.data import Episodes, Sequences
 from driver.losses import LampHead
 from driver.network.bev_encoder import RECORD
+from driver.network.interfaces import PlannerInput
 from driver.network.stack import Highway
 from driver.sampled_losses import PlannerInputCache
 from driver.step import (
@@ -24,6 +26,7 @@ from driver.step import (
     run,
     run_planner,
     total,
+    without_rivals,
 )
 from me2e_compress.simulator.cameras import CameraRig
 from me2e_compress.zoo.stacks import HIGHWAY
@@ -150,10 +153,10 @@ def test_light_changes_every_camera_for_itself() -> None:
 
 
 def test_the_planner_alone_reads_what_the_others_said(
-    model: Highway, lamps: LampHead, episodes: Episodes
+    model: Highway, lamps: LampHead, episodes: Episodes, tmp_path: Path
 ) -> None:
     model.eval()
-    cache = PlannerInputCache.of(model, episodes, LIDAR2IMG)
+    cache = PlannerInputCache.of(model, episodes, LIDAR2IMG, tmp_path / "inputs")
     picked = np.arange(len(episodes))
     rows = episodes.rows(picked)
     rng = np.random.default_rng(0)
@@ -167,6 +170,58 @@ def test_the_planner_alone_reads_what_the_others_said(
     assert {k: float(v) for k, v in found.items()} == pytest.approx(
         {k: float(wanted[k]) for k in PLAN}, rel=0.05, abs=0.02
     )
+
+
+@pytest.fixture(scope="module")
+def world(model: Highway, lamps: LampHead, episodes: Episodes) -> PlannerInput:
+    return outcome(model, lamps, episodes, NO_AUGMENTATION, 2).world
+
+
+def told(world: PlannerInput, no_occ: float, overlooked: float) -> PlannerInput:
+    how = replace(NO_AUGMENTATION, no_occ=no_occ, overlooked=overlooked)
+    return without_rivals(world, np.random.default_rng(0), how)
+
+
+def changed(before: PlannerInput, after: PlannerInput) -> set[str]:
+    names = [field.name for field in fields(PlannerInput)]
+    return {n for n in names if not torch.equal(getattr(before, n), getattr(after, n))}
+
+
+def test_overlooked_agents_leave_occupancy_as_it_is(world: PlannerInput) -> None:
+    found = told(world, 0.0, 0.5)
+    assert changed(world, found) == {"score"}
+    shown = found.score == world.score
+    assert 0.3 < shown.float().mean() < 0.7
+    assert not found.score[~shown].any()
+
+
+def test_without_occupancy_no_agent_is_overlooked(world: PlannerInput) -> None:
+    found = told(world, 1.0, 1.0)
+    assert changed(world, found) == {"occupancy"}
+    assert torch.equal(found.occupancy, world.occupancy.mean(0).expand(4, -1, -1, -1))
+
+
+def test_where_nothing_is_dropped_the_planner_reads_all(world: PlannerInput) -> None:
+    assert changed(world, told(world, 0.0, 0.0)) == set()
+
+
+@torch.no_grad()
+def test_an_overlooked_agent_tells_the_planner_nothing(
+    model: Highway, world: PlannerInput
+) -> None:
+    planner, blind = model.eval().planner, told(world, 0.0, 1.0)
+    ego, command = torch.tensor([[0.5, 0.0]]).expand(4, -1), torch.zeros(4).long()
+    other = replace(
+        blind,
+        agents=blind.agents + 1,
+        boxes=blind.boxes + 1,
+        travel=blind.travel - 1,
+        modes=blind.modes.flip(-1),
+    )
+    logits = [planner.consider(one, ego, command).logits for one in (blind, other)]
+    assert torch.equal(*logits)
+    seen = planner.consider(replace(other, score=world.score), ego, command).logits
+    assert not torch.equal(seen, logits[0])
 
 
 @torch.no_grad()

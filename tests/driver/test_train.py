@@ -56,7 +56,20 @@ def test_a_file_in_the_place_of_the_folder(
     assert "out is a file: name a folder" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [("uniad",), ("--workers", "0")])
+def test_a_folder_of_a_course_that_overlooks_nobody(
+    command: Command, tmp_path: Path, capsys: Capture
+) -> None:
+    claim(tmp_path / MANIFEST, "course", asdict(FULL.on(4)))
+
+    assert command("--overlook", "0.3", "-o", tmp_path) == 1
+    assert (
+        "augmentation.no_occ is 0.2, this one's 0.0; choose" in capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize(
+    "words", [("uniad",), ("--workers", "0"), ("--overlook", "1.5")]
+)
 def test_words_that_make_no_sense(
     command: Command, tmp_path: Path, words: tuple[str, ...]
 ) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import cv2
 import numpy as np
@@ -97,9 +98,19 @@ def covered(actors: Sequence[Actor], ego: Ego, grid: BirdseyeGrid) -> Flags:
     ``ego`` may be of another instant than the actors.
     """
     touched = np.zeros((grid.rows, grid.columns), np.uint8)
-    for actor in actors:
+    for actor in _near(actors, ego, grid):
         _fill(touched, _footprint(actor, ego), 1, grid)
     return touched.astype(np.bool_)
+
+
+def _near(actors: Sequence[Actor], ego: Ego, grid: BirdseyeGrid) -> list[Actor]:
+    """Return the actors that may touch the grid: most are far, and cost as much."""
+    boxes = np.array([(a.x, a.y, a.length, a.width) for a in actors]).reshape(-1, 4)
+    cells = grid.cells(ego.seen(boxes[:, 0], boxes[:, 1]))
+    # half a diagonal, and a cell for the rounding of what is drawn
+    reach = np.hypot(boxes[:, 2], boxes[:, 3])[:, None] / (2 * grid.cell_m) + 1
+    far = (cells < -reach) | (cells - reach > (grid.columns, grid.rows))
+    return list(compress(actors, ~far.any(1)))
 
 
 def _footprint(box: Actor | Ego, ego: Ego) -> Floats:

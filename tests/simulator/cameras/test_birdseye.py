@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -110,3 +112,22 @@ def test_a_box_covers_what_its_class_is_painted_on(texture: GroundTexture) -> No
     assert np.array_equal(
         touched, bev_classes(scene, texture, GRID) == PixelClass.VEHICLE
     )
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7, 2.0])
+def test_nobody_is_skipped_who_touches_the_edge(
+    texture: GroundTexture, turn: float
+) -> None:
+    small = BirdseyeGrid(8.0, 6.0, 1.0, 16, 12)
+    ego = replace(town.scene().ego, heading=turn)
+    found = list[bool]()
+    for x in range(-13, 14):
+        for y in range(-11, 12):
+            car = replace(town.actor(0.0, 0.0), x=ego.x + x, y=ego.y + y)
+            painted = bev_classes(replace(town.scene(car), ego=ego), texture, small)
+            touched = covered([car], ego, small)
+            wanted = painted == PixelClass.VEHICLE
+            rest = painted != PixelClass.EGO
+            assert np.array_equal(touched & rest, wanted), (x, y)
+            found.append(bool(touched.any()))
+    assert 0.2 < np.mean(found) < 0.8
