@@ -81,8 +81,13 @@ class StudyResult(StudyOutcome, Result):
     def _record(self, drive: DriveRecord) -> dict[str, object]:
         # a drive that was not made has no scores
         scores, of = drive.scores, self.variant(drive.variant)
-        names = ("driving_score", "success_rate", "efficiency", "comfort")
+        names = (
+            *("driving_score", "success_rate", "efficiency", "comfort"),
+            *("bench2drive_efficiency", "bench2drive_smoothness"),
+        )
         found = {} if scores is None else {n: getattr(scores, n).value for n in names}
+        if scores is not None:
+            found["room_kept"] = scores.safety.room_kept.value
         return {
             "variant": drive.variant,
             "condition": drive.condition,

@@ -92,7 +92,15 @@ class RoadSearchResult(Result):
     def lines(self) -> tuple[str, ...]:
         """Return the answer, and what it holds for."""
         chosen = len(self.rungs[-1].standings)
-        lines = [self.headline, f"budgets: {self._spent(self.winner)}"]
+        room = self.difference.room_kept
+        value, low, high = (
+            number(each, "+.1f") for each in (room.value, room.low, room.high)
+        )
+        lines = [
+            self.headline,
+            f"room kept to others: {value} points (95 %: {low} to {high})",
+            f"budgets: {self._spent(self.winner)}",
+        ]
         if chosen > 1:
             lines.append(
                 f"chosen as the best of {chosen} on these routes: others may show"
