@@ -1,4 +1,5 @@
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 
@@ -16,8 +17,8 @@ CONDITIONS = (IDEAL, FOG)
 
 def summary(route: str, scenario: str, score: float) -> RouteSummary:
     ended = (100.0, score == 100.0, "", (), None, None)
-    near = {"ttc_exposure": (100.0 - score) / 2, "at_fault": False}
-    return RouteSummary(route, scenario, score, *ended, 1, 0, (), 0, **near)
+    made = RouteSummary(route, scenario, score, *ended, 1, 0, (), 0)
+    return replace(made, ttc_exposure=(100.0 - score) / 2, at_fault=False)
 
 
 def drive(variant: str, condition: str, scores: Sequence[float]) -> DriveRecord:
