@@ -224,37 +224,6 @@ def _ended(route: RouteSummary) -> str:
     return route.fate if room is None else f"{route.fate}; room {room:.0f} %"
 
 
-def near_misses(outcome: StudyOutcome) -> Table:
-    """Show how near every drive came to collisions, which end few routes."""
-    columns = ("TTC < 1.5 s, %", "least TTC s", "PET s", "distance m", "at fault %")
-    return Table(
-        "Near misses",
-        ("variant", *columns),
-        tuple(
-            (Cell(outcome.label(each)), *_safety(each, len(columns)))
-            for each in outcome.drives
-        ),
-        "Means over routes with their 95 % intervals: share of the time with a time to "
-        "collision below 1.5 s, the least of a route, post-encroachment time of "
-        "crossing paths, smallest distance; and routes with a collision that the ego "
-        "could have prevented. Least TTC and PET exist on some routes only.",
-        outcome.study.baseline,
-    )
-
-
-def _safety(drive: DriveRecord, columns: int) -> tuple[Cell, ...]:
-    if drive.scores is None:
-        return (Cell(MISSING, reason=drive.reason),) * columns
-    found = drive.scores.safety
-    return (
-        estimate_cell(found.ttc_exposure),
-        estimate_cell(found.smallest_ttc, ".2f"),
-        estimate_cell(found.smallest_pet, ".2f"),
-        estimate_cell(found.smallest_distance, ".2f"),
-        estimate_cell(found.at_fault_collisions),
-    )
-
-
 def _scores(drive: DriveRecord) -> tuple[Cell, ...]:
     if drive.scores is None:
         return (Cell(MISSING, reason=drive.reason),) * len(SCORES)

@@ -12,10 +12,10 @@ from me2e_compress.study.cells import (
     measure_cell,
     number,
 )
+from me2e_compress.study.study_result import near_misses
 from me2e_compress.study.tables import (
     abilities,
     differences,
-    near_misses,
     scoreboards,
 )
 from me2e_compress.workflows.result import Cell, Table
