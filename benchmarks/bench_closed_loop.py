@@ -156,20 +156,19 @@ def log_of(folder: Path) -> list[dict[str, float]]:
 
 def bench_drivers(out: Path, workers: int) -> None:
     routes = load_routes()
-    columns = ["DS", "SR", *ABILITIES, "DE", "DC", "DE b2d", "DC b2d"]
+    columns = ["DS", "room", "SR", *ABILITIES, "DE", "DC", "DE b2d", "DC b2d"]
     print("| driver | " + " | ".join(columns) + " |")
     print("|---" * (len(columns) + 1) + "|")
     for name in ("expert", "blind:4", "blind:8", "blind:12"):
         folder = out / name.replace(":", "-")
         found, _ = evaluate(folder, driver_named(name), routes, workers)
         each = [found.each_ability[ability] for ability in ABILITIES]
-        shown = [found.driving_score, found.success_rate, *each, found.efficiency]
-        last = [
-            found.comfort,
-            found.bench2drive_efficiency,
-            found.bench2drive_smoothness,
-        ]
-        cells = [_cell(estimate) for estimate in (*shown, *last)]
+        shown = (
+            *(found.driving_score, found.safety.room_kept, found.success_rate, *each),
+            *(found.efficiency, found.comfort),
+            *(found.bench2drive_efficiency, found.bench2drive_smoothness),
+        )
+        cells = [_cell(estimate) for estimate in shown]
         print(f"| {name} | " + " | ".join(cells) + " |")
 
 

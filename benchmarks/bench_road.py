@@ -175,11 +175,14 @@ def compare(folders: Sequence[Path]) -> None:
         whole = fmean(score == 100.0 for score in own.values())
         room = [room_kept(one).value for one in episodes.values()]
         room_100 = fmean(each == 100.0 for each in room)
+        known = [each for each in room if each is not None]
+        kept = f"{fmean(known):.1f} %" if known else "not recorded"
         costs = [json.loads(line) for line in log_beside(path).open()]
         frames, seconds = (fmean(e[k] for e in costs) for k in ("frames", "seconds"))
         print(
             f"{path}: {len(own)} routes, {whole:.1%} at exactly 100 (room kept:"
-            f" {room_100:.1%}), {frames:.0f} frames and {seconds:.1f} s a route"
+            f" {room_100:.1%}); DS {fmean(own.values()):.1f}, room kept {kept};"
+            f" {frames:.0f} frames and {seconds:.1f} s a route"
         )
     shared = [name for name in scores[0] if all(name in own for own in scores)]
     unlike = [name for name in shared if len({own[name] for own in scores}) > 1]

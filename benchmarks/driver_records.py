@@ -14,7 +14,7 @@ from me2e_compress.workflows.result import Cell, Table
 
 COLUMNS = (
     *("scheme", "condition", "route", "driving_score_percent", "succeeded", "ending"),
-    "infractions",
+    *("infractions", "room_kept_percent"),
 )
 
 Drive = tuple[Variant, Condition]
@@ -29,7 +29,9 @@ def routes_csv(outcome: StudyResult) -> str:
         for each in drive.routes:
             infractions = " ".join(kind for kind, _ in each.moments)
             found = (each.driving_score, int(each.succeeded), each.ending, infractions)
-            writer.writerow((drive.variant, drive.condition, each.route, *found))
+            room = "" if each.room_kept is None else round(each.room_kept, 3)
+            names = (drive.variant, drive.condition, each.route)
+            writer.writerow((*names, *found, room))
     return text.getvalue()
 
 
@@ -84,7 +86,10 @@ def _paired(
     ]
     return Table(
         title,
-        (first, "DS, points", "SR, points", "routes better", "routes worse"),
+        (
+            *(first, "DS, points", "room, points", "SR, points"),
+            *("routes better", "routes worse"),
+        ),
         tuple(rows),
         "Mean over routes with its 95 % interval, paired bootstrap.",
     )
@@ -106,6 +111,7 @@ def losers(outcome: StudyResult) -> str:
 def _cells(found: PairedDifference) -> tuple[Cell, ...]:
     return (
         estimate_cell(found.driving_score, signed=True),
+        estimate_cell(found.room_kept, signed=True),
         estimate_cell(found.success_rate, signed=True),
         Cell(str(found.better)),
         Cell(str(found.worse)),

@@ -10,7 +10,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.intervals import unseen_interval, unseen_share
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_summary import RouteSummary
-from me2e_compress.metrics.route_values import DS, SR, RouteValues
+from me2e_compress.metrics.route_values import DS, ROOM, SR, RouteValues
 
 SCATTER = 13.0
 """Standard deviation, points a route, of the driving score's paired difference between
@@ -39,6 +39,7 @@ class PairedDifference:
     """
 
     driving_score: Estimate
+    room_kept: Estimate
     success_rate: Estimate
     better: int
     worse: int
@@ -91,6 +92,7 @@ class PairedDifference:
         """Return both estimates, all counts and the p-value."""
         return {
             "driving_score": self.driving_score.to_json(),
+            "room_kept": self.room_kept.to_json(),
             "success_rate": self.success_rate.to_json(),
             "routes_better": self.better,
             "routes_worse": self.worse,
@@ -111,12 +113,13 @@ def difference(
             f"route {unpaired[0]} was driven by one of the two only: differences are "
             "taken over the same routes"
         )
-    scores, rates = (
-        column.values(routes) - column.values(reference) for column in (DS, SR)
+    scores, room, rates = (
+        column.values(routes) - column.values(reference) for column in (DS, ROOM, SR)
     )
     gaps, turns = scores.by_route.values(), rates.by_route.values()
     return PairedDifference(
         _estimate(scores, seed),
+        _estimate(room, seed),
         _estimate(rates, seed),
         sum(gap > 0 for gap in gaps),
         sum(gap < 0 for gap in gaps),

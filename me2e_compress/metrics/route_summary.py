@@ -6,6 +6,7 @@ from typing import Self
 import numpy as np
 from pydantic import ConfigDict, with_config
 
+from me2e_compress.metrics import bench2drive
 from me2e_compress.metrics import surrogate_safety as near
 from me2e_compress.metrics.comfort import comfort
 from me2e_compress.metrics.driving_score import route_score
@@ -52,6 +53,9 @@ class RouteSummary:
         latency_us: `PERCENTS` of the decisions' latencies on the vehicle.
         ttc_exposure: Share of the frames with a time to collision below 1.5 s.
         smallest_pet: Post-encroachment time of crossing paths, seconds.
+        bench2drive_efficiency: Efficiency in the arithmetic of Bench2Drive's tools; the
+            earliest files lack it, as they lack the next.
+        bench2drive_smoothness: Their comfort.
     """
 
     route: str
@@ -72,6 +76,13 @@ class RouteSummary:
     smallest_pet: float | None = None
     smallest_distance: float | None = None
     at_fault: bool | None = None
+    bench2drive_efficiency: float | None = None
+    bench2drive_smoothness: float | None = None
+
+    @property
+    def room_kept(self) -> float | None:
+        """How much room it kept to others, a grade from 0 to 100 percent."""
+        return near.room_of(self.ttc_exposure, self.smallest_pet, self.at_fault)
 
     @property
     def moments(self) -> tuple[tuple[str, int | None], ...]:
@@ -121,6 +132,8 @@ class RouteSummary:
             near.smallest_pet(episode).value,
             near.smallest_distance(episode).value,
             near.at_fault_collision(episode),
+            bench2drive.efficiency(episode).value,
+            bench2drive.smoothness(episode).value,
         )
 
     def rounded(self) -> Self:
@@ -128,6 +141,7 @@ class RouteSummary:
         measured = (
             *("efficiency", "comfort", "ttc_exposure"),
             *("smallest_ttc", "smallest_pet", "smallest_distance"),
+            *("bench2drive_efficiency", "bench2drive_smoothness"),
         )
         found = {name: getattr(self, name) for name in measured}
         known = {name: each for name, each in found.items() if each is not None}

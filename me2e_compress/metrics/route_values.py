@@ -87,5 +87,10 @@ DS = RouteColumn("DS", "%", lambda route: route.driving_score, PERCENT)
 SR = RouteColumn("SR %", "%", lambda route: 100.0 * route.succeeded, PERCENT)
 DE = RouteColumn("DE %", "%", lambda route: route.efficiency)
 DC = RouteColumn("DC", "ratio", lambda route: route.comfort, SHARE)
-COLUMNS = (DS, SR, DE, DC)
-"""The paper's scores of a route."""
+ROOM = RouteColumn("room %", "%", lambda route: route.room_kept, PERCENT)
+DE_B2D = RouteColumn("DE b2d %", "%", lambda route: route.bench2drive_efficiency)
+DC_B2D = RouteColumn(
+    "DC b2d", "ratio", lambda route: route.bench2drive_smoothness, SHARE
+)
+COLUMNS = (DS, ROOM, SR, DE, DE_B2D, DC, DC_B2D)
+"""The paper's scores of a route; b2d: in the arithmetic of Bench2Drive's tools."""

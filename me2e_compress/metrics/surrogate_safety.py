@@ -38,12 +38,21 @@ def room_kept(episode: Episode) -> Measure:
     that was the ego's fault. The driving score sees neither near misses nor faults.
     """
     exposed, pet = ttc_exposure(episode).value, smallest_pet(episode).value
-    fault = at_fault_collision(episode)
-    if exposed is None or fault is None:
+    kept = room_of(exposed, pet, at_fault_collision(episode))
+    if kept is None:
         why = "whose fault a collision was is not known"
         return Measure(None, "%", NOT_RECORDED if exposed is None else why)
-    kept = 1.0 if pet is None else min(pet / TTC_CRITICAL_S, 1.0)
-    return Measure(0.0 if fault else (100.0 - exposed) * kept, "%")
+    return Measure(kept, "%")
+
+
+def room_of(
+    ttc_exposure: float | None, smallest_pet: float | None, at_fault: bool | None
+) -> float | None:
+    """Return `room_kept` of its three parts; None if the first or last is unknown."""
+    if ttc_exposure is None or at_fault is None:
+        return None
+    kept = 1.0 if smallest_pet is None else min(smallest_pet / TTC_CRITICAL_S, 1.0)
+    return 0.0 if at_fault else (100.0 - ttc_exposure) * kept
 
 
 def smallest_ttc(episode: Episode) -> Measure:

@@ -204,7 +204,7 @@ def _distance_to_chords(
     points: Floats, start: Floats, direction: Floats, length: Floats
 ) -> Floats:
     """Return [N, C] distances of N points to C chords."""
-    offset = points[:, None, :] - start[None]
-    along = np.clip(np.sum(offset * direction, axis=2), 0.0, length)
-    miss = offset - along[..., None] * direction
-    return np.asarray(np.hypot(miss[..., 0], miss[..., 1]))
+    dx, dy = (points[:, i, None] - start[:, i] for i in (0, 1))
+    way_x, way_y = direction.T
+    along = (dx * way_x + dy * way_y).clip(0.0, length)
+    return np.asarray(np.hypot(dx - along * way_x, dy - along * way_y))

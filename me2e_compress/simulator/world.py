@@ -283,12 +283,12 @@ class World:
 
 
 def _actor(body: Car | Walker | StaticObject) -> Actor:
-    x, y = body.position
+    x, y = body.position.tolist()
     return Actor(
         body.id,
         body.kind,
-        float(x),
-        -float(y),
+        x,
+        -y,
         -float(body.heading),
         float(body.speed),
         float(body.LENGTH),

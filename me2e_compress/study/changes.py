@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.metrics.route_values import DS, SR, RouteColumn
+from me2e_compress.metrics.route_values import DS, ROOM, SR, RouteColumn
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.drive_record import DriveRecord
 
@@ -26,20 +26,29 @@ class Change:
     drive: str
     against: str
     driving_score: Estimate
+    room_kept: Estimate
     success_rate: Estimate
     beyond_driving_score: Estimate | None = None
+    beyond_room_kept: Estimate | None = None
     beyond_success_rate: Estimate | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return both names and every estimate."""
-        beyond = (self.beyond_driving_score, self.beyond_success_rate)
-        score, rate = (None if each is None else each.to_json() for each in beyond)
+        beyond = {
+            "driving_score": self.beyond_driving_score,
+            "room_kept": self.beyond_room_kept,
+            "success_rate": self.beyond_success_rate,
+        }
         return {
             "drive": self.drive,
             "against": self.against,
             "driving_score": self.driving_score.to_json(),
+            "room_kept": self.room_kept.to_json(),
             "success_rate": self.success_rate.to_json(),
-            "beyond_baseline": {"driving_score": score, "success_rate": rate},
+            "beyond_baseline": {
+                name: None if each is None else each.to_json()
+                for name, each in beyond.items()
+            },
         }
 
 
@@ -67,9 +76,11 @@ def changes(
             change = _change(ours, before, seed)
             if drive.variant != baseline:
                 both = (ours, before), (theirs, theirs_before)
-                score, rate = (_beyond(column, *both, seed) for column in (DS, SR))
                 change = replace(
-                    change, beyond_driving_score=score, beyond_success_rate=rate
+                    change,
+                    beyond_driving_score=_beyond(DS, *both, seed),
+                    beyond_room_kept=_beyond(ROOM, *both, seed),
+                    beyond_success_rate=_beyond(SR, *both, seed),
                 )
             found.append(change)
     return tuple(found)
@@ -92,8 +103,8 @@ def _by_name(drives: Sequence[DriveRecord]) -> dict[str, DriveRecord]:
 
 
 def _change(drive: DriveRecord, other: DriveRecord, seed: int) -> Change:
-    score, rate = (drive.minus(other, column, seed) for column in (DS, SR))
-    return Change(drive.name, other.name, score, rate)
+    found = (drive.minus(other, column, seed) for column in (DS, ROOM, SR))
+    return Change(drive.name, other.name, *found)
 
 
 Pair = tuple[DriveRecord, DriveRecord]

@@ -135,6 +135,7 @@ class DriveRecord:
         return {
             "route": route.route,
             "driving_score": route.driving_score,
+            "room_kept": route.room_kept,
             "succeeded": route.succeeded,
             "ending": route.ending,
             "infractions": [

@@ -5,17 +5,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from me2e_compress.runtime.providers import PROVIDERS
+from me2e_compress.study.cells import MISSING, estimate_cell
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome
 from me2e_compress.study.tables import (
     abilities,
     change_tables,
     differences,
-    near_misses,
     route_table,
     scoreboards,
 )
-from me2e_compress.workflows.result import Result, Table, counted
+from me2e_compress.workflows.result import Cell, Result, Table, counted
 
 
 @dataclass(frozen=True, repr=False)
@@ -81,8 +81,13 @@ class StudyResult(StudyOutcome, Result):
     def _record(self, drive: DriveRecord) -> dict[str, object]:
         # a drive that was not made has no scores
         scores, of = drive.scores, self.variant(drive.variant)
-        names = ("driving_score", "success_rate", "efficiency", "comfort")
+        names = (
+            *("driving_score", "success_rate", "efficiency", "comfort"),
+            *("bench2drive_efficiency", "bench2drive_smoothness"),
+        )
         found = {} if scores is None else {n: getattr(scores, n).value for n in names}
+        if scores is not None:
+            found["room_kept"] = scores.safety.room_kept.value
         return {
             "variant": drive.variant,
             "condition": drive.condition,
@@ -119,3 +124,34 @@ class StudyResult(StudyOutcome, Result):
             "machine": self.machine,
             "versions": dict(self.versions),
         }
+
+
+def near_misses(outcome: StudyOutcome) -> Table:
+    """Show how near every drive came to collisions, which end few routes."""
+    columns = ("TTC < 1.5 s, %", "least TTC s", "PET s", "distance m", "at fault %")
+    return Table(
+        "Near misses",
+        ("variant", *columns),
+        tuple(
+            (Cell(outcome.label(each)), *_safety(each, len(columns)))
+            for each in outcome.drives
+        ),
+        "Means over routes with their 95 % intervals: share of the time with a time to "
+        "collision below 1.5 s, the least of a route, post-encroachment time of "
+        "crossing paths, smallest distance; and routes with a collision that the ego "
+        "could have prevented. Least TTC and PET exist on some routes only.",
+        outcome.study.baseline,
+    )
+
+
+def _safety(drive: DriveRecord, columns: int) -> tuple[Cell, ...]:
+    if drive.scores is None:
+        return (Cell(MISSING, reason=drive.reason),) * columns
+    found = drive.scores.safety
+    return (
+        estimate_cell(found.ttc_exposure),
+        estimate_cell(found.smallest_ttc, ".2f"),
+        estimate_cell(found.smallest_pet, ".2f"),
+        estimate_cell(found.smallest_distance, ".2f"),
+        estimate_cell(found.at_fault_collisions),
+    )

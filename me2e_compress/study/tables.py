@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 
 from me2e_compress.metrics.abilities import ABILITIES
 from me2e_compress.metrics.differences import PairedDifference, holm
-from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_summary import RouteSummary
+from me2e_compress.metrics.route_values import COLUMNS
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.cells import MISSING, anew_cell, estimate_cell, measure_cell
 from me2e_compress.study.changes import Change
@@ -13,7 +14,7 @@ from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome, VariantOutcome
 from me2e_compress.workflows.result import Cell, Table, counted
 
-SCORES = ("DS", "room %", "SR %", "DE %", "DC")
+SCORES = tuple(each.name for each in COLUMNS)
 MOST_ROUTES = 40
 """With more routes than this, the table of endings is left out."""
 COSTS = ("size MB", "p50 ms", "p99 ms", "plan m", "SQNR dB")
@@ -60,8 +61,8 @@ def differences(outcome: StudyOutcome) -> Table:
     return Table(
         f"Difference to {outcome.study.baseline} on the same routes",
         (
-            *("variant", "DS, points", "DS, other types", "SR, points", "SR p"),
-            *("routes better", "routes worse"),
+            *("variant", "DS, points", "DS, other types", "room, points"),
+            *("SR, points", "SR p", "routes better", "routes worse"),
         ),
         tuple(
             (Cell(name), *_difference(each, p))
@@ -156,11 +157,15 @@ def change_tables(outcome: StudyOutcome) -> tuple[Table, ...]:
         " the change costs more than it."
     )
     # only changes have the columns beyond the baseline
-    columns = ("drive", "against", "DS, points", "DS, other types", "SR, points")
+    columns = (
+        *("drive", "against", "DS, points", "DS, other types", "room, points"),
+        "SR, points",
+    )
+    more = ("DS beyond", "room beyond", "SR beyond")
     return tuple(
         Table(
             title,
-            (*columns, "DS beyond", "SR beyond")[: len(columns) + 2 * beyond],
+            (*columns, *more) if beyond else columns,
             tuple(_change(each, beyond=beyond) for each in rows),
             note + further if beyond else note,
         )
@@ -173,18 +178,24 @@ def _change(change: Change, *, beyond: bool) -> tuple[Cell, ...]:
     cells = (
         Cell(change.drive),
         Cell(change.against),
-        *_gaps(change.driving_score, change.success_rate),
+        *_gaps(change),
     )
     own = Cell(MISSING, reason="the baseline itself")
-    rest = (change.beyond_driving_score, change.beyond_success_rate)
+    rest = (
+        *(change.beyond_driving_score, change.beyond_room_kept),
+        change.beyond_success_rate,
+    )
     shown = (own if each is None else estimate_cell(each, signed=True) for each in rest)
     return (*cells, *shown) if beyond else cells
 
 
-def _gaps(score: Estimate, rate: Estimate) -> tuple[Cell, Cell, Cell]:
-    """Show differences of driving score, with both intervals, and of success rate."""
-    signed = estimate_cell(score, signed=True)
-    return signed, anew_cell(score), estimate_cell(rate, signed=True)
+def _gaps(of: Change | PairedDifference) -> tuple[Cell, Cell, Cell, Cell]:
+    """Show differences: driving score with both intervals, room kept, success rate."""
+    score, room, rate = (
+        estimate_cell(each, signed=True)
+        for each in (of.driving_score, of.room_kept, of.success_rate)
+    )
+    return score, anew_cell(of.driving_score), room, rate
 
 
 def route_table(outcome: StudyOutcome) -> Table | None:
@@ -200,51 +211,29 @@ def route_table(outcome: StudyOutcome) -> Table | None:
         tuple(
             (
                 Cell(routes[0].route),
-                *(Cell(f"{each.driving_score:.1f}", each.fate) for each in routes),
+                *(Cell(f"{each.driving_score:.1f}", _ended(each)) for each in routes),
             )
             for routes in zip(*(each.routes for each in driven), strict=True)
         ),
-        "Driving score, and why it is not 100.",
+        "Driving score, why it is not 100, and the room kept to others.",
     )
 
 
-def near_misses(outcome: StudyOutcome) -> Table:
-    """Show how near every drive came to collisions, which end few routes."""
-    columns = ("TTC < 1.5 s, %", "least TTC s", "PET s", "distance m", "at fault %")
-    return Table(
-        "Near misses",
-        ("variant", *columns),
-        tuple(
-            (Cell(outcome.label(each)), *_safety(each, len(columns)))
-            for each in outcome.drives
-        ),
-        "Means over routes with their 95 % intervals: share of the time with a time to "
-        "collision below 1.5 s, the least of a route, post-encroachment time of "
-        "crossing paths, smallest distance; and routes with a collision that the ego "
-        "could have prevented. Least TTC and PET exist on some routes only.",
-        outcome.study.baseline,
-    )
-
-
-def _safety(drive: DriveRecord, columns: int) -> tuple[Cell, ...]:
-    if drive.scores is None:
-        return (Cell(MISSING, reason=drive.reason),) * columns
-    found = drive.scores.safety
-    return (
-        estimate_cell(found.ttc_exposure),
-        estimate_cell(found.smallest_ttc, ".2f"),
-        estimate_cell(found.smallest_pet, ".2f"),
-        estimate_cell(found.smallest_distance, ".2f"),
-        estimate_cell(found.at_fault_collisions),
-    )
+def _ended(route: RouteSummary) -> str:
+    room = route.room_kept
+    return route.fate if room is None else f"{route.fate}; room {room:.0f} %"
 
 
 def _scores(drive: DriveRecord) -> tuple[Cell, ...]:
     if drive.scores is None:
         return (Cell(MISSING, reason=drive.reason),) * len(SCORES)
     found = drive.scores
-    graded = (found.driving_score, found.safety.room_kept, found.success_rate)
-    return tuple(map(estimate_cell, (*graded, found.efficiency, found.comfort)))
+    shown = (
+        *(found.driving_score, found.safety.room_kept, found.success_rate),
+        *(found.efficiency, found.bench2drive_efficiency),
+        *(found.comfort, found.bench2drive_smoothness),
+    )
+    return tuple(map(estimate_cell, shown))
 
 
 def _costs(variant: VariantOutcome) -> tuple[Cell, ...]:
@@ -259,7 +248,7 @@ def _costs(variant: VariantOutcome) -> tuple[Cell, ...]:
 
 def _difference(found: PairedDifference, p_value: float) -> tuple[Cell, ...]:
     return (
-        *_gaps(found.driving_score, found.success_rate),
+        *_gaps(found),
         Cell(f"{p_value:.2g}"),
         Cell(str(found.better)),
         Cell(str(found.worse)),
@@ -278,7 +267,8 @@ def _routes_note(outcome: StudyOutcome) -> str:
     share = f"{of}{counted(whole, 'route')}"
     return (
         f"{share}. DS driving score, room kept to others, SR success rate, DE"
-        " efficiency, DC comfort, each "
+        " efficiency, DC comfort, both also in the arithmetic of Bench2Drive's tools"
+        " (b2d), each "
         f"with its 95 % interval over these scenario types. {MISSING} means not "
         "measured."
     )

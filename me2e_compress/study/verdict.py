@@ -1,7 +1,10 @@
 """A comparison of two drivers on one screen: size, time, plan, driving."""
 
+from collections.abc import Callable
+
 from me2e_compress.metrics.differences import PairedDifference, shown_by
-from me2e_compress.metrics.measure import Measure
+from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.cells import MISSING, measure_cell, number
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome
@@ -14,7 +17,8 @@ def before_and_after(outcome: StudyOutcome, name: str) -> Table:
     before, after = outcome.variant(outcome.study.baseline), outcome.variant(name)
     moved, most = after.fidelity.mean_m, after.fidelity.max_m
     far = "" if most.value is None else f"{most.value:.2f} m at most"
-    first, second = (_drive(outcome, each.name) for each in (before, after))
+    driven = [_drive(outcome, each.name) for each in (before, after)]
+    gap = driven[1].difference
     return Table(
         "Before and after",
         ("", before.name, after.name, ""),
@@ -29,8 +33,16 @@ def before_and_after(outcome: StudyOutcome, name: str) -> Table:
             ),
             (
                 Cell("driving score"),
-                *(_score(each) for each in (first, second)),
-                Cell(_difference(second)),
+                *(_score(each, lambda found: found.driving_score) for each in driven),
+                Cell("" if gap is None else _points(gap.driving_score)),
+            ),
+            (
+                Cell("room kept, %"),
+                *(
+                    _score(each, lambda found: found.safety.room_kept)
+                    for each in driven
+                ),
+                Cell("" if gap is None else _points(gap.room_kept)),
             ),
         ),
     )
@@ -80,19 +92,18 @@ def _row(what: str, before: Measure, after: Measure, form: str) -> tuple[Cell, .
     )
 
 
-def _score(drive: DriveRecord) -> Cell:
+def _score(drive: DriveRecord, pick: Callable[[Scores], Estimate]) -> Cell:
     if drive.scores is None:
         return Cell(MISSING, reason=drive.reason)
-    return measure_cell(drive.scores.driving_score.measure, ".1f")
+    return measure_cell(pick(drive.scores).measure, ".1f")
 
 
-def _difference(drive: DriveRecord) -> str:
-    """Return the difference in points, with its 95 % interval."""
-    if drive.difference is None:
+def _points(gap: Estimate) -> str:
+    """Return a difference in points with its 95 % interval; empty if unknown."""
+    if gap.value is None:
         return ""
-    score = drive.difference.driving_score
-    said = number(score.value or 0.0, "+.1f")
-    if score.low is None or score.high is None:
+    said = number(gap.value, "+.1f")
+    if gap.low is None or gap.high is None:
         return said
-    low, high = (number(each, "+.1f") for each in (score.low, score.high))
+    low, high = (number(each, "+.1f") for each in (gap.low, gap.high))
     return f"{said} ({low} to {high})"

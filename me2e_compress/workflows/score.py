@@ -55,7 +55,7 @@ class ScoreResult(Result):
 
     @property
     def headline(self) -> str:
-        """The driving scores."""
+        """The driving scores, and the room kept to others."""
         return "; ".join(
             f"{name}: {driving_score(scores)}" for name, scores in self.scores.items()
         )
@@ -184,13 +184,19 @@ def _episodes(folder: ResultsFolder, listener: Listener) -> tuple[Episode, ...]:
 
 
 def driving_score(scores: Scores) -> str:
-    """Return the driving score with its interval, and the number of routes."""
+    """Return driving score and room kept with intervals, and the number of routes."""
     found = scores.driving_score
     routes = f"{scores.routes} of {scores.expected} routes"
     if found.value is None:
         return f"driving score not measured ({found.measure.reason}); {routes}"
-    between = f"{number(found.low, '.1f')} to {number(found.high, '.1f')}"
-    return f"driving score {found.value:.1f} ({between}); {routes}"
+    room = scores.safety.room_kept
+    kept = "" if room.value is None else f", room kept {_between(room)} %"
+    return f"driving score {_between(found)}{kept}; {routes}"
+
+
+def _between(found: Estimate) -> str:
+    low, high = number(found.low, ".1f"), number(found.high, ".1f")
+    return f"{number(found.value, '.1f')} ({low} to {high})"
 
 
 def scores_table(name: str, scores: Scores) -> Table:
@@ -216,8 +222,10 @@ def _each(scores: Scores) -> Iterator[tuple[str, Estimate]]:
     yield "room kept", scores.safety.room_kept
     yield "success rate", scores.success_rate
     yield "efficiency", scores.efficiency
+    yield "Bench2Drive's efficiency", scores.bench2drive_efficiency
     yield "comfort", scores.comfort
     yield "comfort in motion", scores.comfort_in_motion
+    yield "Bench2Drive's smoothness", scores.bench2drive_smoothness
     yield "abilities, mean", scores.abilities
     yield from ((f"  {name}", rate) for name, rate in scores.each_ability.items())
     yield "frames with TTC below 1.5 s", scores.safety.ttc_exposure
@@ -225,8 +233,6 @@ def _each(scores: Scores) -> Iterator[tuple[str, Estimate]]:
     yield "smallest PET", scores.safety.smallest_pet
     yield "smallest distance", scores.safety.smallest_distance
     yield "at-fault collisions", scores.safety.at_fault_collisions
-    yield "Bench2Drive's efficiency", scores.bench2drive_efficiency
-    yield "Bench2Drive's smoothness", scores.bench2drive_smoothness
 
 
 def _cells(estimate: Estimate) -> Sequence[str]:

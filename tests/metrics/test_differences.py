@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,6 +29,16 @@ def test_the_mean_of_differences_route_by_route() -> None:
     assert found.success_rate.value == pytest.approx(-25.0)
     assert found.driving_score.measure.unit == "points"
     assert (found.better, found.worse) == (0, 1)
+
+
+def test_room_is_compared_where_both_drives_recorded_it() -> None:
+    near, far = (
+        [replace(each, ttc_exposure=percent, at_fault=False) for each in GOOD]
+        for percent in (30.0, 10.0)
+    )
+
+    assert difference(near, far).room_kept.value == pytest.approx(-20.0)
+    assert difference(near, GOOD).room_kept.measure.reason == "no route has a room %"
 
 
 def test_the_order_of_the_reference_does_not_matter() -> None:
@@ -107,7 +119,7 @@ def paired(
     routes: int, low: float | None, high: float | None, value: float = 0.0
 ) -> PairedDifference:
     score = Estimate(Measure(value, "points"), low, high, routes)
-    return PairedDifference(score, score, 0, 0)
+    return PairedDifference(score, score, score, 0, 0)
 
 
 @pytest.mark.parametrize(

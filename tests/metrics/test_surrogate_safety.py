@@ -8,6 +8,7 @@ from me2e_compress.metrics.conflict_record import ConflictRecord, Encounter
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.infraction import Infraction, InfractionKind
 from me2e_compress.metrics.measure import Measure
+from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.metrics.scores import score
 from me2e_compress.metrics.surrogate_safety import (
     at_fault_collision,
@@ -67,6 +68,9 @@ def test_room_is_kept_by_who_comes_near_nobody() -> None:
     ]
 
     assert found == pytest.approx([50.0, 10.0, 10.0, 0.0, 100.0])
+    for faults in ((), (crash(True),), (crash(None),)):
+        episode = drive(*faults, conflicts=close)
+        assert RouteSummary.of(episode).room_kept == room_kept(episode).value
     unknown = room_kept(drive(crash(None), conflicts=close))
     assert unknown == Measure(None, "%", "whose fault a collision was is not known")
 

@@ -62,6 +62,8 @@ def _routes(
                 400 // (late + 1),
                 (50_000 * (late + 1),) * 4,
                 50_000 * (late + 1) * (400 // (late + 1)),
+                bench2drive_efficiency=round(130 + random.normal(0, 20), 3),
+                bench2drive_smoothness=0.4 + number / 100 if late else 0.2,
             )
         )
     return tuple(made)

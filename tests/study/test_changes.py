@@ -1,4 +1,5 @@
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 
@@ -16,7 +17,8 @@ CONDITIONS = (IDEAL, FOG)
 
 def summary(route: str, scenario: str, score: float) -> RouteSummary:
     ended = (100.0, score == 100.0, "", (), None, None)
-    return RouteSummary(route, scenario, score, *ended, 1, 0, (), 0)
+    made = RouteSummary(route, scenario, score, *ended, 1, 0, (), 0)
+    return replace(made, ttc_exposure=(100.0 - score) / 2, at_fault=False)
 
 
 def drive(variant: str, condition: str, scores: Sequence[float]) -> DriveRecord:
@@ -40,6 +42,7 @@ def test_a_change_is_held_against_the_same_routes_without_it() -> None:
     assert (float_.drive, float_.against) == ("float.fog", "float.ideal")
     assert float_.driving_score.value == pytest.approx(-2.5)
     assert float_.success_rate.value == pytest.approx(-25.0)
+    assert float_.room_kept.value == pytest.approx(-2.5 / 2)
     assert float_.beyond_driving_score is None
     assert int8.driving_score.value == pytest.approx((-40 - 10 - 40) / 4)
 
@@ -54,6 +57,8 @@ def test_int8_loses_more_is_a_difference_of_differences() -> None:
     assert found.high is not None
     assert found.low < -20.0 < found.high
     assert found.n == 4
+    assert int8.beyond_room_kept is not None
+    assert int8.beyond_room_kept.value == pytest.approx(-10.0)
 
 
 def test_what_was_not_driven_is_left_out() -> None:
@@ -80,10 +85,10 @@ def test_tables_of_changes_and_pairs(make: Make) -> None:
 
     one, other = change_tables(Outcome())  # type: ignore[arg-type]
 
-    assert one.columns[-2:] == ("DS beyond", "SR beyond")
-    assert [len(row) for row in one.rows] == [7, 7]
-    assert one.rows[0][5].reason == "the baseline itself"
-    assert [len(row) for row in other.rows] == [5]
+    assert one.columns[-3:] == ("DS beyond", "room beyond", "SR beyond")
+    assert [len(row) for row in one.rows] == [9, 9]
+    assert one.rows[0][6].reason == "the baseline itself"
+    assert [len(row) for row in other.rows] == [6]
 
 
 @pytest.mark.parametrize("name", ["tail", "shifts"])

@@ -77,6 +77,36 @@ def test_findings_follow_from_the_drives(result: PaperResult) -> None:
     assert found["int8-full"] is YES
 
 
+def test_comfort_has_a_verdict_in_each_arithmetic(result: PaperResult) -> None:
+    found = finding(result, "rate-comfort-b2d")
+
+    assert finding(result, "rate-comfort").verdict is NO
+    assert found.verdict is YES
+    assert found.found.estimate.value == pytest.approx(-0.25)
+    assert found.found.estimate.anew_low is not None
+
+
+def test_early_records_have_no_verdict_in_bench2drives(result: PaperResult) -> None:
+    cells = {
+        name: replace(
+            drive,
+            routes=tuple(
+                replace(e, bench2drive_efficiency=None, bench2drive_smoothness=None)
+                for e in drive.routes
+            ),
+        )
+        for name, drive in cells_of(result).items()
+    }
+    early = with_cells(result, cells)
+
+    found = finding(early, "rate-efficiency-b2d")
+    assert found.verdict is Verdict.NOT_TESTED
+    assert found.found.estimate.measure.reason == "no route has a DE b2d %"
+    # room was not recorded in either
+    assert [each.name for each in early.columns] == ["DS", "SR %", "DE %", "DC"]
+    assert {"DE b2d %", "DC b2d"} < {each.name for each in result.columns}
+
+
 def test_other_drives_turn_a_finding_round(result: PaperResult) -> None:
     slow, ideal = result.drive("float", "fps-1"), result.drive("float", "ideal")
     turned = {**cells_of(result), ("float", "fps-1"): ideal, ("float", "ideal"): slow}
@@ -287,7 +317,7 @@ def test_rates_that_equation_4_makes_one_are_one_drive(result: PaperResult) -> N
     assert rows["14"][1:4] == ["ideal", "0", "20"]
     assert rows["8"][1:4] == ["fps-10", "1", "10"]
     assert rows["3"][1:4] == ["fps-3", "5", "3.33"]
-    assert rows["24"][8:] == ["40.63", "138.21", "0.33"]
+    assert rows["24"][10:] == ["40.63", "138.21", "0.33"]
 
 
 def test_modelled_energy_stands_apart_from_measured(result: PaperResult) -> None:

@@ -130,7 +130,7 @@ def test_each_route_has_its_end(found: StudyResult) -> None:
     assert table.columns[:2] == ("route", "blind, ideal")
     assert [row[0].text for row in table.rows] == [each.id for each in ROUTES]
     ends = {cell.detail for row in table.rows for cell in row[1:]}
-    assert "collision with a vehicle" in ends
+    assert "collision with a vehicle; room 0 %" in ends
 
 
 def test_many_routes_are_not_shown_one_by_one(found: StudyResult) -> None:
@@ -166,7 +166,7 @@ def test_a_curve_needs_three_conditions(found: StudyResult) -> None:
 
     assert curves(found) is None
     assert drawn is not None
-    assert all(drawn.count(f">{name}</text>") == 2 for name in ("middle", "fast"))
+    assert all(drawn.count(f">{name}</text>") == 3 for name in ("middle", "fast"))
 
 
 def test_findings_give_costs_and_what_is_sure(found: StudyResult) -> None:

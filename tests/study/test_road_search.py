@@ -151,6 +151,7 @@ def test_the_budgets_are_met_with_figures(found: Found) -> None:
     assert re.match(
         r"budgets: 0\.0\S* of 1 MB, \S+ of 1 (modelled )?J", result.lines()[1]
     )
+    assert result.lines()[2].startswith("room kept to others: not measured (no route")
     assert "a preview: 8 of 220 routes" in result.lines()
 
 

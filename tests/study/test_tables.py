@@ -12,10 +12,10 @@ from me2e_compress.study.cells import (
     measure_cell,
     number,
 )
+from me2e_compress.study.study_result import near_misses
 from me2e_compress.study.tables import (
     abilities,
     differences,
-    near_misses,
     scoreboards,
 )
 from me2e_compress.workflows.result import Cell, Table
@@ -43,19 +43,22 @@ def test_the_numbers_are_those_of_the_drives(found: StudyResult) -> None:
 
     assert row[1] == estimate_cell(scores.driving_score)
     assert row[2] == estimate_cell(scores.safety.room_kept)
-    assert row[7] == measure_cell(found.variants[3].latency_ms[50], ".1f")
-    assert row[9].text == "7.000"
+    assert row[4] == estimate_cell(scores.efficiency)
+    assert row[5] == estimate_cell(scores.bench2drive_efficiency)
+    assert row[7] == estimate_cell(scores.bench2drive_smoothness)
+    assert row[9] == measure_cell(found.variants[3].latency_ms[50], ".1f")
+    assert row[11].text == "7.000"
 
 
 def test_a_driver_without_a_model_has_reasons_not_numbers(found: StudyResult) -> None:
     row = scoreboards(found)[0].rows[0]
 
-    assert [cell.text for cell in row[6:]] == [MISSING] * 5
-    assert all(cell.reason for cell in row[6:])
+    assert [cell.text for cell in row[8:]] == [MISSING] * 5
+    assert all(cell.reason for cell in row[8:])
 
 
 def test_no_noise_is_not_a_gap(found: StudyResult) -> None:
-    assert scoreboards(found)[0].rows[2][10].text == INFINITE
+    assert scoreboards(found)[0].rows[2][12].text == INFINITE
 
 
 def test_the_baseline_is_not_compared_with_itself(found: StudyResult) -> None:
@@ -105,7 +108,8 @@ def test_one_variant_has_one_scoreboard_of_its_conditions(found: StudyResult) ->
     [table] = scoreboards(alone)
     [mastered] = abilities(alone)
 
-    assert table.columns == ("condition", "DS", "room %", "SR %", "DE %", "DC")
+    assert table.columns[1:6] == ("DS", "room %", "SR %", "DE %", "DE b2d %")
+    assert table.columns[6:] == ("DC", "DC b2d")
     assert [row[0].text for row in mastered.rows] == ["ideal", "slow"]
     assert [row[0].text for row in table.rows] == ["ideal", "slow"]
     assert "Difference" not in "".join(each.title for each in alone.tables())

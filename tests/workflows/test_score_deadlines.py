@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from me2e_compress.evaluators.highway.results import ResultsFolder
+from me2e_compress.metrics.conflict_record import ConflictRecord
 from me2e_compress.metrics.episode import InferenceRecord
 from me2e_compress.workflows.score import score
 from tests.metrics.drives import cruise, drive
@@ -34,3 +35,16 @@ def test_that_number_makes_no_other_evaluation(tmp_path: Path) -> None:
     before = kept(tmp_path, None)
 
     assert ResultsFolder.create(tmp_path, MADE_BY, 16).episodes() == before.episodes()
+
+
+def test_what_ds_does_not_see_stands_beside_it(tmp_path: Path) -> None:
+    near = ConflictRecord((9.0, 3.5), (None, 1.0), ())
+    folder = ResultsFolder.create(tmp_path, MADE_BY, None)
+    folder.keep(replace(drive(driven=cruise(), conflicts=near), route="r"))
+
+    found = score(tmp_path)
+
+    told = "driving score 100.0 (- to -), room kept 50.0 (- to -) %; 1 of 1 routes"
+    assert found.headline.endswith(told)
+    rows = [each["score"] for each in found.records()]
+    assert rows[3:5] == ["efficiency", "Bench2Drive's efficiency"]

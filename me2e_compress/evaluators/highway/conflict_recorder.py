@@ -27,7 +27,7 @@ from me2e_compress.metrics.conflict_record import (
 from me2e_compress.metrics.episode import FRAME_US
 from me2e_compress.metrics.infraction import Contact
 from me2e_compress.simulator.plane_geometry import Lane, Roadmap
-from me2e_compress.simulator.scene import Actor, Ego, Scene
+from me2e_compress.simulator.scene import Actor, ActorKind, Ego, Scene
 
 LATEST = round(PET_HORIZON_S * 1e6 / FRAME_US)
 """Most frames between the first and the second at one place."""
@@ -53,14 +53,14 @@ class ConflictRecorder:
 
     _egos: list[tuple[float, ...]] = field(default_factory=list, init=False)
     _actors: list[list[tuple[float, ...]]] = field(default_factory=list, init=False)
-    _kinds: dict[int, str] = field(default_factory=dict, init=False)
+    _kinds: dict[int, ActorKind] = field(default_factory=dict, init=False)
 
     def record(self, scene: Scene) -> None:
         """Keep one frame."""
         self._egos.append((*_box(scene.ego), scene.ego.speed_mps))
         rows = list[tuple[float, ...]]()
         for actor in scene.actors:
-            self._kinds[actor.id] = actor.kind.value
+            self._kinds[actor.id] = actor.kind
             rows.append((*_box(actor), actor.speed_mps, actor.id))
         self._actors.append(rows)
 
@@ -94,7 +94,7 @@ class ConflictRecorder:
             own = actors[:, 6] == number
             if actors[own, 5].any():
                 pairs = _same_place(egos, actors[own], frame[own])
-                kind = self._kinds[number]
+                kind = self._kinds[number].value
                 found += [_encounter(number, kind, *pair) for pair in pairs]
         return sorted(found, key=lambda each: (each.time_us, each.actor))
 
@@ -155,9 +155,14 @@ def _same_place(
     reach = (np.hypot(*egos[0, 3:5]) + np.hypot(*actor[:, 3:5].T).max()) / 2
     best: dict[bool, tuple[int, int, int, float]] = {}
     for start in range(0, len(egos), CHUNK):
-        # candidate pairs of frames, at most LATEST apart
+        # candidate pairs of frames, at most LATEST apart, where the ego comes at all
+        ego = egos[start : start + CHUNK]
+        low, high = ego[:, :2].min(axis=0) - reach, ego[:, :2].max(axis=0) + reach
         near = (frame >= start - LATEST) & (frame < start + CHUNK + LATEST)
-        ego, other, when = egos[start : start + CHUNK], actor[near], frame[near]
+        near &= ((actor[:, :2] >= low) & (actor[:, :2] <= high)).all(axis=1)
+        if not near.any():
+            continue
+        other, when = actor[near], frame[near]
         apart = np.abs(start + np.arange(len(ego))[:, None] - when)
         away = np.hypot(*(ego[:, None, :2] - other[:, :2]).transpose(2, 0, 1))
         i, j = np.nonzero((apart <= LATEST) & (away <= reach))

@@ -156,6 +156,7 @@ class _Drive:
         enough: Callable[[World], bool] | None,
     ) -> None:
         self.route, self.policy, self.listeners = route, policy, listeners
+        self.hosted = policy if isinstance(policy, HostedPolicy) else None
         self.enough = enough
         self.world = world = World(
             route, dt_us=conditions.dt_us, drive_on=conditions.drive_on
@@ -214,7 +215,7 @@ class _Drive:
         self.listeners.on_answer()
         # the latency source may use the measured time
         control = self.control_by(_checked(answer), scene)
-        facts = DecisionFacts(took_us, road_users(scene), *_host_work(self.policy))
+        facts = DecisionFacts(took_us, road_users(scene), *self.host_work())
         latency_us = self.charge(facts)
         self.recorder.decisions.append(InferenceRecord(scene.time_us, latency_us))
         self.clock.decide(control, latency_us)
@@ -226,6 +227,12 @@ class _Drive:
         self.plan = scene.ego, np.asarray(answer.points, np.float64)
         anchored = AnchoredPlan.of(answer, scene.ego, scene.time_us)
         return anchored.control(scene.ego, scene.time_us)
+
+    def host_work(self) -> tuple[int, int]:
+        """Return iterations and cells of the policy's host stage; zeros without one."""
+        if self.hosted is None:
+            return 0, 0
+        return self.hosted.host_iterations, self.hosted.host_cells
 
     def show(self, scene: Scene) -> None:
         """Render this frame for the listener that draws pictures."""
@@ -246,13 +253,6 @@ def _ask(call: Callable[[], T]) -> T:
         words = " ".join(str(error).split())
         told = f"{type(error).__name__}: {words}" if words else repr(error)
         raise PolicyFailedError(told) from error
-
-
-def _host_work(policy: Policy) -> tuple[int, int]:
-    """Return iterations and cells of the policy's host stage; zeros without one."""
-    if not isinstance(policy, HostedPolicy):
-        return 0, 0
-    return policy.host_iterations, policy.host_cells
 
 
 def _checked(answer: object) -> Trajectory | PedalsAndWheel:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from me2e_compress.simulator.camera_rig import CAMERA_NAMES, CameraRig
 from me2e_compress.simulator.cameras.ground import SKY_M, GroundSampler
 from me2e_compress.simulator.cameras.painter import Faces
-from me2e_compress.simulator.weather import Weather
+from me2e_compress.simulator.weather import CLEAR, Weather
 
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
@@ -110,6 +110,8 @@ class Sensor:
     def expose(self, images: Bytes, time_us: int) -> None:
         """Change uint8 [6, H, W, 3] in place."""
         weather = self.weather
+        if weather == CLEAR:
+            return
         rng = np.random.default_rng((weather.seed, time_us))
         if weather.rain > 0.0:
             self._rain(images, rng)

@@ -51,8 +51,8 @@ class RowGroup:
         steps: [T, R, 2] metres from one column to the next.
         levels: [R] mip level.
         blocks: (level, first, last) slices of the rows.
-        coordinates: Two [T, R, W], working memory, overwritten in every frame.
-        samples: [T, R, W, 4], likewise.
+        coordinates: Two [R, T, W], working memory, overwritten in every frame.
+        samples: [R, T, W, 4], likewise.
     """
 
     rows: npt.NDArray[np.intp]
@@ -78,16 +78,15 @@ class GroundSampler:
             taps = group.samples
             # sample every row from its own mip level, then average
             for level, first, last in group.blocks:
-                for tap in range(len(u)):
-                    cv2.remap(
-                        texture.levels[level],
-                        u[tap, first:last],
-                        v[tap, first:last],
-                        cv2.INTER_LINEAR,
-                        dst=taps[tap, first:last],
-                        borderMode=cv2.BORDER_REPLICATE,
-                    )
-            samples: list[Bytes] = [taps[tap] for tap in range(len(u))]
+                cv2.remap(
+                    texture.levels[level],
+                    u[first:last].reshape(-1, self.rig.width),
+                    v[first:last].reshape(-1, self.rig.width),
+                    cv2.INTER_LINEAR,
+                    dst=taps[first:last].reshape(-1, *taps.shape[2:]),
+                    borderMode=cv2.BORDER_REPLICATE,
+                )
+            samples: list[Bytes] = list(taps.swapaxes(0, 1))
             stacked[group.rows] = cv2.cvtColor(_mean(samples), cv2.COLOR_RGBA2RGB)
 
     def label(self, labels: Bytes, texture: GroundTexture, ego: Ego) -> None:
@@ -95,8 +94,8 @@ class GroundSampler:
         u, v = self._coordinates(self._label_rows, texture, ego)
         labels.reshape(-1, labels.shape[2])[self._label_rows.rows] = cv2.remap(
             texture.classes,
-            u[0],
-            v[0],
+            u[:, 0],
+            v[:, 0],
             cv2.INTER_NEAREST,
             borderMode=cv2.BORDER_REPLICATE,
         )
@@ -120,7 +119,7 @@ class GroundSampler:
     def _coordinates(
         self, group: RowGroup, texture: GroundTexture, ego: Ego
     ) -> tuple[Floats32, Floats32]:
-        """Return [T, R, W] texture columns and rows, each on its own mip level."""
+        """Return [R, T, W] texture columns and rows, each on its own mip level."""
         cos, sin = np.cos(ego.heading), np.sin(ego.heading)
         # ego frame to metres right and down from the texture's corner: rows run south
         rotation = np.array([[cos, -sin], [-sin, -cos]])
@@ -128,7 +127,8 @@ class GroundSampler:
         scale = 1.0 / (RESOLUTION_M * 2.0**group.levels)
         start = (group.origins @ rotation.T + corner) * scale[:, None] - 0.5
         step = (group.steps @ rotation.T) * scale[:, None]
-        start32, step32 = start.astype(np.float32), step.astype(np.float32)
+        # [R, T, 2] as the pixels lie
+        start32, step32 = (e.astype(np.float32).swapaxes(0, 1) for e in (start, step))
         column = np.arange(self.rig.width, dtype=np.float32) + np.float32(0.5)
         for i, pixels in enumerate(group.coordinates):
             np.multiply(step32[..., i, None], column, out=pixels)
@@ -168,7 +168,7 @@ class GroundSampler:
         # slices of equal level
         found, first = np.unique(levels, return_index=True)
         last = [*first[1:].tolist(), len(levels)]
-        shape = (taps, len(levels), self.rig.width)
+        shape = (len(levels), taps, self.rig.width)
         return RowGroup(
             rows=camera * self.rig.height + row,
             origins=centre - steps * self.rig.centre_px[0],

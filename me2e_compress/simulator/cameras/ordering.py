@@ -51,7 +51,7 @@ def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints
     if len(first) == 0:
         return camera, solid
     edges = _edges(x, y)
-    before, after = _hides(edges, second, first), _hides(edges, first, second)
+    before, after = _hides(edges, first, second)
     wrong = after & ~before
     # sort the cameras with such a pair anew, by the edges
     for k in np.unique(camera[first[wrong]]).tolist():
@@ -84,15 +84,17 @@ def _edges(x: Floats, y: Floats) -> Edges:
     return Edges(x, y, normal_x, normal_y, normal_x * x + normal_y * y)
 
 
-def _hides(edges: Edges, front: Ints, back: Ints) -> Flags:
-    """Return whether an edge shows that solid front[i] is on the camera's side.
+def _hides(edges: Edges, first: Ints, second: Ints) -> tuple[Flags, Flags]:
+    """Return whether an edge shows that second[i], or first[i], is the nearer solid.
 
-    Either an edge of the back solid has both the camera and the front solid outside, or
-    an edge of the front solid has the camera inside.
+    Either an edge of the farther solid has both the camera and the nearer one outside,
+    or an edge of the nearer one has the camera inside.
     """
-    shown = _outside(edges, back, front) & (edges.at[:, back] < 0.0)
-    shown |= _outside(edges, front, back) & (edges.at[:, front] >= 0.0)
-    return np.asarray(shown.any(axis=0))
+    one, other = _outside(edges, first, second), _outside(edges, second, first)
+    out_one, out_other = (edges.at[:, solid] < 0.0 for solid in (first, second))
+    before = (one & out_one) | (other & ~out_other)
+    after = (other & out_other) | (one & ~out_one)
+    return np.asarray(before.any(axis=0)), np.asarray(after.any(axis=0))
 
 
 def _outside(edges: Edges, of: Ints, other: Ints) -> Flags:

@@ -1,5 +1,6 @@
 """From a scene to the solids that the painter draws."""
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -120,10 +121,10 @@ def solids_of(scene: Scene) -> list[Solid]:
     """Return every solid of a scene that is near enough to be seen from the ego."""
     ego, solids = scene.ego, list[Solid]()
     for actor in scene.actors:
-        if np.hypot(actor.x - ego.x, actor.y - ego.y) < FARTHEST_M:
+        if math.hypot(actor.x - ego.x, actor.y - ego.y) < FARTHEST_M:
             solids += _actor_solids(actor, scene.time_us)
     for signal in scene.signals:
-        if np.hypot(signal.x - ego.x, signal.y - ego.y) < FARTHEST_M:
+        if math.hypot(signal.x - ego.x, signal.y - ego.y) < FARTHEST_M:
             solids.append(_signal_solid(signal))
     return solids
 

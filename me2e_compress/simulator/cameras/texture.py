@@ -62,27 +62,36 @@ class GroundPlan:
         Piece by piece, since cv2 paints convex polygons without bias and others not.
         Antialiased, it rounds them out by half a texel on each side: taken off here.
         """
-        aliased = self._quads(line, width_m)
-        smooth = self._quads(line, width_m - RESOLUTION_M)
+        normals = left_of(line)
+        aliased = self._quads(line, normals, width_m)
+        smooth = self._quads(line, normals, width_m - RESOLUTION_M)
         for sharp, soft in zip(aliased, smooth, strict=True):
             cv2.fillConvexPoly(
                 self.classes, sharp, (int(kind),), cv2.LINE_8, SUBPIXEL_BITS
             )
             cv2.fillConvexPoly(self.colours, soft, colour, cv2.LINE_AA, SUBPIXEL_BITS)
 
-    def _quads(self, line: Floats, width_m: float) -> npt.NDArray[np.int32]:
+    def _quads(
+        self, line: Floats, normals: tuple[Floats, Floats], width_m: float
+    ) -> npt.NDArray[np.int32]:
         """Return [N - 1, 4, 2], the pieces of a band."""
-        sides = (offset_line(line, side * width_m) for side in (0.5, -0.5))
+        normal, length = normals
+        sides = (line + normal * (side * width_m / length) for side in (0.5, -0.5))
         left, right = (fixed_point(self.texels(side)) for side in sides)
         return np.stack([left[:-1], right[:-1], right[1:], left[1:]], axis=1)
 
 
 def offset_line(line: Floats, lateral_m: float) -> Floats:
     """Return a polyline [N, 2] moved to its left."""
+    normal, length = left_of(line)
+    return np.asarray(line + normal * (lateral_m / length))
+
+
+def left_of(line: Floats) -> tuple[Floats, Floats]:
+    """Return normals [N, 2] to the left of a polyline, and their lengths [N, 1]."""
     tangent = np.gradient(line, axis=0)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    normal *= lateral_m / np.linalg.norm(normal, axis=1)[:, None]
-    return np.asarray(line + normal)
+    return normal, np.linalg.norm(normal, axis=1)[:, None]
 
 
 def paint_lanes(plan: GroundPlan, roadmap: Roadmap) -> None:
@@ -149,6 +158,9 @@ repeats its border, which continues a straight road."""
 GRASS = (92, 122, 70)
 GRASS_GRAIN, ASPHALT_GRAIN = np.float32(10.0), np.float32(3.0)
 """Grey levels of the mottling."""
+GRAINS = ((16.0, 0.8), (2.0, 0.6), (0.5, 0.4))
+"""Metres of a patch, and its share of the mottling."""
+ROWS_AT_ONCE = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +202,8 @@ def paint_texture(roadmap: Roadmap, route: npt.NDArray[np.float64]) -> GroundTex
         classes=np.full((height, width), PixelClass.TERRAIN, np.uint8),
     )
     # from grass up: lanes, grain, then everything painted on top
-    plan.colours[:] = GRASS
+    plan.colours[0] = GRASS
+    plan.colours[1:] = plan.colours[0]
     paint_lanes(plan, roadmap)
     _add_grain(plan, np.random.default_rng(0))
     paint_markings(plan, roadmap)
@@ -210,14 +223,19 @@ def _texels(span_m: float) -> int:
 def _add_grain(plan: GroundPlan, rng: np.random.Generator) -> None:
     """Mottle grass strongly and pavement faintly, in patches of 16, 2 and 0.5 m."""
     height, width = plan.classes.shape
-    grain = np.zeros((height, width), np.float32)
-    for patch_m, share in ((16.0, 0.8), (2.0, 0.6), (0.5, 0.4)):
+    patches = np.empty((3, height, width), np.float32)
+    for out, (patch_m, share) in zip(patches, GRAINS, strict=True):
         cells = int(patch_m / RESOLUTION_M)
         coarse = rng.uniform(-share, share, (height // cells + 2, width // cells + 2))
-        grain += cv2.resize(coarse.astype(np.float32), (width, height))
-    grain *= np.where(plan.classes == PixelClass.TERRAIN, GRASS_GRAIN, ASPHALT_GRAIN)
-    step = np.rint(grain).astype(np.int16)
-    cv2.add(plan.colours, cv2.merge([step] * 3), plan.colours, dtype=cv2.CV_8U)
+        cv2.resize(coarse.astype(np.float32), (width, height), out)
+    # a few rows at a time stay in the processor's cache
+    for top in range(0, height, ROWS_AT_ONCE):
+        rows = slice(top, top + ROWS_AT_ONCE)
+        grass = plan.classes[rows] == PixelClass.TERRAIN
+        grain = patches[0, rows] + patches[1, rows] + patches[2, rows]
+        step = np.rint(grain * np.where(grass, GRASS_GRAIN, ASPHALT_GRAIN))
+        mottled = cv2.merge([step.astype(np.int16)] * 3)
+        cv2.add(plan.colours[rows], mottled, plan.colours[rows], dtype=cv2.CV_8U)
 
 
 def _mip_levels(colours: Bytes) -> tuple[Bytes, ...]:

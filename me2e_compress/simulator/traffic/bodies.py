@@ -145,6 +145,8 @@ class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
     def step(self, dt: float) -> None:
         """Advance by ``dt`` seconds; walking speed is reached within 0.5 s."""
         target = self.top_speed_mps if self.going and not self.done else 0.0
+        if target == self.speed == 0.0:
+            return
         change = 2 * max(self.top_speed_mps, 1.0) * dt
         self.speed += min(max(target - self.speed, -change), change)
         self.walked_m = min(self.walked_m + self.speed * dt, self._ends[-1])

@@ -45,16 +45,16 @@ class LaneTable:
         s = np.empty((len(points), len(self.length)))
         r = np.empty_like(s)
         if len(self._straight):
-            delta = points[:, None, :] - self._start[None]
+            dx, dy = (points[:, i, None] - self._start[:, i] for i in (0, 1))
             ax, ay = self._along[:, 0], self._along[:, 1]
-            s[:, self._straight] = delta[..., 0] * ax + delta[..., 1] * ay
-            r[:, self._straight] = delta[..., 1] * ax - delta[..., 0] * ay
+            s[:, self._straight] = dx * ax + dy * ay
+            r[:, self._straight] = dy * ax - dx * ay
         if len(self._circular):
-            delta = points[:, None, :] - self._centre[None]
-            turn = np.arctan2(delta[..., 1], delta[..., 0]) - self._phase
+            dx, dy = (points[:, i, None] - self._centre[:, i] for i in (0, 1))
+            turn = np.arctan2(dy, dx) - self._phase
             turn = (turn + np.pi) % (2 * np.pi) - np.pi
             s[:, self._circular] = self._sense * turn * self._radius
-            away = np.hypot(delta[..., 0], delta[..., 1])
+            away = np.hypot(dx, dy)
             r[:, self._circular] = self._sense * (self._radius - away)
         return s, r
 

@@ -181,13 +181,12 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         bodies = [*self.vehicles, *self.objects]
         if not any(body.speed > 0 for body in self.vehicles):
             return []
-        points = np.array([body.position for body in bodies])
+        x, y = np.array([body.position for body in bodies]).T
         reach = np.array([body.diagonal / 2 for body in bodies])
         moves = np.array([body.speed > 0 for body in bodies])
-        delta = points[:, None] - points[None]
-        room = reach[:, None] + reach[None]
+        dx, dy, room = x[:, None] - x, y[:, None] - y, reach[:, None] + reach
         # pairs close enough by their diagonals, then the exact test
-        near = (delta * delta).sum(axis=2) < room * room
+        near = dx * dx + dy * dy < room * room
         near &= moves[:, None] | moves[None]
         pairs = list[tuple[RoadObject, RoadObject]]()
         first, second = (side.tolist() for side in np.nonzero(np.triu(near, 1)))

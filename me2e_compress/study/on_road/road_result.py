@@ -92,7 +92,8 @@ class RoadSearchResult(Result):
     def lines(self) -> tuple[str, ...]:
         """Return the answer, and what it holds for."""
         chosen = len(self.rungs[-1].standings)
-        lines = [self.headline, f"budgets: {self._spent(self.winner)}"]
+        budgets = f"budgets: {self._spent(self.winner)}"
+        lines = [self.headline, budgets, self._room()]
         if chosen > 1:
             lines.append(
                 f"chosen as the best of {chosen} on these routes: others may show"
@@ -101,6 +102,15 @@ class RoadSearchResult(Result):
         if self.coverage[0] < self.coverage[1]:
             lines.append("a preview: {} of {} routes".format(*self.coverage))
         return (*lines, f"{self.output}: {self.winner}")
+
+    def _room(self) -> str:
+        room = self.difference.room_kept
+        if room.value is None:
+            return f"room kept to others: not measured ({room.measure.reason})"
+        value, low, high = (
+            number(e, "+.1f") for e in (room.value, room.low, room.high)
+        )
+        return f"room kept to others: {value} points (95 %: {low} to {high})"
 
     def tables(self) -> tuple[Table, ...]:
         """Return the grid with its costs, and the rungs."""

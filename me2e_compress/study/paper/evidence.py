@@ -128,7 +128,7 @@ def _difference(
     question: PaperQuestion, drives: Sequence[DriveRecord], seed: int
 ) -> Found:
     """Return a mean of differences over the routes that all drives have."""
-    column = next(each for each in COLUMNS if each.name.startswith(question.column))
+    column = next(e for e in COLUMNS if e.name.removesuffix(" %") == question.column)
     values = [each.values(column) for each in drives]
     gaps = values[0] - values[1]
     if question.bend is not None:

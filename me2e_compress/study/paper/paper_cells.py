@@ -7,13 +7,12 @@ from me2e_compress.driving.realtime import DT_US, skipped_decisions
 from me2e_compress.metrics.eer import POINTS, eer, rankings
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
-from me2e_compress.metrics.route_values import COLUMNS
+from me2e_compress.metrics.route_values import DS, ROOM
 from me2e_compress.study.cells import MISSING, estimate_cell, number
 from me2e_compress.study.paper.paper_drives import ModelFacts, PaperDrives
 from me2e_compress.study.paper.published import PublishedDrive
 from me2e_compress.workflows.result import Cell
 
-SCORES = tuple(each.name for each in COLUMNS)
 GIVEN = ("paper's DS", "paper's DE %", "paper's DC")
 GIVEN_ENERGY = ("paper's J/frame", "paper's EER")
 
@@ -29,17 +28,23 @@ EER = (
 
 
 def score_cells(result: PaperDrives, name: str, condition: str) -> list[Cell]:
-    """Show the four scores of a drive, or why there are none."""
+    """Show the scores of a drive, or why there are none."""
     drive, seed = result.drive(name, condition), result.study.seed
-    return [estimate_cell(drive.mean(each, seed)) for each in COLUMNS]
+    return [estimate_cell(drive.mean(each, seed)) for each in result.columns]
 
 
-def against(result: PaperDrives, name: str, other: str, condition: str) -> Cell:
-    """Show the driving score of one minus another, over the same routes."""
+def against(
+    result: PaperDrives, name: str, other: str, condition: str
+) -> tuple[Cell, Cell]:
+    """Show driving score and room of one minus another's, over the same routes."""
     if name == other:
-        return Cell("")
+        return Cell(""), Cell("")
     one, reference = (result.drive(each, condition) for each in (name, other))
-    return estimate_cell(one.minus(reference, seed=result.study.seed), signed=True)
+    score, room = (
+        estimate_cell(one.minus(reference, each, result.study.seed), signed=True)
+        for each in (DS, ROOM)
+    )
+    return score, room
 
 
 def given_cells(row: PublishedDrive | None, *, energy: bool = False) -> list[Cell]:

@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter, with_config
 
 from me2e_compress.errors import StudyError
+from me2e_compress.metrics.route_values import COLUMNS, RouteColumn
 from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.energy import EnergyResult
@@ -148,6 +150,13 @@ class PaperDrives(StudyOutcome):
     def finished(self) -> tuple[DriveRecord, ...]:
         """The drives that did not fail."""
         return tuple(each for each in self.drives if not each.reason)
+
+    @cached_property
+    def columns(self) -> tuple[RouteColumn, ...]:
+        """The scores that a route of any drive has: early records lack some."""
+        routes = [each for drive in self.finished for each in drive.routes]
+        found = (e for e in COLUMNS if any(e.of(each) is not None for each in routes))
+        return tuple(found) if routes else COLUMNS
 
     @property
     def distinct(self) -> int:

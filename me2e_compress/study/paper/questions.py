@@ -53,7 +53,9 @@ class PaperQuestion:
     of: str = ""
     minus: str = ""
     bend: tuple[str, str, str] | None = None
-    column: Literal["DS", "DE", "DC", "static", "EER_AV", "ms", "times"] = "DS"
+    column: Literal[
+        "DS", "room", "DE", "DE b2d", "DC", "DC b2d", "static", "EER_AV", "ms", "times"
+    ] = "DS"
     holds: Literal["above", "below", "within"] = "above"
     edge: float = 0.0
     turned: float | None = None

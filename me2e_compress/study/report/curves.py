@@ -19,19 +19,20 @@ Score = Callable[[Scores], Estimate]
 
 
 def curves(outcome: StudyOutcome) -> Markup | None:
-    """Draw driving score and success rate as SVG; None below three conditions."""
+    """Draw driving score, room and success as SVG; None below three conditions."""
     if len(outcome.study.conditions) < ENOUGH:
         return None
-    # two panels over the same conditions
+    # panels over the same conditions
     panels: tuple[tuple[str, Score], ...] = (
         ("driving score", lambda scores: scores.driving_score),
+        ("room kept, %", lambda scores: scores.safety.room_kept),
         ("success rate, %", lambda scores: scores.success_rate),
     )
     names = [condition.name for condition in outcome.study.conditions]
     with styled():
         figure = Figure(figsize=(WIDTH_IN, 3.0), layout="constrained")
         # one curve per variant
-        for axes, (title, pick) in zip(figure.subplots(1, 2), panels, strict=True):
+        for axes, (title, pick) in zip(figure.subplots(1, 3), panels, strict=True):
             for variant in outcome.variants:
                 _curve(axes, variant.name, _found(outcome, variant.name, pick), outcome)
             axes.set_title(title, color=MUTED)

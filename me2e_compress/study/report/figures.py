@@ -97,12 +97,15 @@ def forest(outcome: StudyOutcome) -> Markup | None:
     with styled():
         height = 0.9 + 0.26 * len(rows)
         figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
-        panels = figure.subplots(1, 2, sharey=True)
+        panels = figure.subplots(1, 3, sharey=True)
         # one panel per score, sharing the rows
-        driving = [r.difference.driving_score for r in rows if r.difference]
-        success = [r.difference.success_rate for r in rows if r.difference]
-        titles = ("driving score, points", "success rate, points")
-        for axes, found, title in zip(panels, (driving, success), titles, strict=True):
+        gaps = [each.difference for each in rows if each.difference]
+        scores = {
+            "driving score, points": [each.driving_score for each in gaps],
+            "room kept, points": [each.room_kept for each in gaps],
+            "success rate, points": [each.success_rate for each in gaps],
+        }
+        for axes, (title, found) in zip(panels, scores.items(), strict=True):
             _whiskers(axes, found)
             axes.set_title(title, color=MUTED)
         panels[0].set_yticks(range(len(rows)), names, color=INK)
@@ -179,7 +182,8 @@ def _whiskers(axes: Axes, found: Sequence[Estimate]) -> None:
         colour = ACCENT if estimate.sign else MUTED
         if low is not None and high is not None:
             axes.plot([low, high], [row, row], color=colour, linewidth=1.6)
-        axes.plot(estimate.value or 0.0, row, "o", color=colour, markersize=5)
+        if estimate.value is not None:
+            axes.plot(estimate.value, row, "o", color=colour, markersize=5)
     axes.margins(y=0.08 if len(found) > 3 else 0.3)
     left, right = axes.get_xlim()
     axes.set_xlim(min(left, -1.0), max(right, 1.0))

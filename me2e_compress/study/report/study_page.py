@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from markupsafe import Markup
 
 from me2e_compress.display import counted
-from me2e_compress.metrics.measure import Measure
+from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.study.cells import number
 from me2e_compress.study.drive_record import DriveRecord
@@ -140,7 +140,9 @@ def _contrast(contrast: Contrast, baseline: str) -> Drawing:
 
 
 def _ended(route: RouteSummary) -> str:
-    return f"driving score {route.driving_score:.1f}, {route.fate}"
+    room = route.room_kept
+    kept = "" if room is None else f", room kept {room:.1f} %"
+    return f"driving score {route.driving_score:.1f}{kept}, {route.fate}"
 
 
 def _recipe(variant: VariantOutcome) -> tuple[str, str, str | None]:
@@ -211,4 +213,11 @@ def _road(drive: DriveRecord, several: bool) -> str:
     low, high = (number(each, "+.1f") for each in (found.low, found.high))
     said = f"{where}driving score {value} points ({low} to {high})"
     limit = f"{found.n} routes show none below {drive.difference.smallest_shown:.1f}"
-    return f"{said}, {drive.difference.verdict}; {limit}"
+    room = drive.difference.room_kept
+    kept = "" if room.value is None else f"; room kept {_signed(room)}"
+    return f"{said}, {drive.difference.verdict}; {limit}{kept}"
+
+
+def _signed(gap: Estimate) -> str:
+    value, low, high = (number(e, "+.1f") for e in (gap.value, gap.low, gap.high))
+    return f"{value} points ({low} to {high})"
