@@ -1,7 +1,8 @@
 """The rounding errors of the int8 nodes of a float graph, written as nodes in it."""
 
 import dataclasses
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -9,11 +10,33 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import array_of, producer_of, static_shape
+from me2e_compress.graph.nodes import Array, input_at
 from me2e_compress.quantization.plan import RESIDUAL, Decision, QuantPlan
 from me2e_compress.runtime.runnable import compiled_or_expanded
-from me2e_compress.sensitivity.gradients import Tape
+from me2e_compress.sensitivity.gradients.tape import Tape, given, sizes_of
 from me2e_compress.targets.base import Grids
 from me2e_compress.targets.weights import QuantizedWeight, weights_of
+
+HEAVY = 4_000_000
+"""Products of a layer; the error of its weight is then not computed channel by channel
+for all of them."""
+
+SHARE = 4
+"""Of such a layer one channel in so many is looked at."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """A vector that tells of the error of a layer: one number a channel, mostly.
+
+    ``squares`` is what the squares of its numbers count, ``sums`` what its sum does.
+    """
+
+    layer: str
+    vector: ir.Value
+    size: int
+    squares: float = 1
+    sums: float = 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,39 +101,88 @@ class ErrorSources:
         value = node.outputs[0]
         return self.probes.get(value) or self.layers.get(value, "")
 
-    def effect(self, t: Tape, node: ir.Node, g: ir.Value) -> ir.Value:
-        """Write what an error does: its channels' squares summed, and its sum."""
+    def rounded(self, node: ir.Node) -> Array | None:
+        """Return the weight of a heavy layer as int8 keeps it; None of any other.
+
+        Gradients pass through it in that form: of what they are then, <g, W x + b>
+        is known without another product, and so is what rounding does to it.
+        """
+        if node.outputs[0] not in self.layers or node.inputs[0] not in self.probes:
+            return None
+        decision = self.decisions[self.layers[node.outputs[0]]]
+        near = _stored(self.weights[decision.output])
+        exact, options = array_of(input_at(node, 1)), node.attributes
+        plain = node.op_type in ("Conv", "MatMul", "Gemm") and decision.weight == 1
+        if not plain or exact is None or exact.shape != near.shape:
+            return None
+        channels = near.shape[_axis(node)]
+        bias = static_shape(input_at(node, 2)) or (channels,)
+        scaled = {options.get_float(name, 1.0) for name in ("alpha", "beta")} != {1.0}
+        if options.get_int("group", 1) > 1 or scaled or math.prod(bias) != channels:
+            return None
+        made = math.prod(static_shape(node.outputs[0]) or ())
+        return near if made * near.size // channels >= HEAVY else None
+
+    def readings(
+        self, t: Tape, node: ir.Node, g: ir.Value, to_input: ir.Value | None = None
+    ) -> list[Reading]:
+        """Write what an error does to what a node gives, of its gradient.
+
+        With that ``to_input`` of a heavy layer, a part of the channels is looked at,
+        and <g, W x + b> of the rounded weight beside that of the exact one.
+        """
         value = node.outputs[0]
-        rank = len(static_shape(value) or ())
-        if value not in self.probes:
-            return self._effect_of_weight(t, node, g, rank)
-        layer = next(iter(value.consumers()), None)
+        if value in self.probes:
+            return [self._of_rounding(t, node, g)]
+        if to_input is None:
+            return [self._of_weight(t, node, g, 1)]
+        part = self._of_weight(t, node, g, SHARE)
+        layer, x, sizes = part.layer, given(node.inputs[0]), sizes_of(value)
+        found, inner = [part], _inner(node, sizes)
+        for left, right, sums in ((to_input, x, 1), (g, _behind_relu(value), -1)):
+            both = t.times(left, right)
+            along = _inner(node, sizes_of(right))
+            found.append(_reading(t, layer, both, sizes_of(right), along, 0, sums))
+        if (bias := input_at(node, 2)) is not None:
+            both = t.times(t.total(g, inner, keep=False), bias)
+            size = math.prod(each for at, each in enumerate(sizes) if at not in inner)
+            found.append(_reading(t, layer, both, (size,), (), 0, 1))
+        return found
+
+    def _of_rounding(self, t: Tape, probe: ir.Node, g: ir.Value) -> Reading:
+        value = probe.outputs[0]
+        layer, sizes = next(iter(value.consumers()), None), sizes_of(value)
+        rank = len(sizes)
         convolved = layer is not None and layer.op_type.startswith("Conv")
         along = range(2, rank) if convolved else range(max(rank - 2, 0), rank - 1)
         step, zero = self.grids[value]
-        late = t.op("Add", [t.constant(np.array(step)), t.zero_after([g])])
-        effect = t.times(g, _rounding(t, node, late, zero))
-        return _summed(t, t.total(effect, [*along], keep=False))
+        late = t.late(np.array(step), g, math.prod(sizes))
+        effect = t.times(g, _rounding(t, probe, late, zero))
+        return _reading(t, self.probes[value], effect, sizes, along)
 
-    def _effect_of_weight(
-        self, t: Tape, node: ir.Node, g: ir.Value, rank: int
-    ) -> ir.Value:
+    def _of_weight(self, t: Tape, node: ir.Node, g: ir.Value, share: int) -> Reading:
         """Write what the rounding of a weight does: a product as the layer's own."""
-        name = self.layers[node.outputs[0]]
-        at, weight = self.decisions[name].weight or 0, self.weights[name]
-        near, exact = _stored(weight), array_of(node.inputs[at])
-        inputs = list(node.inputs[:2])
-        channel = 1 if node.op_type.startswith("Conv") else rank - 1
+        name, sizes = self.layers[node.outputs[0]], [*sizes_of(node.outputs[0])]
+        channel = 1 if node.op_type.startswith("Conv") else len(sizes) - 1
+        at, near = self.decisions[name].weight or 0, _stored(self.weights[name])
+        exact, inputs = array_of(node.inputs[at]), [*node.inputs[:2]]
         if exact is None:
             flat = t.op("Reshape", [node.inputs[at], t.ints(near.shape)])
-            inputs[at] = t.op("Sub", [t.constant(near), flat])
+            late = t.late(near, g, math.prod(sizes))
+            inputs[at] = t.op("Sub", [late, flat])
         else:
             error = near - exact.reshape(near.shape).astype(np.float32)
-            inputs[at] = t.constant(np.ascontiguousarray(error))
-        inputs[at] = t.op("Add", [inputs[at], t.zero_after([g])])
+            if share > 1:  # one channel in so many
+                error = error.take(range(0, sizes[channel], share), _axis(node))
+                g = t.op(
+                    "Slice",
+                    [g, *map(t.ints, ([0], [sizes[channel]], [channel], [share]))],
+                )
+                sizes[channel] = error.shape[_axis(node)]
+            inputs[at] = t.late(np.ascontiguousarray(error), g, math.prod(sizes))
         effect = t.times(g, t.op(node.op_type, inputs, node.attributes))
-        along = [axis for axis in range(rank) if axis != channel]
-        return _summed(t, t.total(effect, along, keep=False))
+        along = [axis for axis in range(len(sizes)) if axis != channel]
+        return _reading(t, name, effect, sizes, along, share)
 
     def behind(self, missing: Mapping[ir.Value, str]) -> dict[str, str]:
         """Return the layers whose gradient lacks a part, with the reasons."""
@@ -130,12 +202,40 @@ class ErrorSources:
         }
 
 
-def _summed(t: Tape, value: ir.Value) -> ir.Value:
-    sums = [
-        t.shaped(t.op(each, [value], {"keepdims": 0}), [1])
-        for each in ("ReduceSumSquare", "ReduceSum")
-    ]
-    return t.op("Concat", sums, {"axis": 0})
+def _axis(node: ir.Node) -> int:
+    """Return the axis of a weight along which its channels lie."""
+    turned = node.op_type == "Gemm" and node.attributes.get_int("transB", 0)
+    return 0 if node.op_type == "Conv" or turned else 1
+
+
+def _inner(node: ir.Node, sizes: Sequence[int]) -> range:
+    """Return the axes of a tensor beside its channels, and a convolution's batch."""
+    return range(2, len(sizes)) if node.op_type == "Conv" else range(len(sizes) - 1)
+
+
+def _behind_relu(value: ir.Value) -> ir.Value:
+    """Return the Relu's answer if a Relu alone reads a value.
+
+    Where they differ a gradient is zero, and onnxruntime joins the two nodes.
+    """
+    reader, *others = value.consumers()
+    return value if others or reader.op_type != "Relu" else reader.outputs[0]
+
+
+def _reading(
+    t: Tape,
+    layer: str,
+    products: ir.Value,
+    sizes: Sequence[int],
+    along: Sequence[int],
+    squares: float = 1,
+    sums: float = 1,
+) -> Reading:
+    """Sum products of these sizes along axes."""
+    if any(sizes[axis] != 1 for axis in along):
+        products = t.total(products, [*along], keep=False)
+    size = math.prod(each for axis, each in enumerate(sizes) if axis not in along)
+    return Reading(layer, t.shaped(products, [-1]), size, squares, sums)
 
 
 def _stored(weight: QuantizedWeight) -> npt.NDArray[np.float32]:

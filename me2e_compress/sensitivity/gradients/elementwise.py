@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
+import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of
@@ -14,6 +15,7 @@ from me2e_compress.sensitivity.gradients.tape import (
     Rule,
     Tape,
     given,
+    numpy_of,
     sizes_of,
 )
 
@@ -170,35 +172,46 @@ def _log_softmax(t: Tape, node: ir.Node, g: ir.Value) -> Found:
 
 def _layer_norm(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     x, scale = given(node.inputs[0]), given(node.inputs[1])
-    rank = len(sizes_of(x))
-    first = node.attributes.get_int("axis", -1) % rank
-    epsilon = node.attributes.get_float("epsilon", 1e-5)
-    return [_normalized(t, x, t.times(g, scale), range(first, rank), epsilon)]
+    options, sizes = node.attributes, sizes_of(x)
+    first = options.get_int("axis", -1) % len(sizes)
+    ones = t.constant(np.ones(sizes[first:], numpy_of(x)))
+    # without scale and bias, the operator gives what is needed: n and r
+    rate = t.op("LayerNormalization", [x, ones], options, outputs=3)
+    made, kind = rate.producer(), (x.dtype or ir.DataType.FLOAT).value
+    n = rate if made is None else made.outputs[0]
+    rate = t.op("Cast", [rate], {"to": kind})
+    return [_normalized(t, x, n, rate, t.times(g, scale), range(first, len(sizes)))]
 
 
 def _instance_norm(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     x, scale = given(node.inputs[0]), given(node.inputs[1])
     rank = len(sizes_of(x))
     scale = t.shaped(scale, [-1] + [1] * (rank - 2))
-    epsilon = node.attributes.get_float("epsilon", 1e-5)
-    return [_normalized(t, x, t.times(g, scale), range(2, rank), epsilon)]
+    epsilon = t.number(node.attributes.get_float("epsilon", 1e-5), x)
+    centred = t.op("Sub", [x, _mean(t, x, range(2, rank), x)])
+    spread = _mean(t, t.times(centred, centred), range(2, rank), x)
+    rate = t.op("Reciprocal", [t.op("Sqrt", [t.op("Add", [spread, epsilon])])])
+    n = t.times(centred, rate)
+    return [_normalized(t, x, n, rate, t.times(g, scale), range(2, rank))]
 
 
 def _normalized(
-    t: Tape, x: ir.Value, g: ir.Value, axes: Sequence[int], epsilon: float
+    t: Tape,
+    x: ir.Value,
+    n: ir.Value,
+    rate: ir.Value,
+    g: ir.Value,
+    axes: Sequence[int],
 ) -> ir.Value:
     """Return r (g - mean(g) - n mean(g n)) of n = r (x - mean(x))."""
-    each = t.number(1 / math.prod(sizes_of(x)[at] for at in axes), x)
+    turned = t.times(n, _mean(t, t.times(g, n), axes, x))
+    left = t.op("Sub", [g, _mean(t, g, axes, x)])
+    return t.times(rate, t.op("Sub", [left, turned]))
 
-    def mean(value: ir.Value) -> ir.Value:
-        return t.times(t.total(value, list(axes), keep=True), each)
 
-    centred = t.op("Sub", [x, mean(x)])
-    variance = t.op("Add", [mean(t.times(centred, centred)), t.number(epsilon, x)])
-    rate = t.op("Reciprocal", [t.op("Sqrt", [variance])])
-    n = t.times(centred, rate)
-    left = t.op("Sub", [g, mean(g)])
-    return t.times(rate, t.op("Sub", [left, t.times(n, mean(t.times(g, n)))]))
+def _mean(t: Tape, value: ir.Value, axes: Sequence[int], like: ir.Value) -> ir.Value:
+    each = t.number(1 / math.prod(sizes_of(like)[at] for at in axes), like)
+    return t.times(t.total(value, list(axes), keep=True), each)
 
 
 def _batch_norm(t: Tape, node: ir.Node, g: ir.Value) -> Found:

@@ -71,6 +71,7 @@ def _grid_sample(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     rows, columns = sizes_of(grid)[1:3]
     aligned = options.get_int("align_corners", 0)
     # column and row of each sample, its pixel and the fraction beyond
+    kind = numpy_of(x)
     last = np.array([width, height]) - aligned
     half = t.constant((last / 2).astype(numpy_of(x)))
     middle = t.constant(((np.array([width, height]) - 1) / 2).astype(numpy_of(x)))
@@ -94,33 +95,45 @@ def _grid_sample(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     both = [t.op("Unsqueeze", [each, t.ints([3])]) for each in slopes]
     to_grid = t.times(t.op("Concat", both, {"axis": 3}), half)
 
-    # shares: each sample adds its gradient to the rows of four pixels
+    # shares: each sample adds its gradient to two rows and two columns of pixels
     count = n * rows * columns
+    corners = t.op("Add", [
+        t.shaped(pixel, [1, count, 2]), t.constant(np.array([[[0]], [[1]]], kind))
+    ])  # fmt: skip
+    ends = t.constant(np.array([width - 1, height - 1], kind))
+    inner = t.op("Min", [t.op("Max", [corners, t.number(0, x)]), ends])
+    inside = t.op("Cast", [t.op("Equal", [inner, corners])], {"to": _kind(x)})
+    share = t.shaped(beyond, [1, count, 2])
+    both = t.op("Concat", [t.op("Sub", [t.number(1, x), share]), share], {"axis": 0})
+    weights = t.times(both, inside)
+    # columns [1, 2, count], rows [2, 1, count]
+    across, along = _columns(t, weights, count)
+    place_across, place_along = _columns(t, inner, count)
+    place = t.op("Add", [place_across, t.times(place_along, t.number(width, x))])
+    first = np.repeat(np.arange(n) * height * width, rows * columns)
+    index = t.op("Add", [t.op("Cast", [place], {"to": 7}), t.constant(first)])
     moved = t.op("Transpose", [g], {"perm": [0, 2, 3, 1]})
     samples = t.shaped(moved, [count, channels])
-    first = np.repeat(np.arange(n) * height * width, rows * columns)
     image = t.zeros([n * height * width, channels], x)
-    flat, share = t.shaped(pixel, [count, 2]), t.shaped(beyond, [count, 2])
-    rest = t.op("Sub", [t.number(1, x), share])
-    for down in (0, 1):
-        for right in (0, 1):
-            step = t.constant(np.array([right, down], numpy_of(x)))
-            corner = t.op("Add", [flat, step])
-            ends = t.constant(np.array([width - 1, height - 1], numpy_of(x)))
-            inner = t.op("Min", [t.op("Max", [corner, t.number(0, x)]), ends])
-            inside = t.op("Cast", [t.op("Equal", [inner, corner])], {"to": _kind(x)})
-            mask = t.constant(np.array([right, down], bool))
-            weights = t.times(t.op("Where", [mask, share, rest]), inside)
-            across, along = (
-                t.op("Gather", [weights, t.ints([at])], {"axis": 1}) for at in (0, 1)
-            )
-            strides = t.constant(np.array([[1], [width]], numpy_of(x)))
-            index = t.op("Cast", [t.op("MatMul", [inner, strides])], {"to": 7})
-            index = t.op("Add", [index, t.constant(first[:, None])])
-            added = t.times(samples, across, along)
-            image = t.op("ScatterND", [image, index, added], {"reduction": "add"})
+    index = t.shaped(index, [4, count, 1])
+    weights = t.shaped(t.times(across, along), [4, count, 1])
+    for at in range(4):  # one by one, for what all would take of memory
+        corner = t.constant(np.array(at))
+        its, weight = (
+            t.op("Gather", [each, corner], {"axis": 0}) for each in (index, weights)
+        )
+        added = t.times(samples, weight)
+        image = t.op("ScatterND", [image, its, added], {"reduction": "add"})
     back = t.shaped(image, [n, height, width, channels])
     return [t.op("Transpose", [back], {"perm": [0, 3, 1, 2]}), to_grid]
+
+
+def _columns(t: Tape, value: ir.Value, count: int) -> tuple[ir.Value, ir.Value]:
+    """Return what [2, count, 2] says of columns, [1, 2, count], and of rows."""
+    across, along = (
+        t.op("Gather", [value, t.ints([at])], {"axis": 2}) for at in (0, 1)
+    )
+    return t.shaped(across, [1, 2, count]), t.shaped(along, [2, 1, count])
 
 
 def _kind(value: ir.Value) -> int:
