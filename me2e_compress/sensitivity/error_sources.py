@@ -44,7 +44,8 @@ class ErrorSources:
     """The places of a float graph where int8 makes errors.
 
     ``probes`` are the values that int8 nodes read, ``layers`` those that layers with an
-    int8 weight give: each with the first output of the node that is blamed.
+    int8 weight give: each with the first output of the node that is blamed. ``errors``
+    are those of rounding that are written already.
     """
 
     model: ir.Model
@@ -53,6 +54,9 @@ class ErrorSources:
     layers: Mapping[ir.Value, str]
     weights: Mapping[str, QuantizedWeight]
     decisions: Mapping[str, Decision]
+    errors: dict[tuple[ir.Value, np.float32, int], ir.Value] = dataclasses.field(
+        default_factory=dict
+    )
 
     @classmethod
     def of(cls, model: ir.Model, plan: QuantPlan, grids: Grids) -> "ErrorSources":
@@ -140,9 +144,9 @@ class ErrorSources:
         layer, x, sizes = part.layer, given(node.inputs[0]), sizes_of(value)
         found, inner = [part], _inner(node, sizes)
         for left, right, sums in ((to_input, x, 1), (g, _behind_relu(value), -1)):
-            both = t.times(left, right)
-            along = _inner(node, sizes_of(right))
-            found.append(_reading(t, layer, both, sizes_of(right), along, 0, sums))
+            rows = [t.shaped(each, [1, -1]) for each in (left, right)]
+            dot = t.op("Gemm", rows, {"transB": 1})
+            found.append(_reading(t, layer, dot, (1,), (), 0, sums))
         if (bias := input_at(node, 2)) is not None:
             both = t.times(t.total(g, inner, keep=False), bias)
             size = math.prod(each for at, each in enumerate(sizes) if at not in inner)
@@ -155,9 +159,13 @@ class ErrorSources:
         rank = len(sizes)
         convolved = layer is not None and layer.op_type.startswith("Conv")
         along = range(2, rank) if convolved else range(max(rank - 2, 0), rank - 1)
+        # readers of one tensor share its error
         step, zero = self.grids[value]
-        late = t.late(np.array(step), g, math.prod(sizes))
-        effect = t.times(g, _rounding(t, probe, late, zero))
+        key = (given(probe.inputs[0]), step, zero)
+        if key not in self.errors:
+            late = t.late(np.array(step), g, math.prod(sizes))
+            self.errors[key] = _rounding(t, probe, late, zero)
+        effect = t.times(g, self.errors[key])
         return _reading(t, self.probes[value], effect, sizes, along)
 
     def _of_weight(self, t: Tape, node: ir.Node, g: ir.Value, share: int) -> Reading:
