@@ -21,8 +21,9 @@ HEAVY = 4_000_000
 """Products of a layer; the error of its weight is then not computed channel by channel
 for all of them."""
 
-SHARE = 4
-"""Of such a layer one channel in so many is looked at."""
+SHARE, FEWEST = 8, 16
+"""Of such a layer one channel in so many is looked at, but no fewer than a block of
+those that onnxruntime's convolutions compute together."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,6 +125,8 @@ class ErrorSources:
         scaled = {options.get_float(name, 1.0) for name in ("alpha", "beta")} != {1.0}
         if options.get_int("group", 1) > 1 or scaled or math.prod(bias) != channels:
             return None
+        if channels < 2 * FEWEST:
+            return None
         made = math.prod(static_shape(node.outputs[0]) or ())
         return near if made * near.size // channels >= HEAVY else None
 
@@ -139,18 +142,20 @@ class ErrorSources:
         if value in self.probes:
             return [self._of_rounding(t, node, g)]
         if to_input is None:
-            return [self._of_weight(t, node, g, 1)]
-        part = self._of_weight(t, node, g, SHARE)
+            return [self._of_weight(t, node, g)]
+        channels = sizes_of(value)[_channel(node)]
+        looked = max(channels // SHARE, FEWEST)
+        part = self._of_weight(t, node, g, channels // looked)
         layer, x, sizes = part.layer, given(node.inputs[0]), sizes_of(value)
         found, inner = [part], _inner(node, sizes)
         for left, right, sums in ((to_input, x, 1), (g, _behind_relu(value), -1)):
             rows = [t.shaped(each, [1, -1]) for each in (left, right)]
             dot = t.op("Gemm", rows, {"transB": 1})
-            found.append(_reading(t, layer, dot, (1,), (), 0, sums))
+            found.append(Reading(layer, t.shaped(dot, [-1]), 1, 0, sums))
         if (bias := input_at(node, 2)) is not None:
             both = t.times(t.total(g, inner, keep=False), bias)
             size = math.prod(each for at, each in enumerate(sizes) if at not in inner)
-            found.append(_reading(t, layer, both, (size,), (), 0, 1))
+            found.append(Reading(layer, t.shaped(both, [-1]), size, 0, 1))
         return found
 
     def _of_rounding(self, t: Tape, probe: ir.Node, g: ir.Value) -> Reading:
@@ -168,26 +173,37 @@ class ErrorSources:
         effect = t.times(g, self.errors[key])
         return _reading(t, self.probes[value], effect, sizes, along)
 
-    def _of_weight(self, t: Tape, node: ir.Node, g: ir.Value, share: int) -> Reading:
+    def _of_weight(
+        self, t: Tape, node: ir.Node, g: ir.Value, share: int = 1
+    ) -> Reading:
         """Write what the rounding of a weight does: a product as the layer's own."""
         name, sizes = self.layers[node.outputs[0]], [*sizes_of(node.outputs[0])]
-        channel = 1 if node.op_type.startswith("Conv") else len(sizes) - 1
+        channel, size = _channel(node), math.prod(sizes)
         at, near = self.decisions[name].weight or 0, _stored(self.weights[name])
         exact, inputs = array_of(node.inputs[at]), [*node.inputs[:2]]
         if exact is None:
             flat = t.op("Reshape", [node.inputs[at], t.ints(near.shape)])
-            late = t.late(near, g, math.prod(sizes))
-            inputs[at] = t.op("Sub", [late, flat])
+            inputs[at] = t.op("Sub", [t.late(near, g, size), flat])
         else:
             error = near - exact.reshape(near.shape).astype(np.float32)
             if share > 1:  # one channel in so many
                 error = error.take(range(0, sizes[channel], share), _axis(node))
-                g = t.op(
-                    "Slice",
-                    [g, *map(t.ints, ([0], [sizes[channel]], [channel], [share]))],
-                )
+                lists = [0], [sizes[channel]], [channel], [share]
+                g = t.op("Slice", [g, *map(t.ints, lists)])
                 sizes[channel] = error.shape[_axis(node)]
-            inputs[at] = t.late(np.ascontiguousarray(error), g, math.prod(sizes))
+            rows = math.prod(sizes) // sizes[channel]
+            if (
+                node.op_type == "MatMul"
+                and at == error.ndim - 1 == 1
+                and rows > len(error)
+            ):
+                # the weight's own gradient, which is smaller than what the layer gives
+                x = t.shaped(given(node.inputs[0]), [rows, len(error)])
+                turned = t.op("Transpose", [x], {"perm": [1, 0]})
+                whole = t.op("MatMul", [turned, t.shaped(g, [rows, sizes[channel]])])
+                effect = t.times(whole, t.constant(error))
+                return _reading(t, name, effect, error.shape, [0], share)
+            inputs[at] = t.late(error, g, size)
         effect = t.times(g, t.op(node.op_type, inputs, node.attributes))
         along = [axis for axis in range(len(sizes)) if axis != channel]
         return _reading(t, name, effect, sizes, along, share)
@@ -216,6 +232,12 @@ def _axis(node: ir.Node) -> int:
     return 0 if node.op_type == "Conv" or turned else 1
 
 
+def _channel(node: ir.Node) -> int:
+    """Return the axis of a layer's answer along which its channels lie."""
+    rank = len(sizes_of(node.outputs[0]))
+    return 1 if node.op_type.startswith("Conv") else rank - 1
+
+
 def _inner(node: ir.Node, sizes: Sequence[int]) -> range:
     """Return the axes of a tensor beside its channels, and a convolution's batch."""
     return range(2, len(sizes)) if node.op_type == "Conv" else range(len(sizes) - 1)
@@ -237,13 +259,17 @@ def _reading(
     sizes: Sequence[int],
     along: Sequence[int],
     squares: float = 1,
-    sums: float = 1,
 ) -> Reading:
     """Sum products of these sizes along axes."""
-    if any(sizes[axis] != 1 for axis in along):
+    left = [axis for axis, each in enumerate(sizes) if axis not in along]
+    many = [axis for axis in left if sizes[axis] > 1] or left[:1]
+    if len(many) == 1:  # a vector by itself
+        left, along = many, [axis for axis in range(len(sizes)) if axis not in many]
+    if along:
         products = t.total(products, [*along], keep=False)
-    size = math.prod(each for axis, each in enumerate(sizes) if axis not in along)
-    return Reading(layer, t.shaped(products, [-1]), size, squares, sums)
+    vector = products if len(left) == 1 else t.shaped(products, [-1])
+    size = math.prod(sizes[axis] for axis in left)
+    return Reading(layer, vector, size, squares)
 
 
 def _stored(weight: QuantizedWeight) -> npt.NDArray[np.float32]:

@@ -8,7 +8,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of
-from me2e_compress.graph.nodes import input_at, integers_at
+from me2e_compress.graph.nodes import input_at, integers_at, integers_of
 from me2e_compress.sensitivity.gradients.tape import (
     Found,
     NoRuleError,
@@ -77,10 +77,22 @@ def _sub(t: Tape, node: ir.Node, g: ir.Value) -> Found:
 
 def _mul(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     y, (a, b) = node.outputs[0], map(given, node.inputs)
-    made = g.producer()
-    if made is not None and made.op_type == "Expand" and sizes_of(a) == sizes_of(b):
-        g = given(made.inputs[0])  # the products expand it
+    g = _unexpanded(g, y, (a, b))
     return [t.narrowed(t.times(g, b), y, a), t.narrowed(t.times(g, a), y, b)]
+
+
+def _unexpanded(g: ir.Value, y: ir.Value, factors: Sequence[ir.Value]) -> ir.Value:
+    """Return a sum's gradient before it was expanded, if either product expands it."""
+    expand = g.producer()
+    if expand is None or expand.op_type != "Expand":
+        return g
+    before = given(expand.inputs[0])
+    shaped = before.producer()
+    sizes = None if shaped is None else integers_of(input_at(shaped, 1))
+    if sizes is None or shaped is None or shaped.op_type != "Reshape":
+        return g
+    made = {np.broadcast_shapes(sizes, sizes_of(each)) for each in factors}
+    return before if made == {sizes_of(y)} else g
 
 
 def _div(t: Tape, node: ir.Node, g: ir.Value) -> Found:

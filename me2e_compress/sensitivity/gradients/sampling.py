@@ -71,7 +71,6 @@ def _grid_sample(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     rows, columns = sizes_of(grid)[1:3]
     aligned = options.get_int("align_corners", 0)
     # column and row of each sample, its pixel and the fraction beyond
-    kind = numpy_of(x)
     last = np.array([width, height]) - aligned
     half = t.constant((last / 2).astype(numpy_of(x)))
     middle = t.constant(((np.array([width, height]) - 1) / 2).astype(numpy_of(x)))
@@ -97,26 +96,18 @@ def _grid_sample(t: Tape, node: ir.Node, g: ir.Value) -> Found:
 
     # shares: each sample adds its gradient to two rows and two columns of pixels
     count = n * rows * columns
-    corners = t.op("Add", [
-        t.shaped(pixel, [1, count, 2]), t.constant(np.array([[[0]], [[1]]], kind))
-    ])  # fmt: skip
-    ends = t.constant(np.array([width - 1, height - 1], kind))
-    inner = t.op("Min", [t.op("Max", [corners, t.number(0, x)]), ends])
-    inside = t.op("Cast", [t.op("Equal", [inner, corners])], {"to": _kind(x)})
-    share = t.shaped(beyond, [1, count, 2])
-    both = t.op("Concat", [t.op("Sub", [t.number(1, x), share]), share], {"axis": 0})
-    weights = t.times(both, inside)
-    # columns [1, 2, count], rows [2, 1, count]
-    across, along = _columns(t, weights, count)
-    place_across, place_along = _columns(t, inner, count)
-    place = t.op("Add", [place_across, t.times(place_along, t.number(width, x))])
+    across, share_across = _pixels(t, grid, 0, width, aligned, count)
+    along, share_along = _pixels(t, grid, 1, height, aligned, count)
+    across, share_across = (t.shaped(e, [1, 2, count]) for e in (across, share_across))
+    along, share_along = (t.shaped(e, [2, 1, count]) for e in (along, share_along))
+    place = t.op("Add", [across, t.times(along, t.number(width, x))])
     first = np.repeat(np.arange(n) * height * width, rows * columns)
     index = t.op("Add", [t.op("Cast", [place], {"to": 7}), t.constant(first)])
     moved = t.op("Transpose", [g], {"perm": [0, 2, 3, 1]})
     samples = t.shaped(moved, [count, channels])
     image = t.zeros([n * height * width, channels], x)
     index = t.shaped(index, [4, count, 1])
-    weights = t.shaped(t.times(across, along), [4, count, 1])
+    weights = t.shaped(t.times(share_across, share_along), [4, count, 1])
     for at in range(4):  # one by one, for what all would take of memory
         corner = t.constant(np.array(at))
         its, weight = (
@@ -128,12 +119,20 @@ def _grid_sample(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     return [t.op("Transpose", [back], {"perm": [0, 3, 1, 2]}), to_grid]
 
 
-def _columns(t: Tape, value: ir.Value, count: int) -> tuple[ir.Value, ir.Value]:
-    """Return what [2, count, 2] says of columns, [1, 2, count], and of rows."""
-    across, along = (
-        t.op("Gather", [value, t.ints([at])], {"axis": 2}) for at in (0, 1)
-    )
-    return t.shaped(across, [1, 2, count]), t.shaped(along, [2, 1, count])
+def _pixels(
+    t: Tape, grid: ir.Value, axis: int, size: int, aligned: int, count: int
+) -> tuple[ir.Value, ir.Value]:
+    """Return the two pixels of each sample along an axis, and its shares in them."""
+    u = t.op("Gather", [grid, t.constant(np.array(axis))], {"axis": 3})
+    half, middle = t.number((size - aligned) / 2, grid), t.number((size - 1) / 2, grid)
+    place = t.shaped(t.op("Add", [t.times(u, half), middle]), [1, count])
+    low, one = t.op("Floor", [place]), t.number(1, grid)
+    beyond = t.op("Sub", [place, low])
+    ends = t.op("Concat", [low, t.op("Add", [low, one])], {"axis": 0})
+    inner = t.op("Clip", [ends, t.number(0, grid), t.number(size - 1, grid)])
+    inside = t.op("Cast", [t.op("Equal", [inner, ends])], {"to": _kind(grid)})
+    shares = t.op("Concat", [t.op("Sub", [one, beyond]), beyond], {"axis": 0})
+    return inner, t.times(shares, inside)
 
 
 def _kind(value: ir.Value) -> int:
