@@ -258,9 +258,12 @@ def _reading(
     products: ir.Value,
     sizes: Sequence[int],
     along: Sequence[int],
-    squares: float = 1,
+    share: int = 1,
 ) -> Reading:
-    """Sum products of these sizes along axes."""
+    """Sum products of these sizes along axes; one channel in ``share`` is there.
+
+    Of a part of the channels squares alone count.
+    """
     left = [axis for axis, each in enumerate(sizes) if axis not in along]
     many = [axis for axis in left if sizes[axis] > 1] or left[:1]
     if len(many) == 1:  # a vector by itself
@@ -269,7 +272,7 @@ def _reading(
         products = t.total(products, [*along], keep=False)
     vector = products if len(left) == 1 else t.shaped(products, [-1])
     size = math.prod(sizes[axis] for axis in left)
-    return Reading(layer, vector, size, squares)
+    return Reading(layer, vector, size, share, float(share == 1))
 
 
 def _stored(weight: QuantizedWeight) -> npt.NDArray[np.float32]:

@@ -45,6 +45,11 @@ CASES = {
     " { m = Greater(x, e) y = Where(m, x, p) }",
     "ReduceSum": "(double[a,b,c] x) => (double[a,c] y) <int64[1] i = {1}>"
     " { y = ReduceSum<keepdims=0>(x, i) }",
+    "ReduceSum-products": "(double[a,b,c] x, double[b,1] w) => (double[a,c] y)"
+    " <int64[1] i = {1}> { s = Mul(x, x) m = Mul(s, w)"
+    " y = ReduceSum<keepdims=0>(m, i) }",
+    "ReduceSum-narrow": "(double[a,1,c] x, double[b,c] w) => (double[a,c] y)"
+    " <int64[1] i = {1}> { m = Mul(x, w) y = ReduceSum<keepdims=0>(m, i) }",
     "ReduceMean": "(double[a,b,c] x) => (double[a,b,1] y)"
     " { y = ReduceMean<axes=[-1]>(x) }",
     "ReduceMax": "(double[a,b,c] x) => (double[a,c] y)"

@@ -20,7 +20,7 @@ Found: TypeAlias = Sequence[ir.Value | None]
 _SMALL = 1024
 """Bytes."""
 
-_LARGE = 250_000
+LARGE = 250_000
 """Numbers; 1 MB of float32."""
 
 
@@ -63,7 +63,7 @@ class Tape:
         and would keep what they give.
         """
         constant = self.constant(array)
-        if size < _LARGE:
+        if size < LARGE:
             return constant
         first = self.constant(np.array(0))
         one = self.op("Gather", [self.shaped(g, [-1]), first], {"axis": 0})
