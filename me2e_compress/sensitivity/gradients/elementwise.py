@@ -112,11 +112,19 @@ def _pow(t: Tape, node: ir.Node, g: ir.Value) -> Found:
 
 
 def _extreme(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    """Share a gradient between those that are the extreme."""
     y = node.outputs[0]
+    equal = [_as_number(t, t.op("Equal", [each, y]), y) for each in node.inputs]
+    part = t.op("Div", [g, t.op("Sum", equal)])
     return [
-        t.narrowed(t.only(t.op("Equal", [each, y]), g, y), y, given(each))
-        for each in node.inputs
+        t.narrowed(t.times(part, mine), y, given(each))
+        for mine, each in zip(equal, node.inputs, strict=True)
     ]
+
+
+def _as_number(t: Tape, choice: ir.Value, like: ir.Value) -> ir.Value:
+    kind = like.dtype or ir.DataType.FLOAT
+    return t.op("Cast", [choice], {"to": kind.value})
 
 
 def _mod(t: Tape, node: ir.Node, g: ir.Value) -> Found:
@@ -129,17 +137,19 @@ def _where(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     return [None, t.narrowed(t.only(choice, g, y), y, a), t.narrowed(other, y, b)]
 
 
-def _spread(t: Tape, node: ir.Node, g: ir.Value) -> tuple[ir.Value, list[int], int]:
-    """Return a gradient with the reduced axes as ones, that shape, and their size."""
+def _spread(
+    t: Tape, node: ir.Node, g: ir.Value
+) -> tuple[ir.Value, list[int], list[int]]:
+    """Return a gradient with the reduced axes as ones, that shape, and these axes."""
     x, axes = sizes_of(node.inputs[0]), integers_at(node, "axes", 1)
     if axes is None and input_at(node, 1) is not None:
         raise NoRuleError("its axes are not constant")
     if not axes:
         idle = node.attributes.get_int("noop_with_empty_axes", 0)
         axes = [] if idle else [*range(len(x))]
-    gone = {at % len(x) for at in axes}
+    gone = sorted(at % len(x) for at in axes)
     kept = [1 if at in gone else size for at, size in enumerate(x)]
-    return t.shaped(g, kept), kept, math.prod(x[at] for at in gone)
+    return t.shaped(g, kept), kept, gone
 
 
 def _reduce_sum(t: Tape, node: ir.Node, g: ir.Value) -> Found:
@@ -148,15 +158,19 @@ def _reduce_sum(t: Tape, node: ir.Node, g: ir.Value) -> Found:
 
 
 def _reduce_mean(t: Tape, node: ir.Node, g: ir.Value) -> Found:
-    kept, _, count = _spread(t, node, g)
+    kept, _, axes = _spread(t, node, g)
+    sizes = sizes_of(node.inputs[0])
+    count = math.prod(sizes[at] for at in axes)
     part = t.times(kept, t.number(1 / count, node.inputs[0]))
-    return [t.op("Expand", [part, t.ints(sizes_of(node.inputs[0]))])]
+    return [t.op("Expand", [part, t.ints(sizes)])]
 
 
 def _reduce_extreme(t: Tape, node: ir.Node, g: ir.Value) -> Found:
-    kept, shape, _ = _spread(t, node, g)
+    """Share a gradient between those that are the extreme, as equal points are."""
+    kept, shape, axes = _spread(t, node, g)
     x, y = given(node.inputs[0]), t.shaped(node.outputs[0], shape)
-    return [t.only(t.op("Equal", [x, y]), kept, x)]
+    equal = _as_number(t, t.op("Equal", [x, y]), x)
+    return [t.times(equal, t.op("Div", [kept, t.total(equal, axes, keep=True)]))]
 
 
 def _reduce_l2(t: Tape, node: ir.Node, g: ir.Value) -> Found:
