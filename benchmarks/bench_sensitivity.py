@@ -1,14 +1,16 @@
 """One-pass sensitivity against one int8 node at a time.
 
     python -m benchmarks.bench_sensitivity OUT [--models highway,tcp,vad-tiny]
-        [--frames 8] [--target tensorrt] [--nodes N] [--alone plan,pred_wp]
+        [--frames 8] [--target tensorrt] [--nodes N] [--outputs ego_fut_preds]
+        [--alone plan,pred_wp]
 
 For each output of each model: Spearman's rank correlation, over the nodes that the plan
 makes int8, of the estimated noise with the measured one; the median of their quotient;
 and the CPU time of a run of the estimate over that of inference on the same frames, the
-median of each, one thread, opening apart. Outputs take turns; those of ``--alone`` are
-asked for alone as well. Measured costs stay in OUT: a run that was stopped goes on from
-them. Of more nodes than ``--nodes``, evenly spread ones are measured.
+median of each, one thread, opening apart. All outputs, or those named, take turns;
+those of ``--alone`` are asked for alone as well. Measured costs stay in OUT: a run that
+was stopped goes on from them. Of more estimated nodes than ``--nodes``, evenly spread
+ones are measured.
 """
 
 import argparse
@@ -32,7 +34,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.display import table
 from me2e_compress.fidelity.compare import Reference
 from me2e_compress.graph.modules import map_of
-from me2e_compress.quantization.plan import FLOAT, RESIDUAL, QuantPlan, make_plan
+from me2e_compress.quantization.plan import FLOAT, QuantPlan, make_plan
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.atomic import write_json
@@ -51,14 +53,16 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--target", default="tensorrt")
     parser.add_argument("--nodes", type=int, default=1000, help="most to measure")
-    parser.add_argument("--alone", default="plan,pred_wp,ego_fut_preds")
+    parser.add_argument("--outputs", default="", help="that take turns; all")
+    parser.add_argument("--alone", default="plan,pred_wp")
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
     rows = []
     for name in asked.models.split(","):
         subject = make(name, asked.out, asked.frames)
         case = Case.of(subject, asked.frames, TARGETS.parse(asked.target))
-        rows += rows_of(case, asked.nodes, asked.alone.split(","))
+        outputs = [*filter(None, asked.outputs.split(","))] or None
+        rows += rows_of(case, asked.nodes, outputs, asked.alone.split(","))
         columns = (
             "model", "output", "nodes", "Spearman", "estimated / measured", "x time"
         )  # fmt: skip
@@ -108,13 +112,14 @@ class Case:
         plan = dataclasses.replace(self.plan, decisions=decisions, groups=())
         return self.target.place(self.model, plan, self.ranges)
 
-    def measured(self, most: int) -> Mapping[str, Mapping[str, float]]:
+    def measured(
+        self, names: Sequence[str], most: int
+    ) -> Mapping[str, Mapping[str, float]]:
         """Measure the noise of nodes at each output, relative to its signal."""
         name = f"measured-{self.target.name}-{len(self.frames)}.json"
         saved = self.subject.folder / name
         found = json.loads(saved.read_text()) if saved.is_file() else {}
-        layers = [each for each in self.plan.placed if each.rule != RESIDUAL]
-        chosen = [each.output for each in layers[:: -(-len(layers) // most)]]
+        chosen = names[:: -(-len(names) // most)]
         if left := [output for output in chosen if output not in found]:
             reference = Reference.of(Session(self.model, threads=1), self.frames)
             for output in left:
@@ -122,7 +127,7 @@ class Case:
                 told = reference.compare(session).outputs
                 found[output] = {each.name: 10 ** (-each.sqnr_db / 20) for each in told}
                 write_json(saved, found)
-        return found
+        return {name: found[name] for name in chosen}
 
 
 class Timed(Sequence[Frame]):
@@ -144,17 +149,19 @@ class Timed(Sequence[Frame]):
         return np.diff(self._asked).tolist()
 
 
-def rows_of(case: Case, most: int, alone: list[str]) -> list[tuple[str, ...]]:
+def rows_of(
+    case: Case, most: int, asked: list[str] | None, alone: list[str]
+) -> list[tuple[str, ...]]:
     """Return a row for each output, and one for those that are asked for alone."""
     grids = case.target.grids(case.plan, case.model, case.ranges)
     told = partial(estimate, case.model, case.plan, grids, threads=1)
     # inference before and after: the machine is not alone either
     first, frames, last = (Timed(case.frames) for _ in range(3))
     infer(case.model, first)
-    found = noise_of(told(frames))
+    found = noise_of(told(frames, outputs=asked))
     infer(case.model, last)
     ratio = np.median(frames.each_s()) / np.median(first.each_s() + last.each_s())
-    measured = case.measured(most)
+    measured = case.measured([*found], most)
     outputs = [*next(iter(found.values()), {})]
     rows = [
         (case.subject.name, name, *compared(found, measured, name), f"{ratio:.2f}")
