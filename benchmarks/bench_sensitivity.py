@@ -2,7 +2,7 @@
 
     python -m benchmarks.bench_sensitivity OUT [--models highway,tcp,vad-tiny]
         [--frames 8] [--target tensorrt] [--nodes N] [--outputs ego_fut_preds]
-        [--alone plan,pred_wp]
+        [--alone plan,pred_wp] [--held GB]
 
 For each output of each model: Spearman's rank correlation, over the nodes that the plan
 makes int8, of the estimated noise with the measured one; the median of their quotient;
@@ -16,7 +16,7 @@ ones are measured.
 import argparse
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from time import process_time
@@ -38,10 +38,10 @@ from me2e_compress.quantization.plan import FLOAT, QuantPlan, make_plan
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.atomic import write_json
-from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.session import Session, replay
 from me2e_compress.sensitivity.error_sources import blamed
-from me2e_compress.sensitivity.estimate import NodeCost, estimate
+from me2e_compress.sensitivity.estimate import MOST_HELD, NodeCost, estimate
 from me2e_compress.targets import TARGETS, Target
 
 
@@ -55,6 +55,7 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, default=1000, help="most to measure")
     parser.add_argument("--outputs", default="", help="that take turns; all")
     parser.add_argument("--alone", default="plan,pred_wp")
+    parser.add_argument("--held", type=float, default=MOST_HELD / 1e9, help="GB")
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
     rows = []
@@ -62,7 +63,8 @@ def main() -> None:
         subject = make(name, asked.out, asked.frames)
         case = Case.of(subject, asked.frames, TARGETS.parse(asked.target))
         outputs = [*filter(None, asked.outputs.split(","))] or None
-        rows += rows_of(case, asked.nodes, outputs, asked.alone.split(","))
+        alone, held = asked.alone.split(","), round(asked.held * 1e9)
+        rows += rows_of(case, asked.nodes, outputs, alone, held)
         columns = (
             "model", "output", "nodes", "Spearman", "estimated / measured", "x time"
         )  # fmt: skip
@@ -130,40 +132,38 @@ class Case:
         return {name: found[name] for name in chosen}
 
 
-class Timed(Sequence[Frame]):
-    """Frames that note the CPU time at which each is asked for, and the end."""
+class Timed:
+    """Frames that note the CPU seconds from each to the next."""
 
     def __init__(self, frames: Sequence[Frame]) -> None:
         self._frames = frames
-        self._asked = list[float]()
+        self.seconds = list[float]()
 
     def __len__(self) -> int:
         return len(self._frames)
 
-    def __getitem__(self, index: int) -> Frame:
-        self._asked.append(process_time())
-        return self._frames[index]
-
-    def each_s(self) -> list[float]:
-        """Return CPU seconds from each frame to the next."""
-        return np.diff(self._asked).tolist()
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in self._frames:
+            start = process_time()
+            yield frame
+            self.seconds.append(process_time() - start)
 
 
 def rows_of(
-    case: Case, most: int, asked: list[str] | None, alone: list[str]
+    case: Case, most: int, asked: list[str] | None, alone: list[str], held: int
 ) -> list[tuple[str, ...]]:
     """Return a row for each output, and one for those that are asked for alone."""
     grids = case.target.grids(case.plan, case.model, case.ranges)
-    told = partial(estimate, case.model, case.plan, grids, threads=1)
+    told = partial(estimate, case.model, case.plan, grids, threads=1, most_held=held)
     # inference before and after: the machine is not alone either
     first, frames, last = (Timed(case.frames) for _ in range(3))
     infer(case.model, first)
     found = noise_of(told(frames, outputs=asked))
     infer(case.model, last)
-    ratio = np.median(frames.each_s()) / np.median(first.each_s() + last.each_s())
+    ratio = np.median(frames.seconds) / np.median(first.seconds + last.seconds)
     measured = case.measured([*found], most)
     outputs = [*next(iter(found.values()), {})]
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (case.subject.name, name, *compared(found, measured, name), f"{ratio:.2f}")
         for name in outputs
     ]
@@ -193,7 +193,7 @@ def compared(
     return f"{len(names)} of {len(measured)}", f"{rank:.3f}", f"{quotient:.2f}"
 
 
-def infer(model: ir.Model, frames: Sequence[Frame]) -> None:
+def infer(model: ir.Model, frames: Frames) -> None:
     """Run the float graph."""
     for _ in replay(Session(model, threads=1), frames):
         pass

@@ -125,10 +125,10 @@ class ErrorSources:
         scaled = {options.get_float(name, 1.0) for name in ("alpha", "beta")} != {1.0}
         if options.get_int("group", 1) > 1 or scaled or math.prod(bias) != channels:
             return None
-        if channels < 2 * FEWEST:
-            return None
-        made = math.prod(static_shape(node.outputs[0]) or ())
-        return near if made * near.size // channels >= HEAVY else None
+        products = (
+            math.prod(static_shape(node.outputs[0]) or ()) * near.size // channels
+        )
+        return near if products >= HEAVY and channels >= 2 * FEWEST else None
 
     def readings(
         self, t: Tape, node: ir.Node, g: ir.Value, to_input: ir.Value | None = None
@@ -228,7 +228,7 @@ class ErrorSources:
 
 def _axis(node: ir.Node) -> int:
     """Return the axis of a weight along which its channels lie."""
-    turned = node.op_type == "Gemm" and node.attributes.get_int("transB", 0)
+    turned = node.op_type == "Gemm" and bool(node.attributes.get_int("transB", 0))
     return 0 if node.op_type == "Conv" or turned else 1
 
 
@@ -260,11 +260,8 @@ def _reading(
     along: Sequence[int],
     share: int = 1,
 ) -> Reading:
-    """Sum products of these sizes along axes; one channel in ``share`` is there.
-
-    Of a part of the channels squares alone count.
-    """
-    left = [axis for axis, each in enumerate(sizes) if axis not in along]
+    """Sum products along axes; of one channel in ``share`` squares alone count."""
+    left = [axis for axis in range(len(sizes)) if axis not in along]
     many = [axis for axis in left if sizes[axis] > 1] or left[:1]
     if len(many) == 1:  # a vector by itself
         left, along = many, [axis for axis in range(len(sizes)) if axis not in many]

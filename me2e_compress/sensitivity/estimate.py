@@ -75,14 +75,16 @@ def estimate(
     seed: int = 0,
     threads: int = 0,
     provider: Provider = CPU,
+    most_held: int = MOST_HELD,
 ) -> tuple[NodeCost, ...]:
     """Estimate the cost of each int8 node of a plan for each output, in graph order.
 
     Each run over a frame tells of one output, they take turns; where there are more
     outputs, the frames are run again. Outputs of whole numbers or of open size are
-    left out; ``outputs`` None asks for all others.
+    left out; ``outputs`` None asks for all others. Nodes whose gradients need more than
+    ``most_held`` bytes of the graph's own tensors are not estimated.
     """
-    written = _write(model, plan, grids, outputs)
+    written = _write(model, plan, grids, outputs, most_held)
     effects = _Effects.of(written)
     signal = np.zeros(len(written.seeds))
     if written.readings:
@@ -181,7 +183,11 @@ class _Effects:
 
 
 def _write(
-    model: ir.Model, plan: QuantPlan, grids: Grids, outputs: Collection[str] | None
+    model: ir.Model,
+    plan: QuantPlan,
+    grids: Grids,
+    outputs: Collection[str] | None,
+    most_held: int,
 ) -> _Written:
     # every reading of an activation becomes a value of its own, fused nodes bodies
     sources = ErrorSources.of(model, plan, grids)
@@ -197,7 +203,7 @@ def _write(
     nodes, tape = list(main), Tape(sources.model)
     signal = [tape.op("ReduceSumSquare", [each], {"keepdims": 0}) for each in ports]
     # the backward pass; where a gradient is complete it meets the error
-    back, seeds = Backward(tape, reached, MOST_HELD), dict[str, ir.Value]()
+    back, seeds = Backward(tape, reached, most_held), dict[str, ir.Value]()
     for value in ports:
         signs = ir.Value(
             name=f"{_SIGNS}_{value.name}", shape=value.shape, type=value.type

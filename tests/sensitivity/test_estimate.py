@@ -80,14 +80,22 @@ class Case:
         kept = place.kept_float(plan, model)
         return cls(model, dataclasses.replace(plan, kept_float=kept), place, frames)
 
-    def told(self, seed: int = 0) -> dict[str, NodeCost]:
+    def told(
+        self, seed: int = 0, most_held: int = room.MOST_HELD
+    ) -> dict[str, NodeCost]:
         """Estimate, by node."""
         ranges = Calibrator(threads=1).run(
             self.model, self.target.tensors(self.plan, self.model), self.frames
         )
         grids = self.target.grids(self.plan, self.model, ranges)
         costs = estimate(
-            self.model, self.plan, grids, self.frames, seed=seed, threads=1
+            self.model,
+            self.plan,
+            grids,
+            self.frames,
+            seed=seed,
+            threads=1,
+            most_held=most_held,
         )
         return {each.node: each for each in costs}
 
@@ -226,7 +234,7 @@ def test_readers_of_one_tensor_share_its_error(tmp_path: Path) -> None:
     )
     grids = case.target.grids(case.plan, case.model, ranges)
 
-    made = room._write(case.model, case.plan, grids, None).model
+    made = room._write(case.model, case.plan, grids, None, room.MOST_HELD).model
 
     rounded = [n.inputs[0] for n in made.graph if n.op_type == "QuantizeLinear"]
     assert len(rounded) == len({*rounded})
@@ -318,10 +326,9 @@ def test_a_node_that_only_a_choice_reads_is_not_estimated_and_not_zero(
 
 
 def test_memory_is_kept_and_what_lies_behind_the_limit_is_not_estimated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(room, "MOST_HELD", 30_000)
-    told = Case.of(tmp_path, block()).told()
+    told = Case.of(tmp_path, block()).told(most_held=30_000)
 
     assert told["/head/Linear"].noise is not None
     assert told["/backbone/stem"].noise is None

@@ -114,17 +114,12 @@ def _pow(t: Tape, node: ir.Node, g: ir.Value) -> Found:
 def _extreme(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     """Share a gradient between those that are the extreme."""
     y = node.outputs[0]
-    equal = [_as_number(t, t.op("Equal", [each, y]), y) for each in node.inputs]
+    equal = [t.as_number(t.op("Equal", [each, y]), y) for each in node.inputs]
     part = t.op("Div", [g, t.op("Sum", equal)])
     return [
         t.narrowed(t.times(part, mine), y, given(each))
         for mine, each in zip(equal, node.inputs, strict=True)
     ]
-
-
-def _as_number(t: Tape, choice: ir.Value, like: ir.Value) -> ir.Value:
-    kind = like.dtype or ir.DataType.FLOAT
-    return t.op("Cast", [choice], {"to": kind.value})
 
 
 def _mod(t: Tape, node: ir.Node, g: ir.Value) -> Found:
@@ -169,7 +164,7 @@ def _reduce_extreme(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     """Share a gradient between those that are the extreme, as equal points are."""
     kept, shape, axes = _spread(t, node, g)
     x, y = given(node.inputs[0]), t.shaped(node.outputs[0], shape)
-    equal = _as_number(t, t.op("Equal", [x, y]), x)
+    equal = t.as_number(t.op("Equal", [x, y]), x)
     return [t.times(equal, t.op("Div", [kept, t.total(equal, axes, keep=True)]))]
 
 
@@ -206,9 +201,8 @@ def _layer_norm(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     ones = t.constant(np.ones(sizes[first:], numpy_of(x)))
     # without scale and bias, the operator gives what is needed: n and r
     rate = t.op("LayerNormalization", [x, ones], options, outputs=3)
-    made, kind = rate.producer(), (x.dtype or ir.DataType.FLOAT).value
-    n = rate if made is None else made.outputs[0]
-    rate = t.op("Cast", [rate], {"to": kind})
+    made = rate.producer()
+    n, rate = rate if made is None else made.outputs[0], t.as_number(rate, x)
     return [_normalized(t, x, n, rate, t.times(g, scale), range(first, len(sizes)))]
 
 

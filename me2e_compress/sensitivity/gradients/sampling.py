@@ -130,13 +130,9 @@ def _pixels(
     beyond = t.op("Sub", [place, low])
     ends = t.op("Concat", [low, t.op("Add", [low, one])], {"axis": 0})
     inner = t.op("Clip", [ends, t.number(0, grid), t.number(size - 1, grid)])
-    inside = t.op("Cast", [t.op("Equal", [inner, ends])], {"to": _kind(grid)})
+    inside = t.as_number(t.op("Equal", [inner, ends]), grid)
     shares = t.op("Concat", [t.op("Sub", [one, beyond]), beyond], {"axis": 0})
     return inner, t.times(shares, inside)
-
-
-def _kind(value: ir.Value) -> int:
-    return (value.dtype or ir.DataType.FLOAT).value
 
 
 RULES: Mapping[str, Rule] = {

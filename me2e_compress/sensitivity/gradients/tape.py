@@ -92,6 +92,11 @@ class Tape:
         """Return a scalar of the type of a value."""
         return self.constant(np.array(number, numpy_of(like)))
 
+    def as_number(self, value: ir.Value, like: ir.Value) -> ir.Value:
+        """Cast to the type of a value."""
+        kind = like.dtype or ir.DataType.FLOAT
+        return self.op("Cast", [value], {"to": kind.value})
+
     def zeros(self, shape: Sequence[int], like: ir.Value | None) -> ir.Value:
         """Return a tensor of zeros of the type of a value."""
         zero = ir.tensor(np.zeros(1, numpy_of(like)))
