@@ -1,20 +1,22 @@
 """One-pass sensitivity against one int8 node at a time.
 
     python -m benchmarks.bench_sensitivity OUT [--models highway,tcp,vad-tiny]
-        [--frames 8] [--target tensorrt] [--nodes N] [--outputs plan,pred_wp]
+        [--frames 8] [--target tensorrt] [--nodes N] [--outputs ego_fut_preds]
+        [--alone plan,pred_wp] [--held GB]
 
 For each output of each model: Spearman's rank correlation, over the nodes that the plan
 makes int8, of the estimated noise with the measured one; the median of their quotient;
-and the CPU time of the estimate per frame over that of inference, one thread, opening
-apart. All outputs are asked for, which take turns, or those named. Measured costs stay
-in OUT: a run that was stopped goes on from them. Of more nodes than ``--nodes``, evenly
-spread ones are measured.
+and the CPU time of a run of the estimate over that of inference on the same frames, the
+median of each, one thread, opening apart. All outputs, or those named, take turns;
+those of ``--alone`` are asked for alone as well. Measured costs stay in OUT: a run that
+was stopped goes on from them. Of more estimated nodes than ``--nodes``, evenly spread
+ones are measured.
 """
 
 import argparse
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from time import process_time
@@ -32,14 +34,14 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.display import table
 from me2e_compress.fidelity.compare import Reference
 from me2e_compress.graph.modules import map_of
-from me2e_compress.quantization.plan import FLOAT, RESIDUAL, QuantPlan, make_plan
+from me2e_compress.quantization.plan import FLOAT, QuantPlan, make_plan
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.atomic import write_json
-from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.session import Session, replay
 from me2e_compress.sensitivity.error_sources import blamed
-from me2e_compress.sensitivity.estimate import estimate
+from me2e_compress.sensitivity.estimate import MOST_HELD, NodeCost, estimate
 from me2e_compress.targets import TARGETS, Target
 
 
@@ -51,16 +53,18 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--target", default="tensorrt")
     parser.add_argument("--nodes", type=int, default=1000, help="most to measure")
-    parser.add_argument("--outputs", default="", help="that are asked for; all")
+    parser.add_argument("--outputs", default="", help="that take turns; all")
+    parser.add_argument("--alone", default="plan,pred_wp")
+    parser.add_argument("--held", type=float, default=MOST_HELD / 1e9, help="GB")
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
     rows = []
     for name in asked.models.split(","):
         subject = make(name, asked.out, asked.frames)
         case = Case.of(subject, asked.frames, TARGETS.parse(asked.target))
-        rows += rows_of(
-            case, asked.nodes, [*filter(None, asked.outputs.split(","))] or None
-        )
+        outputs = [*filter(None, asked.outputs.split(","))] or None
+        alone, held = asked.alone.split(","), round(asked.held * 1e9)
+        rows += rows_of(case, asked.nodes, outputs, alone, held)
         columns = (
             "model", "output", "nodes", "Spearman", "estimated / measured", "x time"
         )  # fmt: skip
@@ -110,60 +114,89 @@ class Case:
         plan = dataclasses.replace(self.plan, decisions=decisions, groups=())
         return self.target.place(self.model, plan, self.ranges)
 
-    def measured(self, most: int) -> Mapping[str, Mapping[str, float]]:
+    def measured(
+        self, names: Sequence[str], most: int
+    ) -> Mapping[str, Mapping[str, float]]:
         """Measure the noise of nodes at each output, relative to its signal."""
         name = f"measured-{self.target.name}-{len(self.frames)}.json"
         saved = self.subject.folder / name
         found = json.loads(saved.read_text()) if saved.is_file() else {}
-        reference = Reference.of(Session(self.model, threads=1), self.frames)
-        layers = [each for each in self.plan.placed if each.rule != RESIDUAL]
-        for each in layers[:: -(-len(layers) // most)]:
-            if each.output in found:
-                continue
-            session = Session(self.alone(each.output), threads=1)
-            outputs = reference.compare(session).outputs
-            found[each.output] = {e.name: 10 ** (-e.sqnr_db / 20) for e in outputs}
-            write_json(saved, found)
-        return found
+        chosen = names[:: -(-len(names) // most)]
+        if left := [output for output in chosen if output not in found]:
+            reference = Reference.of(Session(self.model, threads=1), self.frames)
+            for output in left:
+                session = Session(self.alone(output), threads=1)
+                told = reference.compare(session).outputs
+                found[output] = {each.name: 10 ** (-each.sqnr_db / 20) for each in told}
+                write_json(saved, found)
+        return {name: found[name] for name in chosen}
 
 
-def rows_of(case: Case, most: int, outputs: list[str] | None) -> list[tuple[str, ...]]:
-    """Return a row for each output."""
+class Timed:
+    """Frames that note the CPU seconds from each to the next."""
+
+    def __init__(self, frames: Sequence[Frame]) -> None:
+        self._frames = frames
+        self.seconds = list[float]()
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in self._frames:
+            start = process_time()
+            yield frame
+            self.seconds.append(process_time() - start)
+
+
+def rows_of(
+    case: Case, most: int, asked: list[str] | None, alone: list[str], held: int
+) -> list[tuple[str, ...]]:
+    """Return a row for each output, and one for those that are asked for alone."""
     grids = case.target.grids(case.plan, case.model, case.ranges)
-    told = partial(estimate, case.model, case.plan, grids, threads=1, outputs=outputs)
-    found = {e.output: e.noise for e in told(case.frames) if e.noise is not None}
-    ratio = per_frame_s(case, told) / per_frame_s(case, partial(_infer, case.model))
-    measured, rows = case.measured(most), list[tuple[str, ...]]()
-    for output in next(iter(found.values()), {}):
-        names = [name for name in found if measured.get(name, {}).get(output)]
-        ours = np.array([found[name][output] for name in names])
-        theirs = np.array([measured[name][output] for name in names])
-        rank = float(stats.spearmanr(ours, theirs).statistic)
-        quotient = float(np.median(ours / theirs))
-        counted = f"{len(names)} of {len(measured)}"
-        rows.append(
-            (case.subject.name, output, counted, f"{rank:.3f}", f"{quotient:.2f}",
-             f"{ratio:.2f}")
-        )  # fmt: skip
+    told = partial(estimate, case.model, case.plan, grids, threads=1, most_held=held)
+    # inference before and after: the machine is not alone either
+    first, frames, last = (Timed(case.frames) for _ in range(3))
+    infer(case.model, first)
+    found = noise_of(told(frames, outputs=asked))
+    infer(case.model, last)
+    ratio = np.median(frames.seconds) / np.median(first.seconds + last.seconds)
+    measured = case.measured([*found], most)
+    outputs = [*next(iter(found.values()), {})]
+    rows: list[tuple[str, ...]] = [
+        (case.subject.name, name, *compared(found, measured, name), f"{ratio:.2f}")
+        for name in outputs
+    ]
+    for name in filter(outputs.__contains__, alone):
+        only = noise_of(told(case.frames, outputs=[name]))
+        row = compared(only, measured, name)
+        rows.append((case.subject.name, f"{name}, alone", *row, ""))
     return rows
 
 
-def _infer(model: ir.Model, frames: list[Frame]) -> None:
+def noise_of(costs: Sequence[NodeCost]) -> dict[str, Mapping[str, float]]:
+    """Return what is estimated of each node."""
+    return {each.output: each.noise for each in costs if each.noise is not None}
+
+
+def compared(
+    found: Mapping[str, Mapping[str, float]],
+    measured: Mapping[str, Mapping[str, float]],
+    output: str,
+) -> tuple[str, str, str]:
+    """Count the nodes that move an output; compare what is said of them."""
+    names = [name for name in found if measured.get(name, {}).get(output)]
+    ours = np.array([found[name][output] for name in names])
+    theirs = np.array([measured[name][output] for name in names])
+    rank = float(stats.spearmanr(ours, theirs).statistic)
+    quotient = float(np.median(ours / theirs))
+    return f"{len(names)} of {len(measured)}", f"{rank:.3f}", f"{quotient:.2f}"
+
+
+def infer(model: ir.Model, frames: Frames) -> None:
+    """Run the float graph."""
     for _ in replay(Session(model, threads=1), frames):
         pass
-
-
-def per_frame_s(case: Case, run: Callable[[list[Frame]], object]) -> float:
-    """Return CPU seconds of one more frame, so without those of opening.
-
-    No fewer frames than outputs, which take turns, are run at least.
-    """
-    seconds = []
-    for frames in (case.frames, case.frames * 4):
-        start = process_time()
-        run(frames)
-        seconds.append(process_time() - start)
-    return (seconds[1] - seconds[0]) / (3 * len(case.frames))
 
 
 if __name__ == "__main__":

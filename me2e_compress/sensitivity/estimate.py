@@ -24,8 +24,9 @@ from me2e_compress.quantization.plan import RESIDUAL, QuantPlan
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay
-from me2e_compress.sensitivity.error_sources import ErrorSources
+from me2e_compress.sensitivity.error_sources import ErrorSources, Reading
 from me2e_compress.sensitivity.gradients import Backward, Tape
+from me2e_compress.sensitivity.gradients.tape import given
 from me2e_compress.targets.base import Grids
 
 MOST_HELD = 1_500_000_000
@@ -74,14 +75,16 @@ def estimate(
     seed: int = 0,
     threads: int = 0,
     provider: Provider = CPU,
+    most_held: int = MOST_HELD,
 ) -> tuple[NodeCost, ...]:
     """Estimate the cost of each int8 node of a plan for each output, in graph order.
 
     Each run over a frame tells of one output, they take turns; where there are more
     outputs, the frames are run again. Outputs of whole numbers or of open size are
-    left out; ``outputs`` None asks for all others.
+    left out; ``outputs`` None asks for all others. Nodes whose gradients need more than
+    ``most_held`` bytes of the graph's own tensors are not estimated.
     """
-    written = _write(model, plan, grids, outputs)
+    written = _write(model, plan, grids, outputs, most_held)
     effects = _Effects.of(written)
     signal = np.zeros(len(written.seeds))
     if written.readings:
@@ -100,13 +103,13 @@ def estimate(
 class _Written:
     """A graph that gives effects of errors by reading, and signal power by output.
 
-    ``seeds`` are the inputs for random signs, by output; ``readings`` name the layers
-    that readings belong to, by output, ``missing`` those that lack one.
+    ``seeds`` are the inputs for random signs, by output; ``readings`` are the parts of
+    the vector of effects, ``missing`` the layers that lack one, with the reasons.
     """
 
     model: ir.Model
     seeds: Mapping[str, ir.Value]
-    readings: Sequence[str]
+    readings: Sequence[Reading]
     missing: Mapping[str, str]
 
     def fed(self, frames: Frames, random: np.random.Generator) -> Iterator[Frame]:
@@ -147,41 +150,44 @@ class _Written:
 class _Effects:
     """What errors do to outputs, by layer, summed over draws of signs."""
 
-    def __init__(
-        self, layers: Mapping[str, Sequence[int]], sizes: Sequence[int]
-    ) -> None:
-        self._layers = layers
+    def __init__(self, readings: Sequence[Reading], sizes: Sequence[int]) -> None:
+        self._names = list(dict.fromkeys(each.layer for each in readings))
+        places = {name: at for at, name in enumerate(self._names)}
+        self._layers = np.array([places[each.layer] for each in readings])
+        self._parts = np.array([(each.squares, each.sums) for each in readings])
+        self._starts = np.cumsum([0, *(each.size for each in readings[:-1])])
         self._prior = PRIOR * (np.array(sizes, np.float64) - 1)
         self._draws = np.zeros(len(sizes))
-        self._sums = {name: np.zeros((2, len(sizes))) for name in layers}
+        self._totals = np.zeros((2, len(self._names), len(sizes)))
 
     @classmethod
     def of(cls, written: _Written) -> "_Effects":
-        layers = dict[str, list[int]]()
-        for at, name in enumerate(written.readings):
-            layers.setdefault(name, []).append(at)
         shapes = [static_shape(value) or () for value in written.seeds.values()]
-        return cls(layers, [math.prod(each) for each in shapes])
+        return cls(written.readings, [math.prod(each) for each in shapes])
 
     def add(self, turn: int, noise: Array) -> None:
         """Add a draw for one output: squares and sums of every reading."""
-        found = noise.reshape(-1, 2).astype(np.float64)
         self._draws[turn] += 1
-        for name, mine in self._layers.items():
-            squares, sums = found[mine].sum(0)
-            self._sums[name][:, turn] += squares, sums**2
+        found = noise.astype(np.float64)
+        for at, values in enumerate((found**2, found)):
+            parts = np.add.reduceat(values, self._starts) * self._parts[:, at]
+            whole = np.bincount(self._layers, parts)
+            self._totals[at, :, turn] += whole**2 if at else whole
 
     def power(self) -> dict[str, Array]:
         """Return the power of each layer's noise at every output, summed over draws."""
         weight = self._prior / np.maximum(self._prior + self._draws, 1)
-        return {
-            name: weight * squares + (1 - weight) * squared
-            for name, (squares, squared) in self._sums.items()
-        }
+        squares, squared = self._totals
+        power = weight * squares + (1 - weight) * squared
+        return dict(zip(self._names, power, strict=True))
 
 
 def _write(
-    model: ir.Model, plan: QuantPlan, grids: Grids, outputs: Collection[str] | None
+    model: ir.Model,
+    plan: QuantPlan,
+    grids: Grids,
+    outputs: Collection[str] | None,
+    most_held: int,
 ) -> _Written:
     # every reading of an activation becomes a value of its own, fused nodes bodies
     sources = ErrorSources.of(model, plan, grids)
@@ -197,7 +203,7 @@ def _write(
     nodes, tape = list(main), Tape(sources.model)
     signal = [tape.op("ReduceSumSquare", [each], {"keepdims": 0}) for each in ports]
     # the backward pass; where a gradient is complete it meets the error
-    back, seeds = Backward(tape, reached, MOST_HELD), dict[str, ir.Value]()
+    back, seeds = Backward(tape, reached, most_held), dict[str, ir.Value]()
     for value in ports:
         signs = ir.Value(
             name=f"{_SIGNS}_{value.name}", shape=value.shape, type=value.type
@@ -205,19 +211,27 @@ def _write(
         main.inputs.append(signs)
         seeds[str(value.name)] = signs
         back.seed(value, signs)
-    names, effects = list[str](), list[ir.Value]()
+    readings = list[Reading]()
     for node in reversed(nodes):
         found = back.found.get(node.outputs[0])
-        if found is not None and (layer := sources.layer_of(node)):
-            names.append(layer)
-            effects.append(sources.effect(tape, node, found))
-        back.pass_through(node)
+        to_input = None
+        if found is None or (rounded := sources.rounded(node)) is None:
+            back.pass_through(node)
+        else:
+            exact = node.inputs[1]
+            node.replace_input_with(1, tape.constant(rounded))
+            back.pass_through(node)
+            node.replace_input_with(1, exact)
+            to_input = back.found.get(given(node.inputs[0]))
+        if found is not None and sources.layer_of(node):
+            readings += sources.readings(tape, node, found, to_input)
     # one vector of each kind
-    for name, values in ((_NOISE, effects), (_SIGNAL, signal)):
+    effects = [each.vector for each in readings]
+    powers = [tape.shaped(each, [-1]) for each in signal]
+    for name, values in ((_NOISE, effects), (_SIGNAL, powers)):
         if values:
-            flat = [tape.shaped(each, [-1]) for each in values]
-            joined = tape.op("Concat", flat, {"axis": 0})
+            joined = tape.op("Concat", values, {"axis": 0})
             joined.name, joined.type = name, ir.TensorType(ir.DataType.FLOAT)
             main.outputs.append(joined)
     rewrite.remove_dead(main)
-    return _Written(sources.model, seeds, names, sources.behind(back.missing))
+    return _Written(sources.model, seeds, readings, sources.behind(back.missing))

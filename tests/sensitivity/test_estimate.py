@@ -17,9 +17,11 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import FLOAT, RESIDUAL, QuantPlan
 from me2e_compress.runtime.session import Session
+from me2e_compress.sensitivity import error_sources
 from me2e_compress.sensitivity import estimate as room
 from me2e_compress.sensitivity.error_sources import blamed
 from me2e_compress.sensitivity.estimate import NO_PATH, NodeCost, estimate
+from me2e_compress.sensitivity.gradients import tape
 from me2e_compress.targets import TARGETS, Target
 from tests.frames import record
 from tests.nets import MODULES, conv_attention, net
@@ -78,14 +80,22 @@ class Case:
         kept = place.kept_float(plan, model)
         return cls(model, dataclasses.replace(plan, kept_float=kept), place, frames)
 
-    def told(self, seed: int = 0) -> dict[str, NodeCost]:
+    def told(
+        self, seed: int = 0, most_held: int = room.MOST_HELD
+    ) -> dict[str, NodeCost]:
         """Estimate, by node."""
         ranges = Calibrator(threads=1).run(
             self.model, self.target.tensors(self.plan, self.model), self.frames
         )
         grids = self.target.grids(self.plan, self.model, ranges)
         costs = estimate(
-            self.model, self.plan, grids, self.frames, seed=seed, threads=1
+            self.model,
+            self.plan,
+            grids,
+            self.frames,
+            seed=seed,
+            threads=1,
+            most_held=most_held,
         )
         return {each.node: each for each in costs}
 
@@ -154,6 +164,82 @@ def test_what_channels_do_to_one_number_cancels_as_it_does(
 
     assert cost.noise is not None
     assert cost.noise["y"] == pytest.approx(case.measured("/backbone/stem")["y"], 0.005)
+
+
+HEAVY = (
+    HEAD
+    + """
+net (float[1,4,12,12] image, float[48,4,3,3] w0, float[48] b0, float[48,32] w1,
+     float[32,32] w2, float[1,32] b2, float[32,1] w3)
+    => (float[1,144,32] many, float[1,1] one)
+    <int64[3] tokens = {1, 48, 144}, int64[2] two = {144, 32}> {
+    ["/backbone/stem"] a = Conv<pads=[1,1,1,1]>(image, w0, b0)
+    ["/backbone/Relu"] r = Relu(a)
+    ["/head/Reshape"] flat = Reshape(r, tokens)
+    ["/head/Transpose"] rows = Transpose<perm=[0,2,1]>(flat)
+    ["/head/rows"] many = MatMul(rows, w1)
+    ["/head/Flat"] matrix = Reshape(many, two)
+    ["/head/Gemm"] g = Gemm<transB=1>(matrix, w2, b2)
+    ["/head/Mean"] mean = ReduceMean<axes=[0], keepdims=1>(g)
+    ["/head/sum"] one = MatMul(mean, w3)
+}"""
+)
+
+
+def heavy() -> ir.Model:
+    """A convolution, a product and a Gemm that is turned, of no few channels."""
+    random = np.random.default_rng(0)
+    shapes = {"w0": (48, 4, 3, 3), "w1": (48, 32), "w2": (32, 32), "w3": (32, 1)}
+    weights = {name: random.normal(0, 0.2, each) for name, each in shapes.items()}
+    biases = {"b0": random.normal(0, 1, 48), "b2": random.normal(0, 1, (1, 32))}
+    return net(HEAVY, weights | biases)
+
+
+def test_of_a_heavy_weight_a_part_is_looked_at_and_nothing_is_lost_of_the_sum(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = Case.of(tmp_path, heavy())
+    whole = case.told()
+
+    monkeypatch.setattr(error_sources, "HEAVY", 1)
+    part = case.told()
+
+    assert len(part) == 3
+    for name, cost in part.items():
+        told, exact = cost.noise or {}, whole[name].noise or {}
+        # one number: sums alone count; of many the squares of a part of the channels
+        assert told["one"] == pytest.approx(exact["one"], rel=0.02)
+        assert told["many"] == pytest.approx(exact["many"], rel=0.1)
+        assert told["many"] != exact["many"] or not exact["many"]
+
+
+@pytest.mark.parametrize("pieces", [1, 1 << 40])
+def test_waiting_for_a_gradient_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pieces: int
+) -> None:
+    case = Case.of(tmp_path, block())
+    expected = case.told()
+
+    monkeypatch.setattr(tape, "LARGE", pieces)
+    told = case.told()
+
+    for name, cost in told.items():
+        assert cost.noise == pytest.approx(expected[name].noise, rel=1e-5)
+
+
+def test_readers_of_one_tensor_share_its_error(tmp_path: Path) -> None:
+    case = Case.of(tmp_path, block())
+    ranges = Calibrator(threads=1).run(
+        case.model, case.target.tensors(case.plan, case.model), case.frames
+    )
+    grids = case.target.grids(case.plan, case.model, ranges)
+
+    made = room._write(case.model, case.plan, grids, None, room.MOST_HELD).model
+
+    rounded = [n.inputs[0] for n in made.graph if n.op_type == "QuantizeLinear"]
+    assert len(rounded) == len({*rounded})
+    probes = [n.inputs[0] for n in made.graph if "probe" in str(n.outputs[0].name)]
+    assert len(probes) > len(rounded) > 2
 
 
 def test_a_residual_branch_is_counted_to_the_convolution_it_follows(
@@ -240,10 +326,9 @@ def test_a_node_that_only_a_choice_reads_is_not_estimated_and_not_zero(
 
 
 def test_memory_is_kept_and_what_lies_behind_the_limit_is_not_estimated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(room, "MOST_HELD", 30_000)
-    told = Case.of(tmp_path, block()).told()
+    told = Case.of(tmp_path, block()).told(most_held=30_000)
 
     assert told["/head/Linear"].noise is not None
     assert told["/backbone/stem"].noise is None

@@ -45,6 +45,11 @@ CASES = {
     " { m = Greater(x, e) y = Where(m, x, p) }",
     "ReduceSum": "(double[a,b,c] x) => (double[a,c] y) <int64[1] i = {1}>"
     " { y = ReduceSum<keepdims=0>(x, i) }",
+    "ReduceSum-products": "(double[a,b,c] x, double[b,1] w) => (double[a,c] y)"
+    " <int64[1] i = {1}> { s = Mul(x, x) m = Mul(s, w)"
+    " y = ReduceSum<keepdims=0>(m, i) }",
+    "ReduceSum-narrow": "(double[a,1,c] x, double[b,c] w) => (double[a,c] y)"
+    " <int64[1] i = {1}> { m = Mul(x, w) y = ReduceSum<keepdims=0>(m, i) }",
     "ReduceMean": "(double[a,b,c] x) => (double[a,b,1] y)"
     " { y = ReduceMean<axes=[-1]>(x) }",
     "ReduceMax": "(double[a,b,c] x) => (double[a,c] y)"
@@ -233,3 +238,23 @@ def test_a_rule_gives_the_slopes_that_differences_show(
 
 def test_every_rule_has_a_case() -> None:
     assert {each.split("-")[0] for each in CASES} == {*RULES, "Split"}
+
+
+@pytest.mark.parametrize(
+    ("text", "shares"),
+    [
+        ("y = ReduceMax<axes=[1]>(x)", [1 / 3, 1 / 3, 0, 1 / 3]),
+        ("y = ReduceMin<axes=[1]>(x)", [0, 0, 1, 0]),
+        ("e = Relu(x) y = Max(x, e)", [1, 1, 0, 1]),
+    ],
+)
+def test_those_that_are_the_extreme_together_share_its_gradient(
+    text: str, shares: list[float]
+) -> None:
+    size = 1 if "axes" in text else 4
+    model = made(f"(double[1,4] x) => (double[1,{size}] y) {{ {text} }}", (1, 1, 1))
+    x, v = np.array([[2.0, 2.0, -1.0, 2.0]]), np.ones((1, size))
+
+    found = Session(backward(model, ["x"]), threads=1).run({"x": x, "v": v})["d_x"]
+
+    assert found[0] == pytest.approx(shares)

@@ -4,16 +4,18 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
+import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of
-from me2e_compress.graph.nodes import input_at, integers_at
+from me2e_compress.graph.nodes import input_at, integers_at, integers_of
 from me2e_compress.sensitivity.gradients.tape import (
     Found,
     NoRuleError,
     Rule,
     Tape,
     given,
+    numpy_of,
     sizes_of,
 )
 
@@ -75,7 +77,22 @@ def _sub(t: Tape, node: ir.Node, g: ir.Value) -> Found:
 
 def _mul(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     y, (a, b) = node.outputs[0], map(given, node.inputs)
+    g = _unexpanded(g, y, (a, b))
     return [t.narrowed(t.times(g, b), y, a), t.narrowed(t.times(g, a), y, b)]
+
+
+def _unexpanded(g: ir.Value, y: ir.Value, factors: Sequence[ir.Value]) -> ir.Value:
+    """Return a sum's gradient before it was expanded, if either product expands it."""
+    expand = g.producer()
+    if expand is None or expand.op_type != "Expand":
+        return g
+    before = given(expand.inputs[0])
+    shaped = before.producer()
+    sizes = None if shaped is None else integers_of(input_at(shaped, 1))
+    if sizes is None or shaped is None or shaped.op_type != "Reshape":
+        return g
+    made = {np.broadcast_shapes(sizes, sizes_of(each)) for each in factors}
+    return before if made == {sizes_of(y)} else g
 
 
 def _div(t: Tape, node: ir.Node, g: ir.Value) -> Found:
@@ -95,10 +112,13 @@ def _pow(t: Tape, node: ir.Node, g: ir.Value) -> Found:
 
 
 def _extreme(t: Tape, node: ir.Node, g: ir.Value) -> Found:
+    """Share a gradient between those that are the extreme."""
     y = node.outputs[0]
+    equal = [t.as_number(t.op("Equal", [each, y]), y) for each in node.inputs]
+    part = t.op("Div", [g, t.op("Sum", equal)])
     return [
-        t.narrowed(t.only(t.op("Equal", [each, y]), g, y), y, given(each))
-        for each in node.inputs
+        t.narrowed(t.times(part, mine), y, given(each))
+        for mine, each in zip(equal, node.inputs, strict=True)
     ]
 
 
@@ -112,17 +132,19 @@ def _where(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     return [None, t.narrowed(t.only(choice, g, y), y, a), t.narrowed(other, y, b)]
 
 
-def _spread(t: Tape, node: ir.Node, g: ir.Value) -> tuple[ir.Value, list[int], int]:
-    """Return a gradient with the reduced axes as ones, that shape, and their size."""
+def _spread(
+    t: Tape, node: ir.Node, g: ir.Value
+) -> tuple[ir.Value, list[int], list[int]]:
+    """Return a gradient with the reduced axes as ones, that shape, and these axes."""
     x, axes = sizes_of(node.inputs[0]), integers_at(node, "axes", 1)
     if axes is None and input_at(node, 1) is not None:
         raise NoRuleError("its axes are not constant")
     if not axes:
         idle = node.attributes.get_int("noop_with_empty_axes", 0)
         axes = [] if idle else [*range(len(x))]
-    gone = {at % len(x) for at in axes}
+    gone = sorted(at % len(x) for at in axes)
     kept = [1 if at in gone else size for at, size in enumerate(x)]
-    return t.shaped(g, kept), kept, math.prod(x[at] for at in gone)
+    return t.shaped(g, kept), kept, gone
 
 
 def _reduce_sum(t: Tape, node: ir.Node, g: ir.Value) -> Found:
@@ -131,15 +153,19 @@ def _reduce_sum(t: Tape, node: ir.Node, g: ir.Value) -> Found:
 
 
 def _reduce_mean(t: Tape, node: ir.Node, g: ir.Value) -> Found:
-    kept, _, count = _spread(t, node, g)
+    kept, _, axes = _spread(t, node, g)
+    sizes = sizes_of(node.inputs[0])
+    count = math.prod(sizes[at] for at in axes)
     part = t.times(kept, t.number(1 / count, node.inputs[0]))
-    return [t.op("Expand", [part, t.ints(sizes_of(node.inputs[0]))])]
+    return [t.op("Expand", [part, t.ints(sizes)])]
 
 
 def _reduce_extreme(t: Tape, node: ir.Node, g: ir.Value) -> Found:
-    kept, shape, _ = _spread(t, node, g)
+    """Share a gradient between those that are the extreme, as equal points are."""
+    kept, shape, axes = _spread(t, node, g)
     x, y = given(node.inputs[0]), t.shaped(node.outputs[0], shape)
-    return [t.only(t.op("Equal", [x, y]), kept, x)]
+    equal = t.as_number(t.op("Equal", [x, y]), x)
+    return [t.times(equal, t.op("Div", [kept, t.total(equal, axes, keep=True)]))]
 
 
 def _reduce_l2(t: Tape, node: ir.Node, g: ir.Value) -> Found:
@@ -170,35 +196,45 @@ def _log_softmax(t: Tape, node: ir.Node, g: ir.Value) -> Found:
 
 def _layer_norm(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     x, scale = given(node.inputs[0]), given(node.inputs[1])
-    rank = len(sizes_of(x))
-    first = node.attributes.get_int("axis", -1) % rank
-    epsilon = node.attributes.get_float("epsilon", 1e-5)
-    return [_normalized(t, x, t.times(g, scale), range(first, rank), epsilon)]
+    options, sizes = node.attributes, sizes_of(x)
+    first = options.get_int("axis", -1) % len(sizes)
+    ones = t.constant(np.ones(sizes[first:], numpy_of(x)))
+    # without scale and bias, the operator gives what is needed: n and r
+    rate = t.op("LayerNormalization", [x, ones], options, outputs=3)
+    made = rate.producer()
+    n, rate = rate if made is None else made.outputs[0], t.as_number(rate, x)
+    return [_normalized(t, x, n, rate, t.times(g, scale), range(first, len(sizes)))]
 
 
 def _instance_norm(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     x, scale = given(node.inputs[0]), given(node.inputs[1])
     rank = len(sizes_of(x))
     scale = t.shaped(scale, [-1] + [1] * (rank - 2))
-    epsilon = node.attributes.get_float("epsilon", 1e-5)
-    return [_normalized(t, x, t.times(g, scale), range(2, rank), epsilon)]
+    epsilon = t.number(node.attributes.get_float("epsilon", 1e-5), x)
+    centred = t.op("Sub", [x, _mean(t, x, range(2, rank), x)])
+    spread = _mean(t, t.times(centred, centred), range(2, rank), x)
+    rate = t.op("Reciprocal", [t.op("Sqrt", [t.op("Add", [spread, epsilon])])])
+    n = t.times(centred, rate)
+    return [_normalized(t, x, n, rate, t.times(g, scale), range(2, rank))]
 
 
 def _normalized(
-    t: Tape, x: ir.Value, g: ir.Value, axes: Sequence[int], epsilon: float
+    t: Tape,
+    x: ir.Value,
+    n: ir.Value,
+    rate: ir.Value,
+    g: ir.Value,
+    axes: Sequence[int],
 ) -> ir.Value:
     """Return r (g - mean(g) - n mean(g n)) of n = r (x - mean(x))."""
-    each = t.number(1 / math.prod(sizes_of(x)[at] for at in axes), x)
+    turned = t.times(n, _mean(t, t.times(g, n), axes, x))
+    left = t.op("Sub", [g, _mean(t, g, axes, x)])
+    return t.times(rate, t.op("Sub", [left, turned]))
 
-    def mean(value: ir.Value) -> ir.Value:
-        return t.times(t.total(value, list(axes), keep=True), each)
 
-    centred = t.op("Sub", [x, mean(x)])
-    variance = t.op("Add", [mean(t.times(centred, centred)), t.number(epsilon, x)])
-    rate = t.op("Reciprocal", [t.op("Sqrt", [variance])])
-    n = t.times(centred, rate)
-    left = t.op("Sub", [g, mean(g)])
-    return t.times(rate, t.op("Sub", [left, t.times(n, mean(t.times(g, n)))]))
+def _mean(t: Tape, value: ir.Value, axes: Sequence[int], like: ir.Value) -> ir.Value:
+    each = t.number(1 / math.prod(sizes_of(like)[at] for at in axes), like)
+    return t.times(t.total(value, list(axes), keep=True), each)
 
 
 def _batch_norm(t: Tape, node: ir.Node, g: ir.Value) -> Found:

@@ -94,37 +94,45 @@ def _grid_sample(t: Tape, node: ir.Node, g: ir.Value) -> Found:
     both = [t.op("Unsqueeze", [each, t.ints([3])]) for each in slopes]
     to_grid = t.times(t.op("Concat", both, {"axis": 3}), half)
 
-    # shares: each sample adds its gradient to the rows of four pixels
+    # shares: each sample adds its gradient to two rows and two columns of pixels
     count = n * rows * columns
+    across, share_across = _pixels(t, grid, 0, width, aligned, count)
+    along, share_along = _pixels(t, grid, 1, height, aligned, count)
+    across, share_across = (t.shaped(e, [1, 2, count]) for e in (across, share_across))
+    along, share_along = (t.shaped(e, [2, 1, count]) for e in (along, share_along))
+    place = t.op("Add", [across, t.times(along, t.number(width, x))])
+    first = np.repeat(np.arange(n) * height * width, rows * columns)
+    index = t.op("Add", [t.op("Cast", [place], {"to": 7}), t.constant(first)])
     moved = t.op("Transpose", [g], {"perm": [0, 2, 3, 1]})
     samples = t.shaped(moved, [count, channels])
-    first = np.repeat(np.arange(n) * height * width, rows * columns)
     image = t.zeros([n * height * width, channels], x)
-    flat, share = t.shaped(pixel, [count, 2]), t.shaped(beyond, [count, 2])
-    rest = t.op("Sub", [t.number(1, x), share])
-    for down in (0, 1):
-        for right in (0, 1):
-            step = t.constant(np.array([right, down], numpy_of(x)))
-            corner = t.op("Add", [flat, step])
-            ends = t.constant(np.array([width - 1, height - 1], numpy_of(x)))
-            inner = t.op("Min", [t.op("Max", [corner, t.number(0, x)]), ends])
-            inside = t.op("Cast", [t.op("Equal", [inner, corner])], {"to": _kind(x)})
-            mask = t.constant(np.array([right, down], bool))
-            weights = t.times(t.op("Where", [mask, share, rest]), inside)
-            across, along = (
-                t.op("Gather", [weights, t.ints([at])], {"axis": 1}) for at in (0, 1)
-            )
-            strides = t.constant(np.array([[1], [width]], numpy_of(x)))
-            index = t.op("Cast", [t.op("MatMul", [inner, strides])], {"to": 7})
-            index = t.op("Add", [index, t.constant(first[:, None])])
-            added = t.times(samples, across, along)
-            image = t.op("ScatterND", [image, index, added], {"reduction": "add"})
+    index = t.shaped(index, [4, count, 1])
+    weights = t.shaped(t.times(share_across, share_along), [4, count, 1])
+    for at in range(4):  # one by one, for what all would take of memory
+        corner = t.constant(np.array(at))
+        its, weight = (
+            t.op("Gather", [each, corner], {"axis": 0}) for each in (index, weights)
+        )
+        added = t.times(samples, weight)
+        image = t.op("ScatterND", [image, its, added], {"reduction": "add"})
     back = t.shaped(image, [n, height, width, channels])
     return [t.op("Transpose", [back], {"perm": [0, 3, 1, 2]}), to_grid]
 
 
-def _kind(value: ir.Value) -> int:
-    return (value.dtype or ir.DataType.FLOAT).value
+def _pixels(
+    t: Tape, grid: ir.Value, axis: int, size: int, aligned: int, count: int
+) -> tuple[ir.Value, ir.Value]:
+    """Return the two pixels of each sample along an axis, and its shares in them."""
+    u = t.op("Gather", [grid, t.constant(np.array(axis))], {"axis": 3})
+    half, middle = t.number((size - aligned) / 2, grid), t.number((size - 1) / 2, grid)
+    place = t.shaped(t.op("Add", [t.times(u, half), middle]), [1, count])
+    low, one = t.op("Floor", [place]), t.number(1, grid)
+    beyond = t.op("Sub", [place, low])
+    ends = t.op("Concat", [low, t.op("Add", [low, one])], {"axis": 0})
+    inner = t.op("Clip", [ends, t.number(0, grid), t.number(size - 1, grid)])
+    inside = t.as_number(t.op("Equal", [inner, ends]), grid)
+    shares = t.op("Concat", [t.op("Sub", [one, beyond]), beyond], {"axis": 0})
+    return inner, t.times(shares, inside)
 
 
 RULES: Mapping[str, Rule] = {

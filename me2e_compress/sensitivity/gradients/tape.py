@@ -20,6 +20,9 @@ Found: TypeAlias = Sequence[ir.Value | None]
 _SMALL = 1024
 """Bytes."""
 
+LARGE = 250_000
+"""Numbers; 1 MB of float32."""
+
 
 class NoRuleError(Exception):
     """There is no rule for this form of an operator."""
@@ -53,14 +56,18 @@ class Tape:
         self.graph.append(node)
         return node.outputs[-1]
 
-    def zero_after(self, values: Sequence[ir.Value]) -> ir.Value:
-        """Return a zero that is known once some floats are.
+    def late(self, array: Array, g: ir.Value, size: int) -> ir.Value:
+        """Return a constant that is known once a gradient of a large size is.
 
-        What reads it waits for them: onnxruntime runs nodes as soon as it may, and
-        would keep what they give.
+        What reads it waits for the gradient: onnxruntime runs nodes as soon as it may,
+        and would keep what they give.
         """
-        sums = [self.op("ReduceSum", [each], {"keepdims": 0}) for each in values]
-        return self.times(self.op("Sum", sums), self.number(0, values[0]))
+        constant = self.constant(array)
+        if size < LARGE:
+            return constant
+        first = self.constant(np.array(0))
+        one = self.op("Gather", [self.shaped(g, [-1]), first], {"axis": 0})
+        return self.op("Add", [constant, self.times(one, self.number(0, g))])
 
     def _name(self, what: str) -> str:
         return rewrite.fresh_name(f"me2e_{what}_{len(self._names)}", self._names)
@@ -84,6 +91,11 @@ class Tape:
     def number(self, number: float, like: ir.Value | None) -> ir.Value:
         """Return a scalar of the type of a value."""
         return self.constant(np.array(number, numpy_of(like)))
+
+    def as_number(self, value: ir.Value, like: ir.Value) -> ir.Value:
+        """Cast to the type of a value."""
+        kind = like.dtype or ir.DataType.FLOAT
+        return self.op("Cast", [value], {"to": kind.value})
 
     def zeros(self, shape: Sequence[int], like: ir.Value | None) -> ir.Value:
         """Return a tensor of zeros of the type of a value."""
