@@ -213,11 +213,13 @@ def _road(drive: DriveRecord, several: bool) -> str:
     low, high = (number(each, "+.1f") for each in (found.low, found.high))
     said = f"{where}driving score {value} points ({low} to {high})"
     limit = f"{found.n} routes show none below {drive.difference.smallest_shown:.1f}"
-    room = drive.difference.room_kept
-    kept = "" if room.value is None else f"; room kept {_signed(room)}"
+    kept = _signed("; room kept ", drive.difference.room_kept)
     return f"{said}, {drive.difference.verdict}; {limit}{kept}"
 
 
-def _signed(gap: Estimate) -> str:
-    value, low, high = (number(e, "+.1f") for e in (gap.value, gap.low, gap.high))
-    return f"{value} points ({low} to {high})"
+def _signed(what: str, gap: Estimate) -> str:
+    ends = [each for each in (gap.value, gap.low, gap.high) if each is not None]
+    if len(ends) < 3:
+        return ""
+    value, low, high = (number(each, "+.1f") for each in ends)
+    return f"{what}{value} points ({low} to {high})"
