@@ -9,7 +9,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.observers import OBSERVERS
+from me2e_compress.calibration.observers import DEFAULT_METHOD, OBSERVERS
 from me2e_compress.calibration.probes import Counts, Extremes
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
@@ -50,7 +50,7 @@ class Calibrator:
         every: frames between two checkpoints.
     """
 
-    method: str = "max-min"
+    method: str = DEFAULT_METHOD
     threads: int = 0
     optimize: bool = True
     checkpoint: Path | None = None

@@ -202,7 +202,9 @@ class Ranges(Displayed):
         if not method == self.method == IMPORTED:
             asked = OBSERVERS.text(OBSERVERS.parse(method), defaults=True)
         if self.method not in (asked, IMPORTED):
-            raise FramesError(f"{named}: of method {self.method}, asked for {asked}")
+            raise FramesError(
+                f"{named}: of method {self.method}, asked for {asked}; give --method"
+            )
         wanted = self.source if source is None else source
         if self.method != IMPORTED and self.source != wanted:
             raise FramesError(

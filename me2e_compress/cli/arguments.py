@@ -35,8 +35,10 @@ Overrides = Annotated[
 SavedRanges = Annotated[
     Path | None, typer.Option("--ranges", help="saved RANGES.json instead of frames")
 ]
-METHOD = "calibration method: max-min, percentile:99.9, ..."
-Method = Annotated[str | None, typer.Option(help=METHOD)]
+Method = Annotated[
+    str | None,
+    typer.Option(help="calibration method: mse, max-min, percentile:99.9, ..."),
+]
 RECIPE = "a TOML file, or a shipped recipe's name"
 Recipe = Annotated[str | None, typer.Option("-r", "--recipe", help=RECIPE)]
 Count = Annotated[int, typer.Option("-n", "--count", help="number of frames")]

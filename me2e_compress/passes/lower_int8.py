@@ -7,6 +7,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.calibration.observers import DEFAULT_METHOD
 from me2e_compress.display import counted
 from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
@@ -29,14 +30,14 @@ class LowerInt8(Pass):
     attention) become float again.
 
     Attributes:
-        method: how ranges are read from the frames: ``max-min``.
+        method: how ranges are read from the frames: ``mse``, ``max-min``, ...
         ranges: file of saved ranges instead of frames.
     """
 
     name: ClassVar[str] = "lower-int8"
     exact: ClassVar[bool] = False
     reads_ranges: ClassVar[bool] = True
-    method: str = "max-min"
+    method: str = DEFAULT_METHOD
     ranges: Path | None = None
 
     def run(self, model: ir.Model, context: Context) -> PassResult:

@@ -59,7 +59,8 @@ class QuantizeInt8(Pass):
             to the rules (512).
         overrides: TOML file of exceptions to the plan.
         method: how ranges are read from the frames: ``max-min``,
-            ``moving-average:W``, ``percentile:P``, ``mse`` or ``entropy``.
+            ``moving-average:W``, ``percentile:P``, ``mse`` or ``entropy``; None leaves
+            it to the rules (``safe``: ``mse``, ``paper``: ``max-min``).
         ranges: file of saved ranges instead of frames.
         weight_only_gemv: store the weights of matrix-vector products, which rule
             ``gemv`` keeps in float, as int8; no range is needed for it.
@@ -76,7 +77,7 @@ class QuantizeInt8(Pass):
     target: str = "tensorrt"
     attention_limit: int | None = None
     overrides: Path | None = None
-    method: str = "max-min"
+    method: str | None = None
     ranges: Path | None = None
     weight_only_gemv: bool = False
 
@@ -108,13 +109,13 @@ class QuantizeInt8(Pass):
             notes = ("nothing to quantize", *_notes(plan, self.target), *advice)
             return PassResult(model, 0, notes)
         # Calibrate
-        ranges = Ranges({}, self.method, 0, "", "")
+        ranges = Ranges({}, self.method_of_ranges, 0, "", "")
         if tensors:
             ranges = context.ranges(
                 self.name,
                 model,
                 tensors,
-                method=self.method,
+                method=self.method_of_ranges,
                 saved=self.ranges,
             )
         # Place the quantizers and record the plan
@@ -158,6 +159,11 @@ class QuantizeInt8(Pass):
         plan = self.plan(model, context)
         kept_float = self._runtime.kept_float(plan, model)
         return dataclasses.replace(plan, kept_float=kept_float)
+
+    @property
+    def method_of_ranges(self) -> str:
+        """Return the method that was asked for, or the one of the rules."""
+        return self.method or self._rules().method
 
     @functools.cached_property
     def _runtime(self) -> Target:

@@ -185,7 +185,7 @@ def _calibrate(
     if part is None:  # shards were measured elsewhere
         return _written(_merged(ready, tensors, options), output, options)
     # a checkpoint lets a run that was killed go on
-    method = options.method
+    method = options.method or ready.method
     checkpoint = checkpoint_beside(output)
     calibrator = Calibrator(
         method, options.threads, checkpoint=checkpoint, provider=options.provider
@@ -215,11 +215,10 @@ def _merged(
     ready: PreparedGraph, tensors: tuple[str, ...], options: CalibrateOptions
 ) -> Ranges:
     seen = merge([Statistics.load(Path(path)) for path in options.merge])
-    found = Ranges.of(seen, OBSERVERS.parse(options.method))
+    method = options.method or ready.method
+    found = Ranges.of(seen, OBSERVERS.parse(method))
     digest = graph.digest(ready.model)
-    found.check(
-        model=digest, tensors=tensors, method=options.method, named=options.merge[0]
-    )
+    found.check(model=digest, tensors=tensors, method=method, named=options.merge[0])
     return found
 
 

@@ -17,8 +17,8 @@ class CalibrateOptions:
 
     Attributes:
         recipe: a shipped recipe or a TOML file; its passes before int8 are run.
-        method: ``max-min``, ``moving-average:W``, ``percentile:P``, ``mse``,
-            ``entropy``.
+        method: ``mse``, ``max-min``, ``moving-average:W``, ``percentile:P`` or
+            ``entropy``; None takes that of the recipe's int8, else ``mse``.
         count: number of frames, drawn in whole scenes.
         seed: seed of that draw.
         module_map: preset or TOML file; None finds the preset.
@@ -41,7 +41,7 @@ class CalibrateOptions:
     """
 
     recipe: str | Path = "exact"
-    method: str = "max-min"
+    method: str | None = None
     count: int = 256
     seed: int = 0
     module_map: str | Path | None = None
@@ -57,7 +57,8 @@ class CalibrateOptions:
     force: bool = False
 
     def __post_init__(self) -> None:
-        OBSERVERS.parse(self.method)
+        if self.method is not None:
+            OBSERVERS.parse(self.method)
         check_count("--seed", self.seed)
         check_count("--threads", self.threads, most=MOST_THREADS)
         if self.shard is None:

@@ -205,7 +205,7 @@ class _Measurement:
             applied.name,
             before,
             target.tensors(plan, before),
-            method=applied.method,
+            method=applied.method_of_ranges,
             saved=applied.ranges,
         )
         progress = partial(self.listener.on_progress, "search")

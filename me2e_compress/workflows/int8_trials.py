@@ -157,7 +157,8 @@ def _ranges(
             model=digest, tensors=tensors, method=ranges.method, named=options.ranges
         )
         return ranges
-    return Calibrator(threads=options.threads, provider=options.provider).run(
+    method = RULE_SETS.parse(options.rules).method
+    return Calibrator(method, options.threads, provider=options.provider).run(
         ready.model,
         tensors,
         recording,

@@ -9,10 +9,12 @@ from typing import NoReturn, Self
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.calibration.observers import DEFAULT_METHOD
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
+from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.targets import TARGETS
@@ -67,6 +69,15 @@ class PreparedGraph:
         graph.infer_shapes(model)
         _leave_the_message(model)
         return cls(file, model, module_map, reader)
+
+    @property
+    def method(self) -> str:
+        """Return how the pass that reads ranges wants them measured."""
+        if isinstance(self.reader, QuantizeInt8):
+            return self.reader.method_of_ranges
+        return (
+            self.reader.method if isinstance(self.reader, LowerInt8) else DEFAULT_METHOD
+        )
 
     def tensors(self) -> tuple[str, ...]:
         """Return every tensor that any scheme, rule set or target needs a range of.

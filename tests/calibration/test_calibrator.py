@@ -59,7 +59,7 @@ def test_ranges_are_those_of_onnxruntime_to_the_bit(
     tool.collect_data(Reader(states))
     theirs = tool.compute_data().data
 
-    ours = Calibrator(threads=1, optimize=False).run(model, TENSORS, frames)
+    ours = Calibrator("max-min", threads=1, optimize=False).run(model, TENSORS, frames)
 
     for name in TENSORS:
         low, high = (end.item() for end in theirs[name].range_value)
@@ -73,7 +73,8 @@ def test_state_is_fed_forward_and_reset_between_scenes(tmp_path: Path) -> None:
     model = conv_attention()
 
     def highest(frames: CalibrationSet) -> float:
-        return Calibrator(threads=1).run(model, ["seen"], frames).tensors["seen"][1]
+        calibrator = Calibrator("max-min", threads=1)
+        return calibrator.run(model, ["seen"], frames).tensors["seen"][1]
 
     # memory after n equal frames adds 1/2 + 1/4 + 1/8 of what one frame shows
     assert highest(together) == pytest.approx(highest(apart) * 1.875, rel=1e-5)
@@ -125,7 +126,7 @@ def test_an_unknown_tensor_or_method_is_an_error(frames: CalibrationSet) -> None
 
 @pytest.fixture
 def ranges(frames: CalibrationSet) -> Ranges:
-    return Calibrator(threads=1).run(conv_attention(), ["a"], frames)
+    return Calibrator("max-min", threads=1).run(conv_attention(), ["a"], frames)
 
 
 def test_saved_ranges_come_back(ranges: Ranges, tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def test_shards_that_do_not_belong_together_are_refused(
     whole = draw(frames, 7, 0)
     model = conv_attention()
     first, second = (
-        Calibrator(threads=1).collect(model, TENSORS, part)
+        Calibrator("max-min", threads=1).collect(model, TENSORS, part)
         for part in (
             dataclasses.replace(whole, places=tuple(range(5))),
             dataclasses.replace(whole, places=(5, 6)),

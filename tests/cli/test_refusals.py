@@ -195,7 +195,7 @@ RANGES: Mapping[str, Mapping[str, Any]] = {
     "large": {"tensors": {"a": [-1e39, 1]}},
     "turned": {"tensors": {"a": [2, 1]}},
     "no-frames": {"frames": 0},
-    "loud": {"rms": {"a": 1e9}},
+    "loud": {"method": "max-min", "rms": {"a": 1e9}},
     "other-graph": {"model": "another"},
     "other-frames": {"source": "others"},
 }

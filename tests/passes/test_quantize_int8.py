@@ -170,12 +170,27 @@ def test_saved_ranges_give_the_same_graph_without_frames(
 ) -> None:
     model = conv_attention()
     path = tmp_path / "r.json"
-    Calibrator().run(model, TENSORS, frames).save(path)
+    Calibrator("max-min").run(model, TENSORS, frames).save(path)
 
     measured = QuantizeInt8(rules="paper").run(conv_attention(), context).model
     read = QuantizeInt8(rules="paper", ranges=path).run(model, Context(MODULES)).model
 
     assert graph.digest(read) == graph.digest(measured)
+
+
+@pytest.mark.parametrize(
+    ("options", "method"),
+    [
+        ({}, "mse"),
+        ({"rules": "safe{without=[cost]}"}, "mse"),
+        ({"rules": "paper"}, "max-min"),
+        ({"rules": "paper", "method": "percentile:99"}, "percentile:99"),
+    ],
+)
+def test_the_rules_choose_the_method_unless_it_is_asked_for(
+    options: dict[str, str], method: str
+) -> None:
+    assert QuantizeInt8(**options).method_of_ranges == method  # type: ignore[arg-type]
 
 
 def test_ranges_of_another_graph_are_refused(

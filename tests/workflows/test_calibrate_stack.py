@@ -100,7 +100,8 @@ def test_compress_takes_the_ranges(
 def test_ranges_hold_what_the_running_stack_has(tmp_path: Path) -> None:
     stack, frames = write_dense(tmp_path, THREE_FILES), dense_frames(tmp_path)
 
-    found = me2e.calibrate(stack, frames, tmp_path / "ranges.json").ranges
+    options = me2e.CalibrateOptions(method="max-min")
+    found = me2e.calibrate(stack, frames, tmp_path / "ranges.json", options).ranges
 
     session = open_session(stack, threads=1)
     recording = me2e.CalibrationSet(frames)

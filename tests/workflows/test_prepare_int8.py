@@ -1,8 +1,10 @@
 from pathlib import Path
 
 import onnx_ir as ir
+import pytest
 
 from me2e_compress import graph
+from me2e_compress.manager import recipe
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 from tests.nets import conv_attention
 
@@ -15,3 +17,22 @@ def test_what_is_prepared_leaves_the_message_of_the_file(tmp_path: Path) -> None
 
     kinds = {type(each.const_value) for each in ready.graph.initializers.values()}
     assert kinds == {ir.Tensor}
+
+
+@pytest.mark.parametrize(
+    ("passes", "method"),
+    [
+        ("fold-constants", "mse"),
+        ("quantize-int8{rules=paper}", "max-min"),
+        ("quantize-int8{method=percentile:99}", "percentile:99"),
+    ],
+)
+def test_ranges_are_measured_as_the_recipe_reads_them(
+    passes: str, method: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "m.onnx"
+    graph.save(conv_attention(), path)
+
+    ready = PreparedGraph.of(path, graph.load(path), "whole", recipe.parse(passes))
+
+    assert ready.method == method

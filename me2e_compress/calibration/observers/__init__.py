@@ -16,6 +16,10 @@ __all__ = ["OBSERVERS", "QUANT_MAX", "Bounds", "Observer", "scale_of"]
 
 _HERE = "me2e_compress.calibration.observers"
 
+DEFAULT_METHOD = "mse"
+"""It drives no worse than max-min, and the plan moves less, from each of three
+recordings, by a rule that was written down before the drives (benchmarks/observers)."""
+
 OBSERVERS: Registry[Observer] = Registry(
     "calibration method",
     "me2e_compress.observers",

@@ -19,7 +19,6 @@ Output = Annotated[
     Path, typer.Option("-o", "--output", help="the ranges as JSON; of a shard .npz")
 ]
 Recipe = Annotated[str, typer.Option("-r", "--recipe", help=given.RECIPE)]
-Method = Annotated[str, typer.Option(help=given.METHOD)]
 Shard = Annotated[str | None, typer.Option(help="2/4: the second of four shards")]
 Merge = Annotated[list[Path] | None, typer.Option(help="a SHARD.npz; once for each")]
 Cache = Annotated[Path | None, typer.Option(help="write a TensorRT cache too")]
@@ -31,7 +30,7 @@ def calibrate(
     frames: Frames = None,
     output: Output = Path("ranges.json"),
     recipe: Recipe = "exact",
-    method: Method = "max-min",
+    method: given.Method = None,
     count: given.Count = 256,
     seed: given.Seed = 0,
     module_map: given.ModuleMap = None,

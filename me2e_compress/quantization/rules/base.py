@@ -8,6 +8,7 @@ from typing import ClassVar, TypeAlias
 
 import onnx_ir as ir
 
+from me2e_compress.calibration.observers import DEFAULT_METHOD
 from me2e_compress.errors import RecipeError
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.quantization.coordinates import find_coordinates
@@ -146,6 +147,7 @@ class RuleSet(abc.ABC):
         name: the set's name in plans and recipes.
         share_concat: whether the inputs of a Concat are put on one scale with its
             result, so that it moves int8 without requantizing.
+        method: how ranges are read from the frames where a recipe names no method.
 
     Attributes:
         without: names of rules that are switched off.
@@ -157,6 +159,7 @@ class RuleSet(abc.ABC):
 
     name: ClassVar[str]
     share_concat: ClassVar[bool] = False
+    method: ClassVar[str] = DEFAULT_METHOD
     without: tuple[str, ...] = dataclasses.field(default=(), kw_only=True)
     extra: tuple[str | Rule, ...] = dataclasses.field(default=(), kw_only=True)
     balance: bool = dataclasses.field(default=False, kw_only=True)

@@ -177,6 +177,7 @@ class PaperRules(RuleSet):
     """
 
     name: ClassVar[str] = "paper"
+    method: ClassVar[str] = "max-min"  # section III-C, equation 3
     attention_limit: int = 512
 
     def own_rules(self) -> tuple[Rule, ...]:

@@ -12,6 +12,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
+from me2e_compress.calibration.observers import DEFAULT_METHOD
 from me2e_compress.graph import CONVOLUTIONS, static_shape
 from me2e_compress.graph.shapes import PRODUCTS, extent
 from me2e_compress.quantization.rules.base import Rule, RuleFacts
@@ -190,6 +191,7 @@ class SafeRules(PaperRules):
 
     name: ClassVar[str] = "safe"
     share_concat: ClassVar[bool] = True
+    method: ClassVar[str] = DEFAULT_METHOD
     balance: bool = dataclasses.field(default=True, kw_only=True)
 
     def own_rules(self) -> tuple[Rule, ...]:

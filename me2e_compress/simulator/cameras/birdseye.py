@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import compress
 
 import cv2
 import numpy as np
@@ -110,7 +109,7 @@ def _near(actors: Sequence[Actor], ego: Ego, grid: BirdseyeGrid) -> list[Actor]:
     # half a diagonal, and a cell for the rounding of what is drawn
     reach = np.hypot(boxes[:, 2], boxes[:, 3])[:, None] / (2 * grid.cell_m) + 1
     far = (cells < -reach) | (cells - reach > (grid.columns, grid.rows))
-    return list(compress(actors, ~far.any(1)))
+    return [actors[i] for i in np.flatnonzero(~far.any(axis=1)).tolist()]
 
 
 def _footprint(box: Actor | Ego, ego: Ego) -> Floats:
