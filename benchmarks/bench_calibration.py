@@ -40,6 +40,7 @@ from me2e_compress.runtime.session import Session, replay
 OURS = {
     "plain": ("", True),
     "max-min": ("max-min", True),
+    "mse": ("mse", True),
     "entropy": ("entropy", True),
     "plain, not optimized": ("", False),
     "max-min, not optimized": ("max-min", False),
@@ -54,6 +55,7 @@ LEFT_GB = 2.0
 """Memory of the machine that no process here may use up."""
 LEVEL = {
     "max-min": "plain",
+    "mse": "plain",
     "entropy": "plain",
     "max-min, not optimized": "plain, not optimized",
 }
