@@ -193,7 +193,7 @@ def find_readings(
         ]
         trials = [
             (_closeness((*found, each), values, likes), each)
-            for each in _candidates(read[0], likes[0], single=len(values) == 1)
+            for each in _candidates(read[0], likes)
         ]
         # the first of equals: the order of candidates is from common to rare
         best, taken = max(trials, key=lambda trial: trial[0], default=(LOWEST_DB, None))
@@ -220,19 +220,24 @@ def _closeness(
     return float(np.mean(found))
 
 
-def _candidates(value: Array | None, like: Array, *, single: bool) -> Iterator[Reading]:
-    """Propose readings of an output from one frame, from common to rare."""
+def _candidates(value: Array | None, likes: Sequence[Array]) -> Iterator[Reading]:
+    """Propose readings of an output on the first frame, from common to rare."""
     if value is None:
         return
+    like = likes[0]
     yield from _layouts(value, like)
-    types = [like.dtype.name, "float16", "bfloat16", "float32", "int8", "int32"]
+    # zeros fit by chance; integers without a scale are whole numbers
+    told = sum(int(np.count_nonzero(each)) for each in likes)
+    types = [like.dtype.name, "float16", "bfloat16", "float32"] if told else []
+    if told >= FITTED_VALUES and not any(np.mod(each, 1).any() for each in likes):
+        types += ["int8", "int32"]
     for name, swapped in itertools.product(dict.fromkeys(types), (False, True)):
         if (name, swapped) != (value.dtype.name, False) and (name, swapped) != (
             *("int8", True),
         ):
             yield Bytes(name, swapped, value.dtype.name)
     # constants and orders need the shape
-    if value.shape != like.shape or (single and like.size < FITTED_VALUES):
+    if value.shape != like.shape or (len(likes) == 1 and like.size < FITTED_VALUES):
         return
     wide, true = (np.asarray(each, np.float64) for each in (value, like))
     if not np.isfinite(wide).all() or not true.any():

@@ -237,3 +237,10 @@ def test_orders_of_six_cameras_are_tried_once_each() -> None:
     orders = set(camera_orders(6))
     assert {(0, 2, 1, 3, 5, 4), (5, 4, 3, 2, 1, 0), (1, 2, 3, 4, 5, 0)} <= orders
     assert all(sorted(each) == list(range(6)) for each in orders)
+
+
+def test_a_few_zeros_do_not_pass_for_bytes_of_an_integer() -> None:
+    likes = [np.zeros((1, 1), np.float32)] * 3
+    values = [np.full((1, 1), seconds, np.float32) for seconds in (3, 5, 7)]
+
+    assert find_readings(values, likes) == ()
