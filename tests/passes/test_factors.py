@@ -174,3 +174,21 @@ def test_what_must_stay_is_left_alone_and_the_reason_noted(case: str) -> None:
     assert result.changes == 0
     assert len(left) == (reason is not None)
     assert all(str(reason) in note for note in left)
+
+
+def test_values_between_a_layer_and_its_factor_take_other_names() -> None:
+    """Saved ranges, caches and dumps find a value by its name."""
+    body = "a = MatMul(x, w) s = Add(b, a) v = Reshape(s, split) y = Mul(v, c)"
+    model = read(
+        f"{HEAD}g (float[2,4] x) => (float[2,3,2] y) {{ {body} }}",
+        w=normal(4, 6).astype(np.float32),
+        b=normal(6).astype(np.float32),
+        split=integers(2, 3, 2),
+        c=np.array(0.25, np.float32),
+    )
+
+    apply(FuseBasic(), model)
+
+    assert "Mul" not in ops(model)
+    values = [str(value.name) for node in model.graph for value in node.outputs]
+    assert not {"a", "s", "v"} & set(values)

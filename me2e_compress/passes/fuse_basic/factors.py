@@ -25,6 +25,7 @@ from me2e_compress.graph.rewrite import (
     array_of,
     constant,
     either,
+    fresh_name,
     inherit,
     moved,
     numbers_of,
@@ -174,6 +175,9 @@ def _fold_behind(match: Match, kit: Kit) -> str | None:
     parts = _parts(match)
     reason = _scale(product, parts, factor, kit)
     if reason is None:
+        # what lies between holds other values now: ranges and dumps go by names
+        for value in (node.outputs[0] for node in match.nodes[1:]):
+            value.name = fresh_name(f"{value.name}_scaled", kit.names)
         kit.absorb(match.node(MOVED), *(node for _, node, _ in parts))
     return reason
 
