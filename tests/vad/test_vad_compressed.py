@@ -174,7 +174,9 @@ def test_the_cpu_runs_every_convolution_and_most_products_in_int8(
     ranges: Path,
     tmp_path: Path,
 ) -> None:
-    options = QuantizeInt8(rules="paper", target="onnxruntime", ranges=ranges)
+    options = QuantizeInt8(
+        rules="paper", target="onnxruntime", method="mse", ranges=ranges
+    )
     result = options.run(folded.clone(), context).model
 
     rewritten = tmp_path / "rewritten.onnx"
