@@ -62,11 +62,6 @@ class Remedy:
     shortfalls: tuple[Shortfall, ...]
     trials: int
 
-    @property
-    def cures(self) -> bool:
-        """Whether nothing is below the floor any more."""
-        return not self.shortfalls
-
     def overrides(self) -> str:
         """Return what ``--overrides`` takes; empty if nothing was found."""
         return overrides_text(overrides_of(self.nodes, self.modules))

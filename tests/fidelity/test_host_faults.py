@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.fidelity import feed_search
 from me2e_compress.fidelity.dump_readings import closeness, find_readings, undone
 from me2e_compress.fidelity.engine_run import EngineRun
 from me2e_compress.fidelity.feed_faults import Pixels, camera_orders
@@ -97,6 +98,20 @@ def test_what_was_fed_wrongly_is_named(kind: str, state: bool) -> None:
 def test_state_that_was_fed_wrongly_is_named(kind: str, state: bool) -> None:
     dump = drive(opened(), frames(), state=STATES[kind])
     assert [fault.kind for fault in named(dump, state=state)] == [kind]
+
+
+def test_a_state_that_explains_much_does_not_hide_frames_that_are_shifted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        *(feed_search, "_screened"),
+        lambda run, faults, close: [(feed_search.SURE_DB, faults[0])],
+    )
+    run = EngineRun(opened(), frames(), drive(opened(), frames()))
+
+    found = feed_search.find_explanations(run, {}, {})
+
+    assert [fault.kind for _, fault in found] == ["state-not-reset", "frames-shifted"]
 
 
 READS: dict[str, tuple[str, str, Callable[[Any], Any]]] = {

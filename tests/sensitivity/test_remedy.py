@@ -55,7 +55,7 @@ def test_one_node_among_many_is_confirmed_by_one_variant() -> None:
 
     assert named(remedy) == [37]
     assert not remedy.modules
-    assert remedy.cures
+    assert not remedy.shortfalls
     assert remedy.trials == 1
 
 
@@ -63,7 +63,7 @@ def test_as_many_nodes_are_float_as_explain_the_noise_and_no_more() -> None:
     remedy = search({37: 0.9, 3: 0.5, 5: 0.04, 9: 0.03})
 
     assert named(remedy) == [37, 3]
-    assert remedy.cures
+    assert not remedy.shortfalls
     assert remedy.trials == 1
 
 
@@ -72,7 +72,7 @@ def test_noise_that_is_spread_over_a_module_is_cured_by_the_module() -> None:
 
     assert remedy.modules == ("m1",)
     assert not remedy.nodes
-    assert remedy.cures
+    assert not remedy.shortfalls
 
 
 def test_noise_that_is_everywhere_is_never_cured_by_giving_up_int8() -> None:
@@ -80,7 +80,7 @@ def test_noise_that_is_everywhere_is_never_cured_by_giving_up_int8() -> None:
 
     assert not remedy.modules
     assert not remedy.nodes
-    assert not remedy.cures
+    assert remedy.shortfalls
     assert remedy.trials == 0
 
 
@@ -97,7 +97,7 @@ def test_an_estimate_that_is_too_low_is_mended_by_what_a_variant_shows() -> None
     remedy = search({37: 0.9, 3: 0.5}, told={37: 0.9, 3: 0.05})
 
     assert named(remedy) == [37, 3]
-    assert remedy.cures
+    assert not remedy.shortfalls
     assert remedy.trials == 2
 
 
@@ -106,7 +106,7 @@ def test_an_estimate_that_is_wrong_ends_after_few_variants() -> None:
     remedy = search({37: 0.9, 3: 0.02}, told)
 
     assert remedy.trials <= MOST_TRIALS
-    assert not remedy.cures
+    assert remedy.shortfalls
 
 
 def test_what_no_estimate_explains_is_shared_by_the_nodes_without_one() -> None:
@@ -115,7 +115,7 @@ def test_what_no_estimate_explains_is_shared_by_the_nodes_without_one() -> None:
 
     assert remedy.modules == ("m3",)
     assert not remedy.nodes
-    assert remedy.cures
+    assert not remedy.shortfalls
 
 
 def test_what_was_found_is_an_override_that_names_the_node_and_no_other() -> None:

@@ -134,7 +134,7 @@ def test_the_report_holds_the_measurement_and_the_remedy(
     assert len(ran) == 1
     assert found.loss is not None
     assert found.loss.remedy is not None
-    assert found.loss.remedy.cures
+    assert not found.loss.remedy.shortfalls
     assert [each.output for each in found.loss.shortfalls] == ["bev"]
     told = json.loads((cameras / "out.report.json").read_text())
     assert told["fidelity"]["on"] == "kept out of calibration"

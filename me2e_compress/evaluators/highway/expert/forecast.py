@@ -15,6 +15,8 @@ Flags = npt.NDArray[np.bool_]
 TIMES_S = np.concatenate([np.arange(0.25, 3.01, 0.25), np.arange(3.5, 6.01, 0.5)])
 """[18] seconds: fine for the three seconds of the plan, coarse after."""
 NOW_S = np.concatenate([[0.0], TIMES_S])
+STEPS_S = tuple(zip(NOW_S[:-1].tolist(), np.diff(NOW_S).tolist(), strict=True))
+"""Where each begins and its length: numbers of Python are faster one by one."""
 REACH_M = 150.0
 """Range of the actors that are considered; oncoming ones matter early."""
 ROUTE_SPAN_M = (-60.0, 160.0)
@@ -131,7 +133,7 @@ def _speeds(
     """
     hardest = min(first, -2.0)
     speed, travel = [now], [0.0]
-    for begin, step in zip(NOW_S[:-1], np.diff(NOW_S), strict=True):
+    for begin, step in STEPS_S:
         wish = min(max((goal - speed[-1]) / step, hardest), briskest)
         rate = wish
         if begin < 1.0:
