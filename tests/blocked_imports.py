@@ -100,12 +100,13 @@ def found(gone: Collection[str]) -> dict[str, object]:
 
 
 def main() -> None:
-    """Look at each case in a fork of this process, which has most base packages.
+    """Look at each case in a fork of this process, which has what takes long.
 
     Not onnxruntime: its threads would not be there after a fork.
     """
     cases = json.loads(Path(sys.argv[1]).read_text())
-    for name in ("numpy", "onnx_ir", "pydantic", "scipy.optimize", "rich", "typer"):
+    base = ("numpy", "onnx_ir", "pydantic", "scipy.optimize", "rich", "typer")
+    for name in (*base, "torch", "numba", "highway_env", "matplotlib.pyplot"):
         importlib.import_module(name)
     answers = {}
     with tempfile.TemporaryDirectory() as folder:
