@@ -1,19 +1,21 @@
 """Which faults of a host does ``compare --outputs`` name, and where does it cry wolf?
 
     python -m benchmarks.bench_engine_faults OUT [--stack highway] [--frames 16]
-        [--scene 4] [--recipe full] [--only state-late,bgr]
+        [--scene 4] [--recipe full] [--only state-late,bgr] [--small]
 
 Dumps are written by onnxruntime. The engine is the stack's graph (``--recipe``: what
 that recipe makes of it) with its float weights rounded to float16, run with all
 optimizations; a host with a seeded fault (:mod:`benchmarks.wrong_hosts`) feeds it and
 reads its outputs. ``--alarms`` runs the recipes of
 the driver without any fault instead: rounded weights (float16, bfloat16), rounded
-outputs, and noise of 50 dB on them.
+outputs, and noise of 50 dB on them. ``--small`` takes VAD-tiny with all of its layers,
+narrower and of six smaller images.
 """
 
 import argparse
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -25,6 +27,7 @@ import onnx_ir as ir
 from benchmarks.wrong_hosts import STATISTICS, Arrays, Change, Host, hosts
 from me2e_compress.calibration.archives import archive_of
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.recording import Begin, write_recording
 from me2e_compress.manager import recipe
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session
@@ -32,7 +35,10 @@ from me2e_compress.workflows.compare_dump import DumpResult, compare_dump
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.export import export_stack
 from me2e_compress.workflows.frames import FramesOptions, record_frames
+from me2e_compress.zoo.synthetic_frames import frames as synthetic
+from tests.zoo.vad.sizes import SIZES
 
+SMALL = SIZES["small"]
 OF_OTHERS = ("uniad-", "vad-")
 NOISE_DB = 50.0
 HEAD = "fault | named | from dB | to dB | inferences | CPU s"
@@ -71,6 +77,14 @@ def engine_of(path: Path, kind: str) -> Session:
             held = tensor.numpy().astype(getattr(ml_dtypes, kind, None) or kind)
             value.const_value = ir.tensor(held.astype(np.float32), name=value.name)
     return Session(model, threads=1, release=True)
+
+
+def small_frames(given: FramesOptions, begin: Begin) -> Iterator[Frame]:
+    """Yield synthetic frames of the small VAD-tiny."""
+    length = given.scene_length or given.count
+    drawn = synthetic(SMALL.stack, given.count, given.seed, length, begin.frame)
+    for index, arrays in enumerate(drawn, begin.frame):
+        yield Frame(index, index % length == 0, dict(arrays))
 
 
 def judged(model: Path, dump: Path, frames: Path) -> tuple[DumpResult, float]:
@@ -185,16 +199,24 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--stateful", action="store_true", help="with dumped state only"
     )
     parser.add_argument("--alarms", action="store_true")
+    parser.add_argument("--small", action="store_true", help="of vad-tiny")
     options = parser.parse_args(argv)
     out: Path = options.out / options.stack
     out.mkdir(parents=True, exist_ok=True)
     source = out / f"{options.stack}.onnx"
     if not source.is_file():
-        export_stack(options.stack, source)
+        if options.small:
+            SMALL.export(source)
+        else:
+            export_stack(options.stack, source)
     seen, held_out = out / "seen", out / "frames"
     for folder, seed in ((seen, 0), (held_out, 5)):
-        if not folder.is_dir():
-            given = FramesOptions(options.frames, seed, options.scene)
+        if folder.is_dir():
+            continue
+        given = FramesOptions(options.frames, seed, options.scene)
+        if options.small:
+            write_recording(folder, partial(small_frames, given), {"seed": seed})
+        else:
             record_frames(options.stack, folder, given)
     recording = CalibrationSet(held_out)
     if options.alarms:

@@ -4,7 +4,7 @@
     python -m benchmarks.bench_road --routes routes.json
     python -m benchmarks.bench_road --fresh 1 --types Accident,T_Junction
     python -m benchmarks.bench_road --admission admission.json
-    python -m benchmarks.bench_road --compare float/ full/ float-4fps/
+    python -m benchmarks.bench_road --compare benchmarks/road_2/study/*/routes.csv
 
 The first three look at the set that ships, another, or so many proposals of each type:
 how many actors move within 80 m of the ego as a route begins (the median over routes),
@@ -12,11 +12,12 @@ and how often blind drivers of five speeds and the scenario's others meet, by ty
 also count types whose light shows a blind driver red or yellow, and those with a sign.
 Blind drivers decide ten times a second. ``--admission`` takes what ``routes --json``
 printed, and counts the proposals that were refused, by reason. The last compares
-results folders of one set: the share of routes with a driving score of exactly 100, how
-many routes do not end alike for all, frames and seconds of a route.
+kept drives of one set: the share of routes with a driving score of exactly 100, how
+many routes do not end alike for all, and both by type.
 """
 
 import argparse
+import csv
 import json
 import math
 from collections import Counter
@@ -31,10 +32,7 @@ from me2e_compress.evaluators.highway.generate import (
     propose,
     seed_of,
 )
-from me2e_compress.evaluators.highway.results import ResultsFolder, log_beside
 from me2e_compress.evaluators.highway.runner import Listeners, drive
-from me2e_compress.metrics.driving_score import route_score
-from me2e_compress.metrics.surrogate_safety import room_kept
 from me2e_compress.runtime.children import pool
 from me2e_compress.simulator.routes import SETS, Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
@@ -165,28 +163,50 @@ def admission(path: Path) -> None:
         print(f"{words} | {count}")
 
 
-def compare(folders: Sequence[Path]) -> None:
-    """Print how drives of one set differ."""
-    driven = [ResultsFolder.open(path).episodes() for path in folders]
-    scores = [
-        {name: route_score(one).composed for name, one in own.items()} for own in driven
-    ]
-    for path, own, episodes in zip(folders, scores, driven, strict=True):
-        whole = fmean(score == 100.0 for score in own.values())
-        room = [room_kept(one).value for one in episodes.values()]
-        room_100 = fmean(each == 100.0 for each in room)
-        known = [each for each in room if each is not None]
-        kept = f"{fmean(known):.1f} %" if known else "not recorded"
-        costs = [json.loads(line) for line in log_beside(path).open()]
-        frames, seconds = (fmean(e[k] for e in costs) for k in ("frames", "seconds"))
+def drives_of(
+    files: Sequence[Path],
+) -> dict[str, dict[str, tuple[float, float | None]]]:
+    """Read driving score and room kept by ``SCHEME.CONDITION`` and route."""
+    found = dict[str, dict[str, tuple[float, float | None]]]()
+    for path in files:
+        with path.open(encoding="utf-8", newline="") as file:
+            for row in csv.DictReader(file):
+                own = found.setdefault(f"{row['scheme']}.{row['condition']}", {})
+                room = row.get("room_kept_percent")
+                score = float(row["driving_score_percent"])
+                own[row["route"]] = score, float(room) if room else None
+    return found
+
+
+def compare(files: Sequence[Path]) -> None:
+    """Print how drives of one set differ, and where."""
+    drives = drives_of(files)
+    for name, own in drives.items():
+        scores = [score for score, _ in own.values()]
+        room = [each for _, each in own.values() if each is not None]
+        kept = f"{fmean(room):.1f} %" if room else "not recorded"
         print(
-            f"{path}: {len(own)} routes, {whole:.1%} at exactly 100 (room kept:"
-            f" {room_100:.1%}); DS {fmean(own.values()):.1f}, room kept {kept};"
-            f" {frames:.0f} frames and {seconds:.1f} s a route"
+            f"{name}: {len(own)} routes, {fmean(s == 100.0 for s in scores):.1%} at"
+            f" exactly 100; DS {fmean(scores):.1f}, room kept {kept}"
         )
-    shared = [name for name in scores[0] if all(name in own for own in scores)]
-    unlike = [name for name in shared if len({own[name] for own in scores}) > 1]
-    print(f"{len(unlike)} of {len(shared)} routes do not end alike for all")
+    shared = [
+        n for n in next(iter(drives.values())) if all(n in d for d in drives.values())
+    ]
+    unlike = {n for n in shared if len({own[n][0] for own in drives.values()}) > 1}
+    print(f"{len(unlike)} of {len(shared)} routes do not end alike for all\n")
+    print(f"type | {' | '.join(drives)} | not alike")
+    print("---|" * (1 + len(drives)) + "---")
+    for kind in dict.fromkeys(map(type_of, shared)):
+        own_routes = [each for each in shared if type_of(each) == kind]
+        means = (fmean(own[n][0] for n in own_routes) for own in drives.values())
+        told = " | ".join(f"{mean:.1f}" for mean in means)
+        parted = len(unlike.intersection(own_routes))
+        print(f"{kind} | {told} | {parted} of {len(own_routes)}")
+
+
+def type_of(route: str) -> str:
+    """Return the type of a route of either road: ``Accident_0``, ``Accident_R2_0``."""
+    return route.rpartition("_")[0].removesuffix("_R2")
 
 
 def main() -> None:
@@ -201,7 +221,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--admission", type=Path, help="what routes --json printed")
-    parser.add_argument("--compare", type=Path, nargs="+", help="results folders")
+    parser.add_argument("--compare", type=Path, nargs="+", help="routes.csv of drives")
     given = parser.parse_args()
     speeds = [float(each) for each in given.speeds.split(",")]
     if given.compare:

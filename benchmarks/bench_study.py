@@ -5,7 +5,8 @@
 
 Drives what OUT lacks, as ``me2e-compress study NAME -o OUT`` does: hours, and it goes
 on where it was ended. OUT/NAME gets its report; benchmarks/NAME (of a file the folder
-beside it that has its name) its tables and a line a route.
+beside it that has its name) its tables and a line a route; with ``--tables A`` they are
+kept in a folder A of it, so that what took hours lands by itself.
 """
 
 import argparse
@@ -23,8 +24,10 @@ from me2e_compress.study.write import write_study
 KEPT = Path(__file__).parent
 
 
-def keep(name: str, study: Study, out: Path, workers: int) -> None:
+def keep(name: str, part: str, study: Study, out: Path, workers: int) -> None:
     """Drive a study in a folder, and keep its tables and routes beside this file.
+
+    ``part`` names the blocks that are driven, if it is not all of them.
 
     Raises:
         Me2eError: The folder is another study's, or the baseline fails.
@@ -33,7 +36,8 @@ def keep(name: str, study: Study, out: Path, workers: int) -> None:
     command = ("python", "-m", "benchmarks.bench_study", name, str(out))
     written = write_study(found, out / Path(name).stem, command)
     folder = KEPT / name if Path(name).suffix == "" else Path(name).with_suffix("")
-    folder.mkdir(exist_ok=True)
+    folder /= part
+    folder.mkdir(parents=True, exist_ok=True)
     write_bytes(folder / "tables.md", written.tables.read_bytes())
     write_bytes(folder / "routes.csv", routes_csv(found).encode())
 
@@ -51,7 +55,8 @@ def main() -> None:
         study = load_study(given.study)
         if given.tables is not None:
             study = study.of_blocks(given.tables.split(","))
-        keep(given.study, study, given.out, given.workers)
+        part = (given.tables or "").replace(",", "-")
+        keep(given.study, part, study, given.out, given.workers)
     except Me2eError as error:
         sys.exit(f"bench_study: {error}")
 

@@ -97,7 +97,7 @@ def known() -> frozenset[Triple]:
     found = set[Triple]()
     folders = [DRIVER / each for each in ("baselines", "ablation", "pairs", "schemes")]
     folders += [DRIVER / each for each in ("scales", "latency")]
-    folders += [RECORDS / "road_2" / "study"]
+    folders += (RECORDS / "road_2" / "study").iterdir()
     for folder in folders:
         for drive in compared(kept_drives(folder / "routes.csv")):
             found.update(rounded(drive.mean()))
