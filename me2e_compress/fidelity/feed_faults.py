@@ -53,8 +53,14 @@ class StateFault(FeedFault):
         return feeds | {name: state[name] for name in self.names}
 
     def touches(self, fed: Fed, index: int) -> bool:
-        """Return whether a scene starts here, or does not."""
+        """Return whether a scene starts here, or does not.
+
+        What a late state is behind the first frame of a later scene, a host may have
+        cleared or not.
+        """
         starts = fed.frames[index].starts_scene
+        if self.how == "late" and index > 1 and fed.frames[index - 1].starts_scene:
+            return False
         return index > 0 and starts == (self.how == "carried")
 
 

@@ -13,7 +13,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity import feed_search
 from me2e_compress.fidelity.dump_readings import closeness, find_readings, undone
 from me2e_compress.fidelity.engine_run import EngineRun
-from me2e_compress.fidelity.feed_faults import Pixels, camera_orders
+from me2e_compress.fidelity.feed_faults import Pixels, StateFault, camera_orders
 from me2e_compress.fidelity.host_faults import HostFault, explain
 from me2e_compress.runtime.session import Session
 from tests.fidelity.hosts import MEAN, STD, Arrays, drive, frames, noisy, stack
@@ -112,6 +112,15 @@ def test_a_state_that_explains_much_does_not_hide_frames_that_are_shifted(
     found = feed_search.find_explanations(run, {}, {})
 
     assert [fault.kind for _, fault in found] == ["state-not-reset", "frames-shifted"]
+
+
+def test_behind_the_first_frame_of_a_later_scene_a_late_state_is_not_judged() -> None:
+    run = EngineRun(opened(), frames(), drive(opened(), frames()))
+    late = StateFault("state-late", "late", "late", ("prev",))
+
+    touched = [at for at in range(len(run)) if late.touches(run.fed, at)]
+
+    assert touched == [1, 2, 3, 6, 7]
 
 
 READS: dict[str, tuple[str, str, Callable[[Any], Any]]] = {
