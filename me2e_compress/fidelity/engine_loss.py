@@ -47,7 +47,8 @@ class _Sums:
             self.noise = math.nan
             return
         wide = np.asarray(truth, np.float64)
-        gap = wide - np.asarray(found, np.float64)
+        with np.errstate(invalid="ignore"):  # bytes that are read wrongly may be NaN
+            gap = wide - np.asarray(found, np.float64)
         self.known = True
         self.signal += float(np.vdot(wide, wide))
         self.noise += float(np.vdot(gap, gap))

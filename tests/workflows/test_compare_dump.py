@@ -90,6 +90,16 @@ def test_a_fault_is_told_apart_from_what_the_compiler_lost(files: Path) -> None:
     assert found.status == "warning"
 
 
+def test_bytes_that_read_as_signaling_nan_are_no_warning(files: Path) -> None:
+    shown = answered(files)
+    shown[3]["plan"].view(np.uint32)[0, 0, 0] = 0x0100807F  # a NaN in the other order
+    dumped(files, [each | {"plan": each["plan"].byteswap()} for each in shown])
+
+    found = compare_dump(files / "m.onnx", files / "dump", files / "frames")
+
+    assert [each.kind for each in found.faults] == ["dtype"]
+
+
 def test_quantization_is_what_the_graph_lost_to_its_source(tmp_path: Path) -> None:
     ir.save(ir.from_onnx_text(QUANTIZED), tmp_path / "small.onnx")
     ir.save(ir.from_onnx_text(FLOAT), tmp_path / "source.onnx")
