@@ -106,7 +106,8 @@ def hosts(stack: str) -> dict[str, Host]:
         return np.take(value, order, axis=axis)
 
     def channels_last(value: Any) -> Any:
-        return np.moveaxis(value, 1, -1).copy()
+        channels = next(at for at, size in enumerate(value.shape) if size > 1)
+        return np.moveaxis(value, channels, -1).copy()
 
     def blue_first(value: Any) -> Any:
         return ((value * std + mean)[:, :, ::-1] - mean) / std
