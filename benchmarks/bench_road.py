@@ -5,6 +5,7 @@
     python -m benchmarks.bench_road --fresh 1 --types Accident,T_Junction
     python -m benchmarks.bench_road --admission admission.json
     python -m benchmarks.bench_road --compare benchmarks/road_2/study/*/routes.csv
+        [--drives float.ideal,full.ideal]
 
 The first three look at the set that ships, another, or so many proposals of each type:
 how many actors move within 80 m of the ego as a route begins (the median over routes),
@@ -178,9 +179,10 @@ def drives_of(
     return found
 
 
-def compare(files: Sequence[Path]) -> None:
-    """Print how drives of one set differ, and where."""
+def compare(files: Sequence[Path], chosen: Sequence[str]) -> None:
+    """Print how drives of one set differ, and where; of some, or all that are kept."""
     drives = drives_of(files)
+    drives = {name: drives[name] for name in chosen or drives}
     for name, own in drives.items():
         scores = [score for score, _ in own.values()]
         room = [each for _, each in own.values() if each is not None]
@@ -222,10 +224,11 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--admission", type=Path, help="what routes --json printed")
     parser.add_argument("--compare", type=Path, nargs="+", help="routes.csv of drives")
+    parser.add_argument("--drives", default="", help="SCHEME.CONDITION; all")
     given = parser.parse_args()
     speeds = [float(each) for each in given.speeds.split(",")]
     if given.compare:
-        compare(given.compare)
+        compare(given.compare, [*filter(None, given.drives.split(","))])
     elif given.admission:
         admission(given.admission)
     elif given.fresh:
