@@ -2,12 +2,12 @@
 
 import abc
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
 import onnx_ir as ir
 
+from me2e_compress.graph.activations import value_bytes
 from me2e_compress.graph.shapes import Dims, open_shape, product
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values
@@ -102,13 +102,6 @@ class Operator(abc.ABC):
 
 def bytes_of(values: Sequence[ir.Value | None]) -> int | None:
     """Return the total bytes of values; None if a shape or type is unknown."""
-    total = 0
-    for value in values:
-        if value is None:
-            continue
-        shape = open_shape(value)
-        count = None if shape is None else product(shape)
-        if count is None or value.dtype is None:
-            return None
-        total += math.ceil(count * value.dtype.itemsize)
-    return total
+    sizes = [value_bytes(value) for value in values if value is not None]
+    known = [size for size in sizes if size is not None]
+    return sum(known) if len(known) == len(sizes) else None
