@@ -19,11 +19,9 @@ def restore(
     inherits from its nearest neighbour: the producer that comes last in
     the graph, else the consumer that comes first. Linear in nodes.
 
-    Args:
-        model: the tool's result, in graph order; changed in place.
-        like: the tool's input, its nodes with their provenance.
-        by: the pass to name in the provenance of new nodes.
-        node_names: restore the names of known nodes of the same operator too.
+    ``model`` is the tool's result, in graph order, and changed in place, ``like`` its
+    input; ``by`` is the pass to name in the provenance of new nodes. ``node_names``
+    restores the names of known nodes of the same operator too.
     """
     _merge(model.metadata_props, like.metadata_props)
     _merge(model.graph.metadata_props, like.graph.metadata_props)

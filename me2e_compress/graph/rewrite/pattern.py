@@ -226,12 +226,10 @@ def var(name: str, *, computed: bool = False) -> Variable:
 def constant(
     close_to: float | None = None, *, scalar: bool = False, floating: bool = True
 ) -> Constant:
-    """Build the pattern of a weight.
+    """Build the pattern of a weight, of floats unless ``floating`` is False.
 
-    Args:
-        close_to: the number that it holds, within a relative 1e-4; None for any.
-        scalar: True for one element only.
-        floating: False for any element type.
+    ``close_to`` is the number that it holds, within a relative 1e-4; ``scalar`` weights
+    have one element.
     """
     return Constant(close_to, scalar or close_to is not None, floating)
 
@@ -266,9 +264,7 @@ def either(*options: Pattern) -> Either:
 def moved(source: Pattern, *, shared: bool = False) -> Moved:
     """Build the pattern of an expression that Reshape and Transpose may have moved.
 
-    Args:
-        source: the expression.
-        shared: True where others may read what the layout operators make.
+    Others may read what these make if it is ``shared``.
     """
     return Moved(source, shared)
 
