@@ -127,10 +127,7 @@ class Sweep:
         return True
 
     def _touched(self, node: ir.Node) -> bool:
-        if all(
-            value.shape is not None and value.shape.is_static()
-            for value in node.outputs
-        ):
+        if all(static_shape(value) is not None for value in node.outputs):
             return False
         return any(
             value in self.learnt or value in self.known.maker
