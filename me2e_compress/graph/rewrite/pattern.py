@@ -242,15 +242,11 @@ def op(
     where: Callable[[ir.Node], bool] | None = None,
     domain: str = "",
 ) -> OperatorPattern:
-    """Build the pattern of an operator's first output.
+    """Build the pattern of the first output of an operator, or of one of several.
 
-    Args:
-        types: the operator, or several of which it is one.
-        inputs: its operands.
-        more: True where operands may follow that the pattern does not look at.
-        shared: True where others may read what it makes: it stays for them.
-        where: what else must hold of the node, of its attributes say.
-        domain: of the operator; that of ONNX by default.
+    ``more`` operands may follow that the pattern does not look at. Others may read what
+    a ``shared`` one makes: it stays for them. ``where`` says what else must hold of the
+    node, of its attributes say. The domain is that of ONNX by default.
     """
     names = (types,) if isinstance(types, str) else types
     return OperatorPattern(names, inputs, more, shared, where, domain)
