@@ -50,8 +50,6 @@ def from_graphsurgeon(
             error
         )
     _rename(model, {_spelled(key): key for key in like.functions if key[2]})
-    model.domain, model.doc_string = like.domain, like.doc_string
-    model.model_version = like.model_version
     restore(model, like, by=by)
     return model
 
