@@ -24,7 +24,7 @@ from me2e_compress.passes.eliminate_redundant.identities import moves_nothing
 
 _RESHAPING = VIEWS - {"Identity"}
 
-BROADCASTING = {*ELEMENTWISE, "Where"}
+BROADCASTING = frozenset({*ELEMENTWISE, "Where"})
 
 WIDENS: dict[ir.DataType, str] = {
     ir.DataType.BOOL: "UINT8 INT8 INT16 INT32 INT64 FLOAT16 FLOAT DOUBLE",

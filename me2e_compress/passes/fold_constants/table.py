@@ -113,15 +113,10 @@ def _reduces(node: ir.Node, inputs: Sequence[Any]) -> bool:
 
 
 _CHECKS: dict[str, Callable[[ir.Node, Sequence[Any]], bool]] = {
+    **dict.fromkeys(("ConstantOfShape", "Expand"), _fills),
+    **dict.fromkeys(("Div", "Mod"), _divides),
+    **dict.fromkeys(("ReduceMax", "ReduceMin", "ReduceProd", "ReduceSum"), _reduces),
     "Cast": _casts,
-    "ConstantOfShape": _fills,
-    "Div": _divides,
-    "Expand": _fills,
-    "Mod": _divides,
     "NonZero": lambda node, inputs: inputs[0].ndim > 0,
     "Range": _counts,
-    "ReduceMax": _reduces,
-    "ReduceMin": _reduces,
-    "ReduceProd": _reduces,
-    "ReduceSum": _reduces,
 }
