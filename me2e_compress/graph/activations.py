@@ -1,6 +1,7 @@
 """What nodes write in a frame: the bytes of activations as they lie in memory."""
 
 import math
+from collections.abc import Iterable
 
 import onnx_ir as ir
 
@@ -19,6 +20,13 @@ def value_bytes(value: ir.Value) -> int | None:
     if shape is None or value.dtype is None:
         return None
     return math.ceil(math.prod(shape) * value.dtype.itemsize)
+
+
+def total_bytes(values: Iterable[ir.Value]) -> int | None:
+    """Return the bytes of values; None where a shape or type is open."""
+    sizes = [value_bytes(value) for value in values]
+    known = [size for size in sizes if size is not None]
+    return sum(known) if len(known) == len(sizes) else None
 
 
 def as_written(value: ir.Value) -> ir.Value:
@@ -44,9 +52,7 @@ def activation_bytes(node: ir.Node) -> int | None:
     """
     if node.op_type in _WRITE_NOTHING or _is_written_before(node):
         return 0
-    sizes = [value_bytes(as_written(value)) for value in node.outputs if value.name]
-    known = [size for size in sizes if size is not None]
-    return sum(known) if len(known) == len(sizes) else None
+    return total_bytes(as_written(value) for value in node.outputs if value.name)
 
 
 def _is_written_before(node: ir.Node) -> bool:

@@ -48,9 +48,7 @@ def check_text(where: str, texts: Iterable[str]) -> None:
 def check_port(port: onnx.ValueInfoProto, *, typed: bool) -> None:
     """Check a type; a size below 0 becomes an open one, a type of nothing none.
 
-    Args:
-        port: an input, an output or a value in between.
-        typed: whether it must say what it is, as the inputs of a graph must.
+    ``typed`` ports must say what they are, as the inputs of a graph must.
 
     Raises:
         GraphError: it is no tensor, sequence or optional, or of an unknown element.
@@ -128,11 +126,7 @@ def check_signature(node: onnx.NodeProto, versions: Mapping[str, int]) -> None:
     """Check a node of ONNX's own against its operator, by ONNX's checker.
 
     One that nobody knows, as plugins are, takes anything, and so does an operator that
-    ONNX gave up: runtimes may have it still.
-
-    Args:
-        node: the node.
-        versions: opset of every domain.
+    ONNX gave up: runtimes may have it still. ``versions`` are opsets by domain.
 
     Raises:
         GraphError: too many or too few inputs or outputs, or an attribute that is

@@ -31,14 +31,8 @@ def infer_node(
 ) -> Mapping[str, onnx.TypeProto]:
     """Infer what a node of ONNX's own gives; return the types of outputs by name.
 
-    Args:
-        node: whose inputs say what types and shapes they have.
-        opset: the version of ONNX's own operators.
-        known: what an input holds, if that is known.
-        instead: values to be read in the place of inputs.
-
-    Returns:
-        Nothing where an input has no type, or ONNX has no such operator.
+    That is nothing where an input has no type, or ONNX has no such operator. ``known``
+    tells what an input holds; ``instead`` are values to be read in the place of inputs.
 
     Raises:
         InferenceError: the node does not take what it reads.

@@ -19,6 +19,12 @@ VIEWS = frozenset({"Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"})
 LAYOUT_OPERATORS = VIEWS | {"Transpose"}
 """Operators that move elements and do nothing else to them."""
 
+ELEMENTWISE = (
+    *("Add", "And", "Div", "Equal", "Greater", "GreaterOrEqual", "Less"),
+    *("LessOrEqual", "Max", "Min", "Mul", "Or", "Pow", "Sub", "Xor"),
+)
+"""Element-wise operators of two operands, which broadcast."""
+
 DRAWS = frozenset(
     {
         *("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike"),
@@ -162,6 +168,13 @@ Numbers: TypeAlias = npt.NDArray[np.float64]
 FLOATS = frozenset({ir.DataType.DOUBLE, ir.DataType.FLOAT, ir.DataType.FLOAT16})
 """The floating-point types that numpy itself computes with."""
 
+NATIVE = FLOATS | {
+    *(ir.DataType.BOOL, ir.DataType.INT8, ir.DataType.INT16, ir.DataType.INT32),
+    *(ir.DataType.INT64, ir.DataType.UINT8, ir.DataType.UINT16, ir.DataType.UINT32),
+    ir.DataType.UINT64,
+}
+"""All element types that numpy itself computes with."""
+
 CLOSE = 1e-4
 """How near a constant must be to the textbook's, relative: 0.7071 is 1/sqrt 2."""
 
@@ -172,6 +185,13 @@ def maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:
     if node is None or not is_standard(node) or node.op_type not in op_types:
         return None
     return node
+
+
+def unrenamed(value: ir.Value) -> ir.Value:
+    """Follow a value back through Identity nodes."""
+    while (node := maker(value, "Identity")) is not None and node.inputs[0]:
+        value = node.inputs[0]
+    return value
 
 
 def sole_maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:

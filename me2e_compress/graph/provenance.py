@@ -73,12 +73,7 @@ def inherit(node: ir.Node, sources: Iterable[ir.Node], *, by: str) -> None:
     """Write the provenance of a new or changed node: that of the nodes it replaces.
 
     Origins are united in order; the module is the first source's, the rule being
-    that the node whose value lives on is named first.
-
-    Args:
-        node: the node that a pass made or changed.
-        sources: the nodes it stands for, the leading one first.
-        by: the pass's name.
+    that the node whose value lives on is named first. ``by`` is the pass's name.
     """
     pasts = [past for source in sources if (past := read(source)) is not None]
     if not pasts:
@@ -110,11 +105,6 @@ def unstamped(before: ir.Model, after: ir.Model, by: str) -> list[str]:
     A node is changed where its operator or an attribute is another; reading another
     value of the same meaning is no change of its own. Empty where the graph before
     says nothing of its nodes: they may have no names yet to be known by.
-
-    Args:
-        before: the graph that the pass was given.
-        after: the graph that it returned.
-        by: the pass's name.
     """
     if missing(before):
         return []

@@ -12,19 +12,19 @@ def restore(
 ) -> None:
     """Restore metadata and provenance in a graph that a tool has rewritten.
 
-    onnxsim and onnx-graphsurgeon drop the metadata of models, functions, nodes and
-    values. Here a node is known again by the name of its first output, then by its own
-    name. One of the same operator gets all its metadata back; one of another operator
-    now inherits from that and from the nodes that vanished above it; one that is new
-    inherits from its nearest neighbour: the producer that comes last in
-    the graph, else the consumer that comes first. Linear in nodes.
+    onnxsim and onnx-graphsurgeon drop what models say of themselves, and the metadata
+    of functions, nodes and values. Here a node is known again by the name of its first
+    output, then by its own name. One of the same operator gets all its metadata back;
+    one of another operator now inherits from that and from the nodes that vanished
+    above it; one that is new inherits from its nearest neighbour: the producer that
+    comes last in the graph, else the consumer that comes first. Linear in nodes.
 
-    Args:
-        model: the tool's result, in graph order; changed in place.
-        like: the tool's input, its nodes with their provenance.
-        by: the pass to name in the provenance of new nodes.
-        node_names: restore the names of known nodes of the same operator too.
+    ``model`` is the tool's result, in graph order, and changed in place, ``like`` its
+    input; ``by`` is the pass to name in the provenance of new nodes. ``node_names``
+    restores the names of known nodes of the same operator too.
     """
+    model.domain, model.doc_string = like.domain, like.doc_string
+    model.model_version = like.model_version
     _merge(model.metadata_props, like.metadata_props)
     _merge(model.graph.metadata_props, like.graph.metadata_props)
     for key, function in model.functions.items():

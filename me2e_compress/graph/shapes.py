@@ -49,11 +49,8 @@ def infer_shapes(
     so do the inputs and the order of the initializers in any case. Of the outputs,
     dimensions that the file leaves open become numbers: an exporter's symbol
     (``Gathery_dim_0``) hides what is known, and shape arithmetic behind it would stay.
-
-    Args:
-        model: the graph.
-        strict: refuse shapes that contradict each other.
-        written: this very graph by :func:`without_weights`; None writes it.
+    ``strict`` refuses shapes that contradict each other; ``written`` is this very graph
+    by :func:`without_weights`, None writes it.
 
     Raises:
         onnx.shape_inference.InferenceError: strict, and shapes contradict each other.
@@ -226,11 +223,7 @@ def extent(node: ir.Node, *, weight: bool) -> Extent:
     A weight of shape [K, N] (or [1, ..., K, N]) is shared by every row, whatever the
     rank of the left operand: [1, 1, 256] x [256, 12] has one row, and so does
     [1, 256] x [256, 12]. Where the right operand differs from batch to batch, the rows
-    of one batch count.
-
-    Args:
-        node: the product.
-        weight: whether its right operand is constant.
+    of one batch count. ``weight`` tells whether that operand is constant.
     """
     left, right = open_shape(node.inputs[0]), open_shape(node.inputs[1])
     if node.op_type == "Gemm":

@@ -189,20 +189,14 @@ def _attention(node: ir.Node) -> int | None:
 
 
 _RULES: dict[str, Counter] = {
+    **dict.fromkeys(("Conv", "ConvInteger", "DeformConv"), _conv(1)),
+    **dict.fromkeys(("GRU", "LSTM", "RNN"), _recurrent),
+    **dict.fromkeys(("MatMul", "MatMulInteger", "QLinearMatMul"), _matmul),
     "Attention": _attention,
-    "Conv": _conv(1),
-    "ConvInteger": _conv(1),
     "ConvTranspose": _conv_transpose,
-    "DeformConv": _conv(1),
     "Einsum": _einsum,
-    "GRU": _recurrent,
     "Gemm": _gemm,
-    "LSTM": _recurrent,
-    "MatMul": _matmul,
-    "MatMulInteger": _matmul,
     "QLinearConv": _conv(3),
-    "QLinearMatMul": _matmul,
-    "RNN": _recurrent,
 }
 
 

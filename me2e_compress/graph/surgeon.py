@@ -35,10 +35,8 @@ def from_graphsurgeon(
 ) -> ir.Model:
     """Return the model of a ``gs.Graph``, with the metadata of the one it came from.
 
-    Args:
-        gs_graph: the graph; its nodes may be in any order.
-        like: the model that was given to :func:`to_graphsurgeon`.
-        by: the pass to name in the provenance of new nodes.
+    Its nodes may be in any order. ``like`` was given to :func:`to_graphsurgeon`, ``by``
+    is the pass to name in the provenance of new nodes.
 
     Raises:
         GraphError: the graph has a cycle, or an input or output without a type.
@@ -52,8 +50,6 @@ def from_graphsurgeon(
             error
         )
     _rename(model, {_spelled(key): key for key in like.functions if key[2]})
-    model.domain, model.doc_string = like.domain, like.doc_string
-    model.model_version = like.model_version
     restore(model, like, by=by)
     return model
 

@@ -26,14 +26,10 @@ def refusal(
     """Return why ONNX's checker refuses a graph, in one line; None if it takes it.
 
     An output without a shape is let pass: exporters leave out what they do not know,
-    behind a plugin for one, and every runtime takes that.
-
-    Args:
-        model: the graph; it stays as it is.
-        plugins: whether operators of the default domain that ONNX does not have are
-            taken for plugins, as TensorRT takes them.
-        written: this very graph by :func:`~me2e_compress.graph.shapes.without_weights`;
-            None writes it.
+    behind a plugin for one, and every runtime takes that. With ``plugins``, operators
+    of the default domain that ONNX does not have are taken for such, as TensorRT does.
+    ``written`` is this very graph by
+    :func:`~me2e_compress.graph.shapes.without_weights`; None writes it.
     """
     try:
         if written is None:

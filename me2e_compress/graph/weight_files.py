@@ -175,11 +175,9 @@ _PLAIN = frozenset(
 
 
 def write_inline(model: ir.Model, path: Path) -> None:
-    """Write a model with all its weights in one file.
+    """Write a model with all its weights in one file; none of them is external.
 
-    Args:
-        model: with no weights in files of their own; it stays as it is.
-        path: the file.
+    The model stays as it is.
     """
     large = {
         value: value.const_value

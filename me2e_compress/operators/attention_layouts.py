@@ -10,7 +10,7 @@ import onnx_ir as ir
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import array_of
 from me2e_compress.graph.nodes import maker, permutation_of
-from me2e_compress.graph.shapes import Dims, static_shape
+from me2e_compress.graph.shapes import Dims, product, static_shape
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values, present
 
@@ -40,9 +40,7 @@ class JoinedHeads(Dialect):
 
     def shape_from_own(self, shape: Dims) -> Dims:
         """Join the heads."""
-        heads, width = shape[2], shape[3]
-        known = None if heads is None or width is None else heads * width
-        return (*shape[:2], known)
+        return (*shape[:2], product(shape[2:]))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,12 +2,12 @@
 
 import abc
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
 import onnx_ir as ir
 
+from me2e_compress.graph.activations import total_bytes
 from me2e_compress.graph.shapes import Dims, open_shape, product
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values
@@ -95,20 +95,5 @@ class Operator(abc.ABC):
         """Return the cost of one call as far as the shapes are known."""
         shapes = dialect.shapes_to_own([open_shape(value) for value in node.inputs])
         attributes = dialect.options_to_own(dialect.attributes_of(node))
-        return Cost(
-            self.macs(shapes, attributes), bytes_of((*node.inputs, node.outputs[0]))
-        )
-
-
-def bytes_of(values: Sequence[ir.Value | None]) -> int | None:
-    """Return the total bytes of values; None if a shape or type is unknown."""
-    total = 0
-    for value in values:
-        if value is None:
-            continue
-        shape = open_shape(value)
-        count = None if shape is None else product(shape)
-        if count is None or value.dtype is None:
-            return None
-        total += math.ceil(count * value.dtype.itemsize)
-    return total
+        values = filter(None, (*node.inputs, node.outputs[0]))
+        return Cost(self.macs(shapes, attributes), total_bytes(values))

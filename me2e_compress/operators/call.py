@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
-import onnx
 import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import array_of, provenance
+from me2e_compress.graph.node_inference import REFUSALS, infer_node
 from me2e_compress.graph.nodes import Array
 from me2e_compress.graph.rewrite import add_constant, fresh_name, value_names
 
@@ -16,8 +16,6 @@ AttributeValue: TypeAlias = int | float | str | Sequence[int]
 Attributes: TypeAlias = Mapping[str, AttributeValue]
 Size: TypeAlias = int | ir.Value
 """One dimension: a number, or an int64 value of shape [1] that holds it at run time."""
-
-_INT64 = ir.DataType.INT64
 
 
 class FusedCall:
@@ -228,43 +226,27 @@ def names_in(where: ir.Graph | ir.Function) -> set[str]:
     return {*values, *(value.name or "" for value in where.inputs)}
 
 
-def _typed(value: ir.Value) -> bool:
+def _type(value: ir.Value) -> None:
+    """Write the type and shape of a constant."""
     known = array_of(value)
-    if known is None:
-        return False
-    value.type = ir.TensorType(ir.DataType.from_numpy(known.dtype))
-    value.shape = ir.Shape(known.shape)
-    return True
+    if known is not None:
+        value.type = ir.TensorType(ir.DataType.from_numpy(known.dtype))
+        value.shape = ir.Shape(known.shape)
+
+
+def _whole(value: ir.Value) -> Array | None:
+    """Return the integers of a constant: axes, sizes and shapes."""
+    return array_of(value) if value.dtype == ir.DataType.INT64 else None
 
 
 def _infer(node: ir.Node, opset: int) -> None:
-    """Infer a node's outputs from the types of its operands and small constants."""
-    if node.domain or not onnx.defs.has(node.op_type, opset, ""):
-        return
-    written = ir.to_proto(node)
-    types: dict[str, onnx.TypeProto] = {}
-    data: dict[str, onnx.TensorProto] = {}
-    # Every input needs a type; integer constants are shown too
+    """Infer a node's outputs from the types of its operands and integer constants."""
     for value in node.inputs:
-        if value is None or not value.name:
-            continue
-        if value.type is None and not _typed(value):
-            return  # what the operands are of decides what the result is of
-        info = ir.to_proto(value)
-        types[value.name] = info.type
-        known = array_of(value) if value.dtype == _INT64 else None
-        if known is not None:
-            data[value.name] = onnx.numpy_helper.from_array(known)
-    schema = onnx.defs.get_schema(node.op_type, opset, "")
+        if value is not None and value.type is None:
+            _type(value)
     try:
-        found = onnx.shape_inference.infer_node_outputs(
-            schema,
-            written,
-            types,
-            data,
-            opset_imports=[onnx.helper.make_opsetid("", opset)],
-        )
-    except onnx.shape_inference.InferenceError:
+        found = infer_node(node, opset, known=_whole)
+    except REFUSALS:
         return
     for value in node.outputs:
         kind = found.get(value.name or "")

@@ -11,6 +11,11 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
+import onnx_ir as ir
+
+from me2e_compress.graph import static_shape
+from me2e_compress.graph.nodes import LAYOUT_OPERATORS, permutation_of
+
 
 @dataclasses.dataclass(frozen=True)
 class Digit:
@@ -72,6 +77,19 @@ def regrouped(layout: Layout, shape: Sequence[int]) -> Layout | None:
             size //= digit.size
         found.append(tuple(taken))
     return None if rest else tuple(found)
+
+
+def before(node: ir.Node, layout: Layout) -> Layout | None:
+    """Return the layout of what a node reads, from that of what it gives.
+
+    None if it is no layout operator, a shape is unknown, or a Reshape breaks digits up.
+    """
+    shape, order = static_shape(node.inputs[0]), permutation_of(node)
+    if shape is None or node.op_type not in LAYOUT_OPERATORS:
+        return None
+    if node.op_type != "Transpose" or order is None:
+        return regrouped(layout, shape)
+    return tuple(layout[order.index(axis)] for axis in range(len(order)))
 
 
 def merged(digits: Iterable[Digit]) -> Digits:

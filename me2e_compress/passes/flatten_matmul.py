@@ -13,6 +13,7 @@ from me2e_compress.graph.activations import value_bytes
 from me2e_compress.graph.nodes import VIEWS
 from me2e_compress.graph.rewrite import graphs_of, remove_dead, value_names
 from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.hoist_linear.node_writer import NodeWriter
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.row_moves import broadcasts
 from me2e_compress.passes.work import (
@@ -176,67 +177,44 @@ def _form(
     )
 
 
+class _Writer(NodeWriter):
+    """Writes around a product; constants that only it reads stay constants."""
+
+    def __init__(self, rewriter: Rewriter, product: ir.Node) -> None:
+        super().__init__(rewriter, (product,), product.outputs[0].name)
+
+    def shape(self, value: ir.Value, shape: Shape) -> ir.Value:
+        """Return a value in another shape."""
+        known = array_of(value)
+        owned = len(value.uses()) == 1 and not value.is_graph_output()
+        if known is None or not owned or static_shape(value) == shape:
+            return super().shape(value, shape)
+        return self.rewriter.store(known.reshape(shape), value.name or "constant")
+
+
 def _write(product: ir.Node, form: _Form, rewriter: Rewriter) -> ir.Node:
-    old = product.outputs[0]
+    old, writer = product.outputs[0], _Writer(rewriter, product)
     # Both operands as they are multiplied
     rows = form.rows
     if form.moves:
-        rows = _viewed(rows, form.axes, product, rewriter)
-        rows = _transposed(rows, form.order, product, rewriter)
-    rows = _viewed(rows, form.rows_shape, product, rewriter)
+        rows = writer.transpose(writer.shape(rows, form.axes), form.order)
+    rows = writer.shape(rows, form.rows_shape)
     shape = _turned(form.matrix_shape) if form.turned else form.matrix_shape
-    matrix = _viewed(form.matrix, shape, product, rewriter)
+    matrix = writer.shape(form.matrix, shape)
     if form.turned:
         rank = len(shape)
-        order = (*range(rank - 2), rank - 1, rank - 2)
-        matrix = _transposed(matrix, order, product, rewriter)
-    new = rewriter.write(
-        "MatMul", [rows, matrix], [], form.shape, sources=(product,), like=old
-    )
+        matrix = writer.transpose(matrix, (*range(rank - 2), rank - 1, rank - 2))
+    new = writer.write("MatMul", [rows, matrix], form.shape)
     node = new.producer()
     assert node is not None
     # The product as it was
     if form.moves:
         sizes = (*form.sorted_axes[form.batch : -1], form.shape[-1])
-        new = _viewed(new, (*form.shape[: form.batch], *sizes), product, rewriter)
-        back = tuple(form.order.index(axis) for axis in range(len(form.order)))
-        new = _transposed(new, back, product, rewriter)
-    rewriter.swap(old, _viewed(new, static_shape(old) or (), product, rewriter))
+        new = writer.shape(new, (*form.shape[: form.batch], *sizes))
+        back = [form.order.index(axis) for axis in range(len(form.order))]
+        new = writer.transpose(new, back)
+    rewriter.swap(old, writer.shape(new, static_shape(old) or ()))
     return node
-
-
-def _transposed(
-    value: ir.Value, order: tuple[int, ...], product: ir.Node, rewriter: Rewriter
-) -> ir.Value:
-    shape = static_shape(value) or ()
-    result = rewriter.write(
-        "Transpose",
-        [value],
-        [ir.AttrInt64s("perm", order)],
-        tuple(shape[axis] for axis in order),
-        sources=(product,),
-        like=product.outputs[0],
-    )
-    result.type = value.type
-    return result
-
-
-def _viewed(
-    value: ir.Value, shape: Shape, product: ir.Node, rewriter: Rewriter
-) -> ir.Value:
-    """Return a value in another shape: a constant again where only this reads it."""
-    if static_shape(value) == shape:
-        return value
-    known = array_of(value)
-    if known is not None and len(value.uses()) == 1 and not value.is_graph_output():
-        return rewriter.store(known.reshape(shape), value.name or "constant")
-    old = product.outputs[0]
-    target = rewriter.target(shape, f"{old.name}_shape")
-    view = rewriter.write(
-        "Reshape", [value, target], [], shape, sources=(product,), like=old
-    )
-    view.type = value.type
-    return view
 
 
 def _read_unrepeated(product: ir.Node, rewriter: Rewriter) -> int:
@@ -254,7 +232,7 @@ def _read_unrepeated(product: ir.Node, rewriter: Rewriter) -> int:
         batch = np.broadcast_shapes(*(shape[:-2] for shape in pair))
         same = batch == np.broadcast_shapes(*(shape[:-2] for shape in shapes))
         if small[-2:] == shapes[index][-2:] and same:
-            view = _viewed(source, small, product, rewriter)
+            view = _Writer(rewriter, product).shape(source, small)
             product.replace_input_with(index, view)
             rewriter.drop(value)
             count += 1

@@ -41,6 +41,11 @@ def small_products(left: tuple[int, ...], right: tuple[int, ...]) -> int:
     return math.prod(np.broadcast_shapes(left[:-2], right[:-2]))
 
 
+def item_bytes(value: ir.Value) -> float:
+    """Return the bytes of an element; those of float32 where the type is unknown."""
+    return 4.0 if value.dtype is None else value.dtype.itemsize
+
+
 def work(node: ir.Node) -> float:
     """Return the cost of a node per frame in node starts: 1 plus its work.
 

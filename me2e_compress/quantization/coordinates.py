@@ -13,12 +13,8 @@ from me2e_compress.quantization.geometry import depth, is_few
 
 _POSITIONS: dict[str, tuple[int, ...]] = {
     "DeformConv": (2,),
-    "Gather": (1,),
-    "GatherElements": (1,),
-    "GatherND": (1,),
-    "GridSample": (1,),
-    "ScatterElements": (1,),
-    "ScatterND": (1,),
+    **dict.fromkeys(("Gather", "GatherElements", "GatherND", "GridSample"), (1,)),
+    **dict.fromkeys(("ScatterElements", "ScatterND"), (1,)),
 }
 """Which inputs of standard operators say where to look."""
 

@@ -171,3 +171,8 @@ def _check_keys(text: str) -> None:
         after_dot = False
         if parts > KEY_PARTS:
             raise MalformedError(f"a key has more than {KEY_PARTS} parts")
+
+
+def toml_string(text: str) -> str:
+    """Write a TOML string: JSON's escapes are valid in TOML, except for delete."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

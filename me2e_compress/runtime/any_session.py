@@ -51,12 +51,10 @@ class AnySession(Protocol):
         *,
         first: bool = False,
     ) -> dict[str, Array]:
-        """Run one inference.
+        """Run one inference; return all outputs, or those that are named.
 
-        Args:
-            feeds: one array for every input; other names are ignored.
-            outputs: the outputs to return; None returns all.
-            first: whether a scene begins here; it decides which files of a stack run.
+        ``feeds`` has one array for every input; other names are ignored. Which files of
+        a stack run depends on whether a scene begins here, ``first``.
 
         Raises:
             FramesError: an input is missing or has the wrong type or shape.

@@ -6,14 +6,13 @@ result (measured by SparseDriveV2's deployment).
 """
 
 import dataclasses
-import math
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, producer_of
 from me2e_compress.graph.nodes import maker
-from me2e_compress.graph.shapes import open_shape
+from me2e_compress.graph.shapes import open_shape, product
 from me2e_compress.operators import FusedCall
 
 _SUFFIX = {ir.DataType.INT8: "Int8", ir.DataType.UINT8: "Uint8"}
@@ -98,15 +97,13 @@ def _stored(value: ir.Value | None, channels: int | None) -> _Stored | None:
 
 def _size(value: ir.Value) -> int | None:
     dims = open_shape(value)
-    known = [dim for dim in dims or () if dim is not None]
-    return math.prod(known) if dims is not None and len(known) == len(dims) else None
+    return None if dims is None else product(dims)
 
 
 def _channels(value: ir.Value) -> int | None:
     """Return heads times channels of a value [N, S, M, D]."""
     dims = open_shape(value)
-    heads, width = dims[2:] if dims is not None and len(dims) == 4 else (None, None)
-    return None if heads is None or width is None else heads * width
+    return None if dims is None or len(dims) != 4 else product(dims[2:])
 
 
 def _remove_unread(node: ir.Node | None) -> None:

@@ -8,6 +8,8 @@ from typing import Self
 
 import psutil
 
+from me2e_compress.runtime.children import cpu_seconds
+
 BUSY = 0.1
 """Share of the cores that other processes may take before a latency is in doubt: they
 move our threads between cores and evict caches long before all cores are taken."""
@@ -56,7 +58,7 @@ class OthersLoad:
         ours: Callable[[], float] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._machine, self._ours = machine or _machine_s, ours or _ours_s
+        self._machine, self._ours = machine or _machine_s, ours or cpu_seconds
         self._clock = clock
         self.load: Load | None = None
 
@@ -82,7 +84,3 @@ def _machine_s() -> float:
     idle = times.idle + getattr(times, "iowait", 0.0)
     guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)
     return float(sum(times) - idle - guests)  # guests are in user and nice already
-
-
-def _ours_s() -> float:
-    return sum(os.times()[:4])

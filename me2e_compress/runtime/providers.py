@@ -77,7 +77,7 @@ class Provider(abc.ABC):
 
     def claims(self, op_type: str) -> bool:
         """Return whether a user's library names an operator, and so runs it."""
-        return any(_holds(each, op_type.encode()) for each in self.plugins)
+        return any(holds(each, op_type.encode()) for each in self.plugins)
 
     def is_installed(self) -> bool:
         """Return whether this onnxruntime has it; its device may still be missing."""
@@ -217,7 +217,7 @@ class TensorRtProvider(Provider):
     @staticmethod
     def _is_tensorrts(library: Path) -> bool:
         """Return whether a library lacks onnxruntime operators, without running it."""
-        return library.is_file() and not _holds(library, _ENTRY)
+        return library.is_file() and not holds(library, _ENTRY)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,15 +259,15 @@ class TensorRtRtxProvider(Provider):
         """Return None: the options of the session name its device."""
 
 
-def _holds(library: Path, word: bytes) -> bool:
-    """Return whether a file holds these bytes, without running it."""
-    if not library.is_file() or not library.stat().st_size:
+def holds(path: Path, *words: bytes) -> bool:
+    """Return whether a file holds some of these bytes, without running it."""
+    if not path.is_file() or not path.stat().st_size:
         return False
     with (
-        library.open("rb") as file,
+        path.open("rb") as file,
         mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
     ):
-        return content.find(word) >= 0
+        return any(content.find(word) >= 0 for word in words)
 
 
 CPU = CpuProvider()

@@ -19,7 +19,13 @@ from onnxruntime.capi import (
 
 from me2e_compress import graph, operators
 from me2e_compress.errors import GraphError, PreconditionError
-from me2e_compress.graph.nodes import array_of, bodies_of, input_at, is_standard, maker
+from me2e_compress.graph.nodes import (
+    array_of,
+    bodies_of,
+    input_at,
+    is_standard,
+    unrenamed,
+)
 from me2e_compress.graph.rewrite import value_names
 from me2e_compress.operators import OWN_DOMAIN, kernels
 from me2e_compress.runtime.float_products import write_float_products
@@ -193,7 +199,7 @@ def _rounds(node: ir.Node) -> float:
     if len(body.inputs) < 2 or not body.outputs:
         return 1
     # Both conditions must be constantly true, or passed through unchanged.
-    goes_on = _origin(body.outputs[0])
+    goes_on = unrenamed(body.outputs[0])
     first = input_at(node, 1)
     if first is not None and not _is_true(first):
         return 1
@@ -207,15 +213,8 @@ def _rounds(node: ir.Node) -> float:
 
 
 def _is_true(value: ir.Value) -> bool:
-    array = array_of(_origin(value))
+    array = array_of(unrenamed(value))
     return array is not None and array.size == 1 and bool(array.item())
-
-
-def _origin(value: ir.Value) -> ir.Value:
-    """Follow a value back through Identity nodes."""
-    while (node := maker(value, "Identity")) is not None and node.inputs[0]:
-        value = node.inputs[0]
-    return value
 
 
 def unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:

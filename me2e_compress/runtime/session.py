@@ -9,6 +9,7 @@ import onnx_ir as ir
 import onnxruntime as ort
 
 from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.graph.nodes import NATIVE
 from me2e_compress.graph.recurrence import SessionPort, not_fed_back, recurrence
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
@@ -31,19 +32,9 @@ __all__ = [
 ]
 
 DTYPES: Mapping[str, np.dtype[np.generic]] = {
-    "tensor(float)": np.dtype(np.float32),
-    "tensor(double)": np.dtype(np.float64),
-    "tensor(float16)": np.dtype(np.float16),
-    "tensor(int8)": np.dtype(np.int8),
-    "tensor(int16)": np.dtype(np.int16),
-    "tensor(int32)": np.dtype(np.int32),
-    "tensor(int64)": np.dtype(np.int64),
-    "tensor(uint8)": np.dtype(np.uint8),
-    "tensor(uint16)": np.dtype(np.uint16),
-    "tensor(uint32)": np.dtype(np.uint32),
-    "tensor(uint64)": np.dtype(np.uint64),
-    "tensor(bool)": np.dtype(np.bool_),
+    f"tensor({kind.name.lower()})": kind.numpy() for kind in NATIVE
 }
+"""Element types by onnxruntime's word for them."""
 
 
 _SHRINK = "memory.enable_memory_arena_shrinkage"

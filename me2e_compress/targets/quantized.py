@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.graph.nodes import maker
 from me2e_compress.quantization.plan.decision import METADATA
 
 QUANTIZE, DEQUANTIZE = PAIR = ("QuantizeLinear", "DequantizeLinear")
@@ -31,12 +32,12 @@ def pairs_of(model: ir.Model) -> Iterator[ir.Node]:
 
 def is_quantized(value: ir.Value | None) -> bool:
     """Return whether a value is the output of a QuantizeLinear."""
-    return _comes_from(value, QUANTIZE)
+    return maker(value, QUANTIZE) is not None
 
 
 def is_dequantized(value: ir.Value | None) -> bool:
     """Return whether a value is the output of a DequantizeLinear."""
-    return _comes_from(value, DEQUANTIZE)
+    return maker(value, DEQUANTIZE) is not None
 
 
 def describe_quantized(model: ir.Model) -> str | None:
@@ -58,11 +59,6 @@ def describe_quantized(model: ir.Model) -> str | None:
     elif model.producer_name:
         parts.append(f"made by {model.producer_name}")
     return "; ".join(parts)
-
-
-def _comes_from(value: ir.Value | None, op: str) -> bool:
-    node = graph.producer_of(value)
-    return node is not None and graph.is_standard(node) and node.op_type == op
 
 
 def _grid(model: ir.Model) -> str:

@@ -9,9 +9,8 @@ from me2e_compress.graph.modules.assignment import Assignment, Placement
 from me2e_compress.graph.modules.detect import behind_a_prefix
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.modules.paths import parameter_path, scope_of
-
-STAMP = "me2e.module"
-"""Node metadata that holds the module in a graph that was imported before."""
+from me2e_compress.graph.nodes import has_subgraph
+from me2e_compress.graph.provenance import MODULE
 
 
 def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
@@ -37,7 +36,7 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
     placed = {
         node: Placement(module, "stamp")
         for node in nodes
-        if (module := node.metadata_props.get(STAMP)) in modules.names()
+        if (module := node.metadata_props.get(MODULE)) in modules.names()
         and module is not None
     }
     scopes = {node: scope_of(node) for node in nodes}
@@ -166,7 +165,7 @@ def is_constant(nodes: Sequence[ir.Node]) -> frozenset[ir.Node]:
     """Return the nodes that compute from constants alone; nodes come in graph order."""
     found: set[ir.Node] = set()
     for node in nodes:
-        if _holds_a_graph(node):
+        if has_subgraph(node):
             continue
         if all(_known(value, found) for value in node.inputs if value is not None):
             found.add(node)
@@ -254,8 +253,3 @@ def _known(value: ir.Value, constant: Collection[ir.Node]) -> bool:
     if producer is None:
         return value.is_initializer() and not value.is_graph_input()
     return producer in constant
-
-
-def _holds_a_graph(node: ir.Node) -> bool:
-    kinds = (ir.AttributeType.GRAPH, ir.AttributeType.GRAPHS)
-    return any(attribute.type in kinds for attribute in node.attributes.values())

@@ -1,12 +1,13 @@
 """Count a graph's weights and costs by module."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import onnx_ir as ir
 
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.modules.paths import parameter_path
+from me2e_compress.graph.summary import total_macs
 
 _NOT_WEIGHTS = (
     *(ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL),
@@ -63,20 +64,12 @@ def itemise(
         if tensor.dtype not in _NOT_WEIGHTS:
             elements[owner] = elements.get(owner, 0) + tensor.size
     return tuple(
-        Item(module, len(own), elements[module], size[module], *_total(own, macs))
+        Item(
+            *(module, len(own), elements[module], size[module]),
+            *((None, None) if macs is None else total_macs(map(macs, own))),
+        )
         for module, own in nodes.items()
     )
-
-
-def _total(
-    nodes: Sequence[ir.Node], macs: Callable[[ir.Node], int | None] | None
-) -> tuple[int | None, int | None]:
-    """Add up the MACs of nodes; return the sum and how many nodes it leaves out."""
-    if macs is None:
-        return None, None
-    counts = [macs(node) for node in nodes]
-    known, unknown = sum(count or 0 for count in counts), counts.count(None)
-    return (known if known or not unknown else None), unknown
 
 
 def _owner_of(

@@ -36,12 +36,8 @@ def add_constant(
 ) -> ir.Value:
     """Register an initializer under this name, or ``name_1``, ... where it is taken.
 
-    Args:
-        graph: where.
-        array: what it holds.
-        name: what to call it, if that is free.
-        names: those that are taken, the new one is entered; None to look at the whole
-            graph, which whoever adds thousands had better do once.
+    ``names`` are those that are taken, the new one is entered; None looks at the whole
+    graph, which whoever adds thousands had better do once.
     """
     unique = fresh_name(name, value_names(graph) if names is None else names)
     flat = np.ascontiguousarray(array).reshape(array.shape)
@@ -72,12 +68,7 @@ def replace_value(old: ir.Value, new: ir.Value, names: set[str] | None = None) -
     """Replace a value in all its readers; a graph output keeps its name.
 
     Where ``old`` is a graph output, ``new`` takes its place and its name, so that the
-    interface stays as it was.
-
-    Args:
-        old: what is read.
-        new: what is to be read.
-        names: those that are taken, as in :func:`add_constant`.
+    interface stays as it was; ``names`` are taken, as in :func:`add_constant`.
 
     Raises:
         GraphError: ``old`` is a graph output, and ``new`` cannot be it, being an
@@ -115,13 +106,8 @@ def put(
 ) -> ir.Node:
     """Put a standard operator in a node's place; it takes over output and name.
 
-    Args:
-        old: the node whose first output lives on; it is removed.
-        op_type: the operator that takes its place.
-        inputs: what it reads.
-        by: the pass's name.
-        sources: the other nodes it stands for.
-        attributes: its attributes.
+    The old node is removed. ``by`` is the pass's name, ``sources`` are the other nodes
+    that the new one stands for.
 
     Raises:
         GraphError: another output of the node is read.

@@ -79,14 +79,7 @@ class Kit:
         *,
         behind: Sequence[ir.Node] = (),
     ) -> None:
-        """Replace all that matched by one standard operator.
-
-        Args:
-            op_type: the operator.
-            inputs: what it reads.
-            attributes: its attributes.
-            behind: nodes in a row behind the match that it replaces too.
-        """
+        """Replace all that matched, and a row of nodes ``behind``, by one operator."""
         *sources, last = (self.match.root, *behind)
         sources += self.match.nodes[1:]
         put(last, op_type, inputs, by=self.by, sources=sources, attributes=attributes)
@@ -113,10 +106,9 @@ class Kit:
         return node.outputs[0]
 
     def absorb(self, *changed: ir.Node) -> None:
-        """Remove the last node; the first of the changed ones makes its output.
+        """Remove the last node, whose work the changed ones do from now on.
 
-        Args:
-            changed: nodes of the match that do the work of the last one from now on.
+        The first of them makes its output.
         """
         root = self.match.root
         for node in changed:
@@ -195,12 +187,8 @@ def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
     """Try fusions on every node, in order, until none applies.
 
     What nothing reads is removed first, and after every round: it would read what a
-    pattern wants for itself.
-
-    Args:
-        model: the graph, shapes inferred; rewritten in place, its bodies too.
-        fusions: those that come first are tried first.
-        by: the pass's name.
+    pattern wants for itself. Shapes must be inferred; bodies are rewritten too, all in
+    place. ``by`` is the pass's name.
     """
     run = _Run(Facts(opset_of(model)), by, value_names(model.graph), _by_root(fusions))
     fused = Fused(unread=remove_dead(model.graph))

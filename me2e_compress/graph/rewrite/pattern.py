@@ -226,12 +226,10 @@ def var(name: str, *, computed: bool = False) -> Variable:
 def constant(
     close_to: float | None = None, *, scalar: bool = False, floating: bool = True
 ) -> Constant:
-    """Build the pattern of a weight.
+    """Build the pattern of a weight, of floats unless ``floating`` is False.
 
-    Args:
-        close_to: the number that it holds, within a relative 1e-4; None for any.
-        scalar: True for one element only.
-        floating: False for any element type.
+    ``close_to`` is the number that it holds, within a relative 1e-4; ``scalar`` weights
+    have one element.
     """
     return Constant(close_to, scalar or close_to is not None, floating)
 
@@ -244,15 +242,11 @@ def op(
     where: Callable[[ir.Node], bool] | None = None,
     domain: str = "",
 ) -> OperatorPattern:
-    """Build the pattern of an operator's first output.
+    """Build the pattern of the first output of an operator, or of one of several.
 
-    Args:
-        types: the operator, or several of which it is one.
-        inputs: its operands.
-        more: True where operands may follow that the pattern does not look at.
-        shared: True where others may read what it makes: it stays for them.
-        where: what else must hold of the node, of its attributes say.
-        domain: of the operator; that of ONNX by default.
+    ``more`` operands may follow that the pattern does not look at. Others may read what
+    a ``shared`` one makes: it stays for them. ``where`` says what else must hold of the
+    node, of its attributes say. The domain is that of ONNX by default.
     """
     names = (types,) if isinstance(types, str) else types
     return OperatorPattern(names, inputs, more, shared, where, domain)
@@ -266,9 +260,7 @@ def either(*options: Pattern) -> Either:
 def moved(source: Pattern, *, shared: bool = False) -> Moved:
     """Build the pattern of an expression that Reshape and Transpose may have moved.
 
-    Args:
-        source: the expression.
-        shared: True where others may read what the layout operators make.
+    Others may read what these make if it is ``shared``.
     """
     return Moved(source, shared)
 

@@ -40,9 +40,8 @@ def join(content: StackFile, files: Sequence[PartGraph], folder: Path) -> Joined
     joiner.names = dataclasses.replace(joiner.names, taken=inputs)
     # Name the outputs of the stack.
     answers = dict(joiner.answers())
-    ports = {each.label: each.outputs for each in files}
     outputs = {
-        name: ports[joiner.kept(part).label][output]
+        name: joiner.files[part].outputs[output]
         for name, (part, output) in answers.items()
     }
     # Pair the state, and check that no part is left alone.
@@ -96,10 +95,6 @@ class _Joiner:
             for part, each in graphs.items()
         }
         return Joints.of(graphs, sources)
-
-    def kept(self, part: str) -> PartGraph:
-        """Return the file of a part that runs at most frames."""
-        return self.files[part]
 
     def answers(self) -> Iterator[tuple[str, tuple[str, str]]]:
         """Yield the name, part and output of what is present at every frame."""

@@ -1,11 +1,11 @@
 """Cut one graph into the parts of the stack that it was joined from."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.nodes import STANDARD, bodies_of, nodes_of
+from me2e_compress.graph.nodes import STANDARD, nodes_of, reads_of
 from me2e_compress.graph.stack.joints import Joints, Names
 from me2e_compress.graph.stack.part_graph import PartGraph
 
@@ -101,20 +101,8 @@ def _between(
             )
         elif node not in needed:
             needed.add(node)
-            waiting += _reads(node, graph)
+            waiting += reads_of(node)
     return [node for node in graph if node in needed], list(weights)
-
-
-def _reads(node: ir.Node, graph: ir.Graph) -> Iterator[ir.Value]:
-    """Yield what a node reads of its graph, and what its bodies read of it."""
-    for value in node.inputs:
-        if value is not None:
-            yield value
-    for body in bodies_of(node):
-        for inner in body.all_nodes():
-            for value in inner.inputs:
-                if value is not None and value.graph is graph:
-                    yield value
 
 
 def _rename(

@@ -9,6 +9,7 @@ import pydantic
 
 from me2e_compress.errors import GraphError
 from me2e_compress.registry import documents
+from me2e_compress.registry.documents import toml_string
 
 SUFFIX = ".toml"
 """Suffix of a file that describes a stack, wherever a model is expected."""
@@ -160,15 +161,9 @@ def _inline(entry: StateEntry) -> _Inline:
 
 
 def _lines(entries: dict[str, Any]) -> list[str]:
+    known = {key: value for key, value in entries.items() if value is not None}
     return [
-        f"{_quoted(key)} = {value if isinstance(value, _Inline) else _quoted(value)}"
-        if not _NAME.fullmatch(key)
-        else f"{key} = {value if isinstance(value, _Inline) else _quoted(value)}"
-        for key, value in entries.items()
-        if value is not None
+        f"{key if _NAME.fullmatch(key) else toml_string(key)} ="
+        f" {value if isinstance(value, _Inline) else toml_string(value)}"
+        for key, value in known.items()
     ]
-
-
-def _quoted(text: str) -> str:
-    """Return a TOML string: JSON's escapes are valid in TOML, except for delete."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

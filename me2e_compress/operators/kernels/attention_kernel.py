@@ -33,11 +33,7 @@ from me2e_compress.operators.kernels.intrinsics import (
 )
 from me2e_compress.operators.kernels.kernel import WIDEST_HEAD
 from me2e_compress.operators.kernels.matrix_tile import host_tile, matrix_product
-from me2e_compress.operators.kernels.online_softmax import (
-    MOST,
-    SUM,
-    softmax_step,
-)
+from me2e_compress.operators.kernels.online_softmax import MOST, SUM, softmax_step
 
 F = np.float32
 LOG2_E = 1.4426950408889634

@@ -5,13 +5,20 @@ Adding +0.0 is not an identity (-0.0 + 0.0 is +0.0); adding -0.0 is, and so is
 subtracting +0.0.
 """
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, static_shape
-from me2e_compress.graph.nodes import input_at, integers_at, integers_of, permutation_of
+from me2e_compress.graph.nodes import (
+    input_at,
+    integers_at,
+    integers_of,
+    maker,
+    permutation_of,
+)
 from me2e_compress.graph.rewrite import Array, is_read, is_standard
 
 Rule = Callable[[ir.Node, int], ir.Value | None]
@@ -101,13 +108,12 @@ def _slice(node: ir.Node, opset: int) -> ir.Value | None:
 
 def _sliced_part(node: ir.Node) -> ir.Value | None:
     """Return the operand of a Concat that a Slice takes out again, if it is one."""
-    whole = node.inputs[0]
-    inner = None if whole is None else whole.producer()
-    shape, axes = static_shape(whole), integers_at(node, "axes", 3)
+    inner, shape = maker(node.inputs[0], "Concat"), static_shape(node.inputs[0])
     starts, ends = integers_at(node, "starts", 1), integers_at(node, "ends", 2)
-    if inner is None or not is_standard(inner) or inner.op_type != "Concat":
+    axes = integers_at(node, "axes", 3)
+    if inner is None or shape is None or not starts or not ends:
         return None
-    if shape is None or axes is None or len(axes) != 1 or not starts or not ends:
+    if axes is None or len(axes) != 1:
         return None
     axis = axes[0] % len(shape)
     if inner.attributes.get_int("axis", 0) % len(shape) != axis:
@@ -138,13 +144,10 @@ def _clip(node: ir.Node, opset: int) -> ir.Value | None:
 
 def _repeats(node: ir.Node, opset: int) -> ir.Value | None:
     """Relu of Relu, Abs of Abs, ...: idempotent operators."""
-    source = node.inputs[0]
-    inner = None if source is None else source.producer()
-    if inner is None or inner.op_type != node.op_type or inner.domain != node.domain:
+    inner = maker(node.inputs[0], node.op_type)
+    if inner is None or tuple(inner.inputs[1:]) != tuple(node.inputs[1:]):
         return None
-    if tuple(inner.inputs[1:]) != tuple(node.inputs[1:]):
-        return None
-    return source if _attributes(inner) == _attributes(node) else None
+    return node.inputs[0] if _attributes(inner) == _attributes(node) else None
 
 
 def _attributes(node: ir.Node) -> list[tuple[str, object]]:
@@ -153,11 +156,8 @@ def _attributes(node: ir.Node) -> list[tuple[str, object]]:
 
 def _undoes(node: ir.Node, opset: int) -> ir.Value | None:
     """Not of Not, Neg of Neg: self-inverse operators."""
-    source = node.inputs[0]
-    inner = None if source is None else source.producer()
-    if inner is None or inner.op_type != node.op_type or inner.domain != node.domain:
-        return None
-    return inner.inputs[0]
+    inner = maker(node.inputs[0], node.op_type)
+    return None if inner is None else inner.inputs[0]
 
 
 def _neutral(test: Callable[[Array], bool], *, either: bool) -> Rule:
@@ -185,16 +185,12 @@ def _spreads(source: ir.Value, array: Array, node: ir.Node) -> bool:
     )
 
 
-def _zero_added(array: Array) -> bool:
+def _zero(array: Array, *, negative: bool) -> bool:
+    """Return whether all numbers are zero, those with a sign of zero of this one."""
     if array.dtype.kind in "iu":
         return not array.any()
-    return array.dtype.kind == "f" and bool(np.all((array == 0) & np.signbit(array)))
-
-
-def _zero_taken(array: Array) -> bool:
-    if array.dtype.kind in "iu":
-        return not array.any()
-    return array.dtype.kind == "f" and bool(np.all((array == 0) & ~np.signbit(array)))
+    zero = array.dtype.kind == "f" and not array.any()
+    return zero and bool(np.all(np.signbit(array) == negative))
 
 
 def _one(array: Array) -> bool:
@@ -215,40 +211,25 @@ def _where(node: ir.Node, opset: int) -> ir.Value | None:
 
 
 RULES: dict[str, Rule] = {
-    "Abs": _repeats,
-    "Add": _neutral(_zero_added, either=True),
+    **dict.fromkeys(("Abs", "Ceil", "Floor", "Relu", "Round", "Sign"), _repeats),
+    **dict.fromkeys(("Concat", "Max", "Mean", "Min", "Sum"), _if_alone),
+    **dict.fromkeys(("Expand", "Flatten", "Reshape", "Squeeze"), _if_same_shape),
+    **dict.fromkeys(("Tile", "Unsqueeze"), _if_same_shape),
+    **dict.fromkeys(("Neg", "Not"), _undoes),
+    **dict.fromkeys(("Div", "Pow"), _neutral(_one, either=False)),
+    "Add": _neutral(functools.partial(_zero, negative=True), either=True),
     "And": _neutral(lambda array: bool(array.all()), either=True),
     "Cast": _cast,
     "CastLike": _cast_like,
-    "Ceil": _repeats,
     "Clip": _clip,
-    "Concat": _if_alone,
-    "Div": _neutral(_one, either=False),
     "Dropout": _dropout,
-    "Expand": _if_same_shape,
-    "Flatten": _if_same_shape,
-    "Floor": _repeats,
     "Identity": _always,
-    "Max": _if_alone,
-    "Mean": _if_alone,
-    "Min": _if_alone,
     "Mul": _neutral(_one, either=True),
-    "Neg": _undoes,
-    "Not": _undoes,
     "Or": _neutral(lambda array: not array.any(), either=True),
     "Pad": _pad,
-    "Pow": _neutral(_one, either=False),
-    "Relu": _repeats,
-    "Reshape": _if_same_shape,
-    "Round": _repeats,
-    "Sign": _repeats,
     "Slice": _slice,
     "Split": _split,
-    "Squeeze": _if_same_shape,
-    "Sub": _neutral(_zero_taken, either=False),
-    "Sum": _if_alone,
-    "Tile": _if_same_shape,
+    "Sub": _neutral(functools.partial(_zero, negative=False), either=False),
     "Transpose": _transpose,
-    "Unsqueeze": _if_same_shape,
     "Where": _where,
 }

@@ -11,7 +11,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import provenance, static_shape
-from me2e_compress.graph.nodes import VIEWS, integers_of, permutation_of
+from me2e_compress.graph.nodes import ELEMENTWISE, VIEWS, integers_of, permutation_of
 from me2e_compress.graph.rewrite import (
     add_constant,
     bypass,
@@ -24,26 +24,7 @@ from me2e_compress.passes.eliminate_redundant.identities import moves_nothing
 
 _RESHAPING = VIEWS - {"Identity"}
 
-BROADCASTING = frozenset(
-    {
-        "Add",
-        "And",
-        "Div",
-        "Equal",
-        "Greater",
-        "GreaterOrEqual",
-        "Less",
-        "LessOrEqual",
-        "Max",
-        "Min",
-        "Mul",
-        "Or",
-        "Pow",
-        "Sub",
-        "Where",
-        "Xor",
-    }
-)
+BROADCASTING = frozenset({*ELEMENTWISE, "Where"})
 
 WIDENS: dict[ir.DataType, str] = {
     ir.DataType.BOOL: "UINT8 INT8 INT16 INT32 INT64 FLOAT16 FLOAT DOUBLE",

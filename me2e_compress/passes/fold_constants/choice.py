@@ -40,14 +40,9 @@ class FoldChoice:
 
 
 def choose_within(known: Knowledge, bytes_per_node: int, most: float) -> FoldChoice:
-    """Choose at the price given, or at the highest below it that keeps to a budget.
+    """Choose at the price given, or at the highest at which weights grow by ``most``.
 
     A lower price leaves those nodes computed whose removal costs the most bytes each.
-
-    Args:
-        known: the constant values.
-        bytes_per_node: the price of a node.
-        most: bytes by which the weights may grow.
     """
     choice = choose(known, bytes_per_node)
     low, high = 0, bytes_per_node

@@ -6,6 +6,7 @@ import onnx
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, node_inference
+from me2e_compress.graph.nodes import unrenamed
 from me2e_compress.graph.rewrite import Array
 from me2e_compress.graph.shapes import refined
 
@@ -44,21 +45,13 @@ def _accepts(node: ir.Node, instead: Mapping[ir.Value, ir.Value], opset: int) ->
         value: array
         for value in node.inputs
         if value is not None
-        and (array := array_of(_origin(instead.get(value, value)))) is not None
+        and (array := array_of(unrenamed(instead.get(value, value)))) is not None
     }
     try:
         node_inference.infer_node(node, opset, known=arrays.get, instead=instead)
     except node_inference.REFUSALS:
         return False
     return True
-
-
-def _origin(value: ir.Value) -> ir.Value:
-    maker = value.producer()
-    while maker is not None and maker.op_type == "Identity" and maker.inputs[0]:
-        value = maker.inputs[0]
-        maker = value.producer()
-    return value
 
 
 def _record(

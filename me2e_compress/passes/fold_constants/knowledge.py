@@ -8,11 +8,10 @@ import onnx_ir as ir
 
 from me2e_compress.graph import array_of, static_shape
 from me2e_compress.graph.activations import value_bytes
-from me2e_compress.graph.nodes import DRAWS, attribute_values
+from me2e_compress.graph.nodes import DRAWS, NATIVE, attribute_values
 from me2e_compress.graph.rewrite import Array, has_subgraph, is_standard
 from me2e_compress.passes.fold_constants import table
 from me2e_compress.passes.fold_constants.inference import learn_shapes
-from me2e_compress.passes.fold_constants.table import NATIVE
 
 SMALL = 1024
 """Arrays of up to this many elements (shapes, indices) are computed immediately."""
@@ -128,10 +127,7 @@ class Sweep:
         return True
 
     def _touched(self, node: ir.Node) -> bool:
-        if all(
-            value.shape is not None and value.shape.is_static()
-            for value in node.outputs
-        ):
+        if all(static_shape(value) is not None for value in node.outputs):
             return False
         return any(
             value in self.learnt or value in self.known.maker

@@ -12,17 +12,8 @@ import onnx
 import onnx_ir as ir
 from onnx.reference import ReferenceEvaluator
 
+from me2e_compress.graph.nodes import NATIVE
 from me2e_compress.graph.rewrite import Array
-
-NATIVE = frozenset(
-    {
-        *(ir.DataType.BOOL, ir.DataType.DOUBLE, ir.DataType.FLOAT, ir.DataType.FLOAT16),
-        *(ir.DataType.INT8, ir.DataType.INT16, ir.DataType.INT32, ir.DataType.INT64),
-        *(ir.DataType.UINT8, ir.DataType.UINT16),
-        *(ir.DataType.UINT32, ir.DataType.UINT64),
-    }
-)
-"""The element types that numpy itself computes with."""
 
 MOST_ELEMENTS = 1 << 20
 """Limit of a result, in elements, whatever shape the file claims."""
@@ -122,15 +113,10 @@ def _reduces(node: ir.Node, inputs: Sequence[Any]) -> bool:
 
 
 _CHECKS: dict[str, Callable[[ir.Node, Sequence[Any]], bool]] = {
+    **dict.fromkeys(("ConstantOfShape", "Expand"), _fills),
+    **dict.fromkeys(("Div", "Mod"), _divides),
+    **dict.fromkeys(("ReduceMax", "ReduceMin", "ReduceProd", "ReduceSum"), _reduces),
     "Cast": _casts,
-    "ConstantOfShape": _fills,
-    "Div": _divides,
-    "Expand": _fills,
-    "Mod": _divides,
     "NonZero": lambda node, inputs: inputs[0].ndim > 0,
     "Range": _counts,
-    "ReduceMax": _reduces,
-    "ReduceMin": _reduces,
-    "ReduceProd": _reduces,
-    "ReduceSum": _reduces,
 }

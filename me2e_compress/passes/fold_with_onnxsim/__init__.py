@@ -71,7 +71,8 @@ class FoldWithOnnxsim(Pass):
         restore(result, model, by=self.name, node_names=True)
         lift_constants(result)
         sweep(result)
-        _restore_header(result, model)
+        result.producer_name = model.producer_name
+        result.producer_version = model.producer_version
         if digest(result) == digest(model):
             return PassResult(model, 0)
         return PassResult(result, max(1, node_count(model) - node_count(result)))
@@ -117,12 +118,3 @@ def _same(one: ir.TensorProtocol, other: ir.TensorProtocol) -> bool:
         and one.shape == other.shape
         and one.tobytes() == other.tobytes()
     )
-
-
-def _restore_header(result: ir.Model, model: ir.Model) -> None:
-    result.producer_name, result.producer_version = (
-        model.producer_name,
-        model.producer_version,
-    )
-    result.domain, result.doc_string = model.domain, model.doc_string
-    result.model_version = model.model_version

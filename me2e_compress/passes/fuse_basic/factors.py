@@ -14,7 +14,6 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import input_at, static_shape
-from me2e_compress.graph.nodes import VIEWS, permutation_of
 from me2e_compress.graph.rewrite import (
     Array,
     Facts,
@@ -34,7 +33,7 @@ from me2e_compress.graph.rewrite import (
     sole_reader,
     var,
 )
-from me2e_compress.passes.digits import Layout, regrouped, sizes, whole
+from me2e_compress.passes.digits import Layout, before, sizes, whole
 
 SOURCE = var("source", computed=True)
 WEIGHT, BIAS, FACTOR = constant(), constant(), constant()
@@ -117,19 +116,11 @@ def _layout(value: ir.Value, source: ir.Value, shape: tuple[int, ...]) -> Layout
     layout: Layout = tuple(whole(str(axis), size) for axis, size in enumerate(shape))
     while value is not source:
         node = value.producer()
-        before = None if node is None else node.inputs[0]
-        shape_before = static_shape(before)
-        if node is None or before is None or shape_before is None:
+        earlier = None if node is None else node.inputs[0]
+        back = None if node is None else before(node, layout)
+        if earlier is None or back is None:
             return None
-        if node.op_type in VIEWS:
-            back = regrouped(layout, shape_before)
-            if back is None:
-                return None
-            layout = back
-        else:
-            order = permutation_of(node) or []
-            layout = tuple(layout[order.index(axis)] for axis in range(len(order)))
-        value = before
+        value, layout = earlier, back
     return layout
 
 

@@ -16,17 +16,13 @@ import math
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, provenance, static_shape
+from me2e_compress.graph.nodes import ELEMENTWISE
 from me2e_compress.graph.rewrite import Array, Facts, Fusion, Kit, Match, op, var
-
-BINARY = (
-    *("Add", "And", "Div", "Equal", "Greater", "GreaterOrEqual", "Less"),
-    *("LessOrEqual", "Max", "Min", "Mul", "Or", "Pow", "Sub", "Xor"),
-)
 
 LEAST = 1000
 """Elements that take onnxruntime 6 us one at a time: three starts of a node."""
 
-PATTERN = op(BINARY, var("left"), var("right"))
+PATTERN = op(ELEMENTWISE, var("left"), var("right"))
 
 
 @dataclasses.dataclass(frozen=True)

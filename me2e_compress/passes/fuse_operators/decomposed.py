@@ -18,17 +18,8 @@ from me2e_compress.graph.nodes import (
     producer_of,
     sole_reader,
 )
-from me2e_compress.passes.digits import (
-    Digit,
-    Digits,
-    flat,
-    whole,
-)
-from me2e_compress.passes.fuse_operators.views import (
-    View,
-    aligned,
-    results,
-)
+from me2e_compress.passes.digits import Digit, Digits, flat, whole
+from me2e_compress.passes.fuse_operators.views import View, aligned, results
 
 BATCH, CHANNEL, LEVEL, PIXEL, XY = "batch", "channel", "level", "pixel", "xy"
 ROW, COLUMN = "row", "column"

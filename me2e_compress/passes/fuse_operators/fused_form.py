@@ -9,14 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
-from me2e_compress.passes.digits import (
-    Digit,
-    Layout,
-    flat,
-    sizes,
-    split_like,
-    whole,
-)
+from me2e_compress.passes.digits import Digit, Layout, flat, sizes, split_like, whole
 from me2e_compress.passes.fuse_operators.decomposed import (
     BATCH,
     CHANNEL,

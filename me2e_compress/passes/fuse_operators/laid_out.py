@@ -5,14 +5,7 @@ from collections.abc import Sequence
 import onnx_ir as ir
 
 from me2e_compress.operators import FusedCall
-from me2e_compress.passes.digits import (
-    Digit,
-    Layout,
-    flat,
-    runs,
-    sizes,
-    split_like,
-)
+from me2e_compress.passes.digits import Digit, Layout, flat, runs, sizes, split_like
 from me2e_compress.passes.fuse_operators.operand_sources import scaling
 from me2e_compress.passes.fuse_operators.views import View
 

@@ -16,7 +16,7 @@ from me2e_compress.graph.nodes import (
     producer_of,
     sole_reader,
 )
-from me2e_compress.passes.digits import Digits, Layout, regrouped
+from me2e_compress.passes.digits import Digits, Layout, before, regrouped
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,12 +58,12 @@ def sources(view: View) -> Iterator[View | Selection]:
     """
     while True:
         yield view
-        before = _before(view)
-        if isinstance(before, Selection):
-            yield before
-        if not isinstance(before, View):
+        earlier = _earlier(view)
+        if isinstance(earlier, Selection):
+            yield earlier
+        if not isinstance(earlier, View):
             return
-        view = before
+        view = earlier
 
 
 def results(view: View) -> Iterator[View]:
@@ -127,7 +127,7 @@ def _without(layout: Layout, axis: int) -> Layout:
     return layout[:axis] + layout[axis + 1 :]
 
 
-def _before(view: View) -> View | Selection | None:
+def _earlier(view: View) -> View | Selection | None:
     node = producer_of(view.value)
     if node is None or not is_standard(node) or not node.inputs:
         return None
@@ -141,19 +141,11 @@ def _before(view: View) -> View | Selection | None:
     if source is None or shape is None:
         return None
     # Move the digits back through the operator
-    layout: Layout | None = None
-    if node.op_type in VIEWS:
-        layout = regrouped(view.layout, shape)
-    elif node.op_type == "Expand":
-        layout = aligned(view.layout, shape)
-    elif node.op_type == "Transpose":
-        order = permutation_of(node) or []
-        layout = tuple(view.layout[order.index(axis)] for axis in range(len(shape)))
-    return (
-        None
-        if layout is None
-        else dataclasses.replace(view, value=source, layout=layout)
-    )
+    expands = node.op_type == "Expand"
+    layout = aligned(view.layout, shape) if expands else before(node, view.layout)
+    if layout is None:
+        return None
+    return dataclasses.replace(view, value=source, layout=layout)
 
 
 def _after(node: ir.Node, view: View) -> View | None:
@@ -168,11 +160,9 @@ def _after(node: ir.Node, view: View) -> View | None:
         layout = regrouped(view.layout, shape)
     elif node.op_type == "Transpose":
         layout = tuple(view.layout[axis] for axis in permutation_of(node) or ())
-    return (
-        None
-        if layout is None
-        else dataclasses.replace(view, value=result, layout=layout)
-    )
+    if layout is None:
+        return None
+    return dataclasses.replace(view, value=result, layout=layout)
 
 
 def _unscaled(node: ir.Node, view: View) -> View | None:
@@ -216,8 +206,8 @@ def _selected(node: ir.Node, view: View) -> Selection | None:
     layout = list(view.layout)
     if not kept:
         layout.insert(axis, ())
-    before = dataclasses.replace(view, value=source, layout=tuple(layout))
-    return Selection(before, axis, start, size)
+    whole = dataclasses.replace(view, value=source, layout=tuple(layout))
+    return Selection(whole, axis, start, size)
 
 
 _Part = tuple[int, int, int, bool]

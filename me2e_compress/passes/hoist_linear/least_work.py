@@ -19,10 +19,7 @@ from me2e_compress.graph.nodes import VIEWS
 from me2e_compress.graph.rewrite import holds_numbers, is_standard, sole_reader
 from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
 from me2e_compress.passes.hoist_linear.owned_work import Amount, OwnedWork
-from me2e_compress.passes.hoist_linear.row_moves import (
-    moved_rows,
-    without_repeats,
-)
+from me2e_compress.passes.hoist_linear.row_moves import moved_rows, without_repeats
 from me2e_compress.passes.hoist_linear.ways import (
     Composed,
     Direct,
@@ -33,7 +30,7 @@ from me2e_compress.passes.hoist_linear.ways import (
     Way,
     uses_weight,
 )
-from me2e_compress.passes.work import MACS_PER_NODE, MOVED_BYTES_PER_NODE
+from me2e_compress.passes.work import MACS_PER_NODE, MOVED_BYTES_PER_NODE, item_bytes
 
 DEEPEST = 32
 """Largest number of consecutive nodes examined before a product."""
@@ -70,7 +67,7 @@ class Question:
     @property
     def product_bytes(self) -> float:
         """The size of the product in memory."""
-        return _size(self.shape[:-1]) * self.columns * _item(self.value)
+        return math.prod(self.shape[:-1]) * self.columns * item_bytes(self.value)
 
     def of(
         self, value: ir.Value, *, owned: bool | None = None, fresh: bool = False
@@ -128,11 +125,11 @@ class Prices:
         """Price the product of the value as it is; the nodes of an owned value stay."""
         if holds_numbers(asked.value):
             return Price(Precomputed(asked.value), asked.product_bytes / self.rate, 0)
-        macs = _size(asked.shape) * asked.columns
-        moved = asked.product_bytes + _size(asked.shape) * _item(asked.value)
+        macs = math.prod(asked.shape) * asked.columns
+        moved = asked.product_bytes + math.prod(asked.shape) * item_bytes(asked.value)
         cost = 1.0 + macs / MACS_PER_NODE + moved / MOVED_BYTES_PER_NODE
         if asked.fresh:
-            matrix = asked.shape[-1] * asked.columns * _item(asked.value)
+            matrix = asked.shape[-1] * asked.columns * item_bytes(asked.value)
             cost += matrix / self.rate
         held = self.owned.of(asked.value) if asked.owned else Amount()
         return Price(Direct(asked.value), cost + held.work, macs + held.macs)
@@ -185,12 +182,8 @@ class Prices:
             shape = static_shape(value) or ()
             terms.append(Term(one.way, shape, rows))
             cost, macs = cost + one.work, macs + one.macs
-            cost += (
-                _size(shape[:-1])
-                * asked.columns
-                * _item(asked.value)
-                / (MOVED_BYTES_PER_NODE)
-            )
+            made = math.prod(shape[:-1]) * asked.columns * item_bytes(asked.value)
+            cost += made / MOVED_BYTES_PER_NODE
         # Adding the products up
         sums = len(terms) - 1
         cost += sums + sums * asked.product_bytes / MOVED_BYTES_PER_NODE
@@ -234,11 +227,3 @@ def terms_of(
         rows = (start, start + widths[at]) if node.op_type == "Concat" else None
         start += widths[at]
         yield value, owned, rows
-
-
-def _size(shape: tuple[int, ...]) -> int:
-    return math.prod(shape)
-
-
-def _item(value: ir.Value) -> float:
-    return 4.0 if value.dtype is None else value.dtype.itemsize

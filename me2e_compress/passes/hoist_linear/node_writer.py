@@ -15,10 +15,14 @@ class NodeWriter:
     Args:
         rewriter: of the graph.
         sources: the replaced node first, then those that go with it.
+        label: what shapes are named after; None for the replaced node.
     """
 
-    def __init__(self, rewriter: Rewriter, sources: Sequence[ir.Node]) -> None:
+    def __init__(
+        self, rewriter: Rewriter, sources: Sequence[ir.Node], label: str | None = None
+    ) -> None:
         self.rewriter, self.sources = rewriter, tuple(sources)
+        self.label = self.sources[0].name if label is None else label
         self.values: list[ir.Value] = []
 
     @property
@@ -37,16 +41,19 @@ class NodeWriter:
             return value
         old = static_shape(value) or ()
         shape = tuple(old[axis] for axis in order)
-        return self.write(
-            "Transpose", [value], shape, [ir.AttrInt64s("perm", list(order))]
-        )
+        perm = ir.AttrInt64s("perm", list(order))
+        return self._moved(value, self.write("Transpose", [value], shape, [perm]))
 
     def shape(self, value: ir.Value, shape: tuple[int, ...]) -> ir.Value:
         """Reshape; nothing is written where the shape stays."""
         if static_shape(value) == shape:
             return value
-        target = self.rewriter.target(shape, f"{self.sources[0].name}_shape")
-        return self.write("Reshape", [value, target], shape)
+        target = self.rewriter.target(shape, f"{self.label}_shape")
+        return self._moved(value, self.write("Reshape", [value, target], shape))
+
+    def _moved(self, value: ir.Value, result: ir.Value) -> ir.Value:
+        result.type = value.type or result.type
+        return result
 
     def multiply(self, left: ir.Value, right: ir.Value) -> ir.Value:
         """Multiply matrices; the axes before the last two are those of the left."""

@@ -14,11 +14,11 @@ from collections.abc import Sequence
 import onnx_ir as ir
 
 from me2e_compress.graph import is_standard, static_shape
-from me2e_compress.graph.nodes import VIEWS, permutation_of
 from me2e_compress.passes.digits import (
     Digit,
     Digits,
     Layout,
+    before,
     flat,
     merged,
     regrouped,
@@ -64,10 +64,10 @@ def repeated_axes(value: ir.Value) -> RepeatedAxes | None:
         if node is None or node.graph is not value.graph:
             break
         source = node.inputs[0] if node.inputs else None
-        before = _before(node, layout)
-        if before is None or source is None:
+        earlier = _before_repeats(node, layout)
+        if earlier is None or source is None:
             break
-        value, layout = source, before
+        value, layout = source, earlier
         nodes.append(node)
         size = math.prod(static_shape(value) or ())
         sizes = _sizes(shape, merged(flat(layout))) if size < least else None
@@ -76,22 +76,13 @@ def repeated_axes(value: ir.Value) -> RepeatedAxes | None:
     return best
 
 
-def _before(node: ir.Node, layout: Layout) -> Layout | None:
+def _before_repeats(node: ir.Node, layout: Layout) -> Layout | None:
     """Return the layout of what a node moves or repeats; None if it does neither."""
     if not is_standard(node) or not node.inputs:
         return None
     given = static_shape(node.inputs[0])
-    if given is None:
-        return None
-    if node.op_type in VIEWS:
-        return regrouped(layout, given)
-    if node.op_type == "Transpose":
-        order = permutation_of(node)
-        if order is None:
-            return None
-        return tuple(layout[order.index(axis)] for axis in range(len(order)))
-    if node.op_type not in REPEATS:
-        return None
+    if given is None or node.op_type not in REPEATS:
+        return before(node, layout)
     if node.op_type == "Concat" and len(set(node.inputs)) != 1:
         return None
     found = [

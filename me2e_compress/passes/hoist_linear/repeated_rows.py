@@ -22,7 +22,7 @@ from me2e_compress.passes.hoist_linear.row_moves import (
     moved_rows,
     without_repeats,
 )
-from me2e_compress.passes.work import MOVED_BYTES_PER_NODE
+from me2e_compress.passes.work import MOVED_BYTES_PER_NODE, item_bytes
 
 UNARY = frozenset(
     {
@@ -171,7 +171,7 @@ def _pays(node: ir.Node, move: Move) -> bool:
     whole = static_shape(node.outputs[0]) or ()
     # Bytes that the node no longer reads and writes
     saved = _traffic(node.inputs) - _traffic(move.inputs)
-    item = 4.0 if node.outputs[0].dtype is None else node.outputs[0].dtype.itemsize
+    item = item_bytes(node.outputs[0])
     saved += (math.prod(whole) - math.prod(move.shape)) * item
     # Cost of a repetition that other readers still need
     owned, added = True, 0.0

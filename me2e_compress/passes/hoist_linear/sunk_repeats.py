@@ -26,7 +26,7 @@ from me2e_compress.passes.hoist_linear.repeated_rows import (
     along_last,
     is_row_wise,
 )
-from me2e_compress.passes.work import MOVED_BYTES_PER_NODE, work
+from me2e_compress.passes.work import MOVED_BYTES_PER_NODE, item_bytes, work
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,8 +191,7 @@ def _once(
 
 def _pays(node: ir.Node, plan: _Plan) -> bool:
     """Return whether all that is computed once is more than what is written anew."""
-    result = node.outputs[0]
-    item = 4.0 if result.dtype is None else result.dtype.itemsize
+    result, item = node.outputs[0], item_bytes(node.outputs[0])
     before, moved = work(node), math.prod(plan.small) * item
     after = 1.0
     for operand in plan.operands:

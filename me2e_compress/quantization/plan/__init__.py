@@ -24,10 +24,7 @@ from me2e_compress.quantization.plan.groups import (
 )
 from me2e_compress.quantization.plan.make import make_plan, tensors_of
 from me2e_compress.quantization.plan.overrides import Overrides
-from me2e_compress.quantization.plan.weight_only import (
-    savable_bytes,
-    with_weight_only,
-)
+from me2e_compress.quantization.plan.weight_only import savable_bytes, with_weight_only
 
 __all__ = [
     "FLOAT",

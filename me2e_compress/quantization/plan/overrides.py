@@ -31,6 +31,7 @@ from me2e_compress.errors import RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan.decision import FLOAT, INT8, Decision
 from me2e_compress.registry import documents
+from me2e_compress.registry.documents import toml_string
 
 _GLOB = str.maketrans({"[": "[[]", "?": "[?]", "*": "[*]"})
 """Makes a name a pattern that matches only itself."""
@@ -81,13 +82,8 @@ class Override(_Strict):
         return ", ".join(f"{key} {value!r}" for key, value in self._given().items())
 
     def _given(self) -> dict[str, str]:
-        matchers = {
-            "nodes": self.nodes,
-            "module": self.module,
-            "op": self.op,
-            "reads": self.reads,
-        }
-        return {key: value for key, value in matchers.items() if value is not None}
+        keys = ("nodes", "module", "op", "reads")
+        return {k: text for k in keys if (text := getattr(self, k)) is not None}
 
 
 def keep_float(name: str, reason: str) -> Override:
@@ -109,12 +105,6 @@ def overrides_text(overrides: Iterable[Override]) -> str:
         lines = (f"{key} = {toml_string(text)}\n" for key, text in given.items())
         entries.append("[[override]]\n" + "".join(lines))
     return "\n".join(entries)
-
-
-def toml_string(text: str) -> str:
-    """Write a TOML basic string."""
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
 
 
 class ConcatScale(_Strict):

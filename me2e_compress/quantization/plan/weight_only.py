@@ -1,12 +1,12 @@
 """Matrix-vector products whose weight alone becomes int8."""
 
 import dataclasses
-import math
 from collections.abc import Collection, Iterator
 
 import onnx_ir as ir
 
-from me2e_compress.graph import channel_axis, size, static_shape
+from me2e_compress.graph import channel_axis, size
+from me2e_compress.graph.activations import value_bytes
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.graph.shapes import is_one_matrix
 from me2e_compress.quantization.plan.decision import (
@@ -28,11 +28,8 @@ def with_weight_only(plan: QuantPlan, model: ir.Model) -> QuantPlan:
 
     Such a product reads every weight once, so its time and file size are those of the
     weight; quantizing its one row would gain nothing. Products that other rules keep in
-    float, weights that float layers read too and small ones stay as they are.
-
-    Args:
-        plan: the graph's plan.
-        model: the float graph that was planned.
+    float, weights that float layers read too and small ones stay as they are. ``model``
+    is the float graph that was planned.
     """
     found = {each.output: each for each, _ in _candidates(plan, model)}
     return dataclasses.replace(
@@ -47,7 +44,7 @@ def savable_bytes(plan: QuantPlan, model: ir.Model) -> tuple[int, int]:
     Both are zero if that is less than a fiftieth of all weights.
     """
     weights = {weight: None for _, weight in _candidates(plan, model)}
-    saved = sum(_bytes(weight) * 3 // 4 for weight in weights)
+    saved = sum((value_bytes(weight) or 0) * 3 // 4 for weight in weights)
     worth = saved >= WORTH * size(model).weight_bytes
     return (len(weights), saved) if worth and saved else (0, 0)
 
@@ -66,7 +63,9 @@ def _candidates(
     }
     for node, decision in vectors.items():
         weight = node.inputs[1]
-        if weight is None or weight not in constants or _bytes(weight) < LEAST_BYTES:
+        if weight is None or weight not in constants:
+            continue
+        if (value_bytes(weight) or 0) < LEAST_BYTES:
             continue
         plain = node.op_type == "Gemm" or is_one_matrix(node)
         if plain and weight.dtype == ir.DataType.FLOAT and _read_by(weight, vectors):
@@ -83,10 +82,3 @@ def _candidates(
 def _read_by(weight: ir.Value, nodes: Collection[ir.Node]) -> bool:
     """Return whether a weight is read by these nodes only, as their right operand."""
     return all(use.node in nodes and use.idx == 1 for use in weight.uses())
-
-
-def _bytes(weight: ir.Value) -> int:
-    tensor = weight.const_value
-    if tensor is not None:
-        return tensor.nbytes
-    return 4 * math.prod(static_shape(weight) or (0,))

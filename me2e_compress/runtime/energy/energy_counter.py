@@ -64,12 +64,8 @@ ENERGY_COUNTERS: Registry[EnergyCounter] = Registry(
 def open_counter(text: str = AUTO) -> Reader | EnergyRecording | Absent:
     """Open a counter by its text, e.g. ``rapl`` or ``recorded:FILE``.
 
-    Args:
-        text: ``auto`` opens the first counter of this machine that answers; otherwise a
-            name and options, see :data:`ENERGY_COUNTERS`.
-
-    Returns:
-        The open counter, or an :class:`Absent` with the answer of each counter tried.
+    ``auto`` opens the first of :data:`ENERGY_COUNTERS` that answers on this machine; an
+    :class:`Absent` has the answer of each counter tried.
 
     Raises:
         EnergyError: no such counter, an unknown option, or a file that is not usable.

@@ -4,9 +4,8 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import Assignment, ModuleMap, assign
-from me2e_compress.graph.modules.assign import STAMP
+from me2e_compress.graph.provenance import MODULE
 
 MAP = ModuleMap.parse(
     '[modules.neck]\nrole = "feature"\noptional = ["neck"]\n'
@@ -136,15 +135,14 @@ def test_what_hangs_on_nothing_goes_with_the_node_before_it() -> None:
 
 
 def test_an_imported_graph_says_it_itself() -> None:
-    assert STAMP == provenance.MODULE
     model = read("(float[2] x) => (float[2] y)", '["/det/Relu"] y = Relu(x)')
-    model.graph[0].metadata_props[STAMP] = "plan"
+    model.graph[0].metadata_props[MODULE] = "plan"
     assert placed(assign(model, MAP)) == {"y": ("plan", "stamp")}
 
 
 def test_a_stamp_of_another_map_is_not_heard() -> None:
     model = read("(float[2] x) => (float[2] y)", '["/det/Relu"] y = Relu(x)')
-    model.graph[0].metadata_props[STAMP] = "occ"
+    model.graph[0].metadata_props[MODULE] = "occ"
     assert placed(assign(model, MAP)) == {"y": ("det", "scope")}
 
 

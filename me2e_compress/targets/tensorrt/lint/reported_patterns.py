@@ -8,12 +8,7 @@ from collections.abc import Collection
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, input_at, rank_of, static_shape
-from me2e_compress.graph.nodes import (
-    LAYOUT_OPERATORS,
-    is_standard,
-    maker,
-    scalar_of,
-)
+from me2e_compress.graph.nodes import LAYOUT_OPERATORS, is_standard, maker, scalar_of
 from me2e_compress.targets.quantized import is_dequantized
 
 _MOVES = LAYOUT_OPERATORS | {"Cast", "Concat", "Expand", "Gather", "Slice", "Split"}
