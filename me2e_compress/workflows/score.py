@@ -107,9 +107,7 @@ class ScoreResult(Result):
         }
 
     def _of(self, name: str, scores: Scores) -> tuple[Table, ...]:
-        late = [
-            deadlines_table(name, each) for at, each in self.late.items() if at == name
-        ]
+        late = [deadlines_table(name, self.late[name])] if name in self.late else []
         if name not in self.real:
             return (scores_table(name, scores), *late)
         real = self.real[name]
