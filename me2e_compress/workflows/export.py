@@ -9,12 +9,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.graph import file_bytes, rewrite
-from me2e_compress.operators import (
-    dialect_of,
-    fused_nodes,
-    import_domains,
-    translate,
-)
+from me2e_compress.operators import dialect_of, fused_nodes, import_domains, translate
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.passes.fold_constants.knowledge import Sweep
 from me2e_compress.passes.import_normalize import with_own_domains
