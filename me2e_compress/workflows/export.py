@@ -134,7 +134,9 @@ def export_stack(
 
 
 def _exported(stack: str, output: Path, options: ExportOptions) -> ExportResult:
-    weights = _read(stack, options)
+    weights, given = None, options.weights
+    if given is not None:
+        weights = published_weights(stack, given, heads=options.heads, ema=options.ema)
     # torch writes our own operator, which is translated to the dialect afterwards
     if options.dialect is not None:
         with tempfile.TemporaryDirectory(prefix="me2e-export-") as folder:
@@ -146,14 +148,6 @@ def _exported(stack: str, output: Path, options: ExportOptions) -> ExportResult:
         _written(stack, output, options, weights)
     record = None if weights is None else weights.record
     return ExportResult(stack, output, options.opset, record)
-
-
-def _read(stack: str, options: ExportOptions) -> PublishedWeights | None:
-    if options.weights is None:
-        return None
-    return published_weights(
-        stack, options.weights, heads=options.heads, ema=options.ema
-    )
 
 
 def _written(
