@@ -1,9 +1,8 @@
 """Draw where the time goes: modules stacked over inferences, and the long tail."""
 
 import io
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -65,7 +64,7 @@ def modules_figure(trace: LatencyTrace, name: str) -> Figure:
     total = np.sum([np.array(each) for each in shown.values()], axis=0)
     said = f"{name}: {trace.machine}\n{_slower(trace, total)}"
     figure.suptitle(said, x=0.01, ha="left", fontsize=10)
-    stack_modules(left, shown, "inference")
+    _stack(left, shown, total)
     _tail(right, total)
     return figure
 
@@ -91,49 +90,31 @@ def _gathered(parts: Microseconds) -> Microseconds:
     return {**kept, f"{len(small)} others": others}
 
 
-def stack_modules(
-    axes: Axes, parts: Microseconds, inference: str, where: str = "", size: float = 9.0
-) -> None:
-    """Draw one bar per inference, one colour per module, the first at the bottom.
-
-    ``inference`` is what the bars are, ``where`` ends the title; the legend's letters
-    have ``size`` points. At most ten modules are drawn.
-    """
+def _stack(axes: Axes, parts: Microseconds, total: Totals) -> None:
     colours = colormaps["tab10"].colors  # type: ignore[attr-defined]
-    count, total = len(next(iter(parts.values()))), sum(map(sum, parts.values()))
-    at, floor = np.arange(1, count + 1), np.zeros(count)
+    at = np.arange(1, len(total) + 1)
+    floor = np.zeros(len(total))
     # each module's bars stand on those before
     for (name, samples), colour in zip(parts.items(), colours, strict=False):
         height = np.array(samples) / 1e3
-        label = f"{name}  {sum(samples) / max(1, total):.0%}"
+        share = sum(samples) / max(1, int(total.sum()))
+        label = f"{name}  {share:.0%}"
         axes.bar(at, height, 1.0, floor, color=colour, label=label, linewidth=0)
         floor += height
-    axes.set_xlim(0.5, count + 0.5)
-    axes.set_xlabel(inference, color=_MUTED)
-    axes.set_title(f"milliseconds by module{where}", color=_MUTED)
+    axes.set_xlim(0.5, len(total) + 0.5)
+    axes.set_xlabel("inference", color=_MUTED)
+    axes.set_title("milliseconds by module", color=_MUTED)
     axes.legend(
-        loc="upper left",
-        bbox_to_anchor=(1.0, 1.0),
-        frameon=False,
-        reverse=True,
-        fontsize=size,
+        loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, reverse=True
     )
 
 
-def draw_tail(
-    axes: Axes, samples_us: Sequence[int], name: str, colour: Any, width: float
-) -> None:
-    """Draw the share of inferences that take as long as each one, or longer."""
+def _tail(axes: Axes, total: Totals) -> None:
     # of n inferences, n - k take as long as the k-th (from 0) or longer
-    slower = 1 - np.arange(len(samples_us)) / len(samples_us)
-    taken_ms = np.sort(samples_us) / 1e3
-    axes.step(taken_ms, slower, where="pre", color=colour, label=name, linewidth=width)
+    slower = 1 - np.arange(len(total)) / len(total)
+    axes.step(np.sort(total) / 1e3, slower, where="pre", color=_INK, linewidth=1.4)
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-
-
-def _tail(axes: Axes, total: Totals) -> None:
-    draw_tail(axes, total.tolist(), "", _INK, 1.4)
     # mark those percentiles that the samples suffice for
     samples = total.tolist()
     for percent, drawn in _MARKED.items():

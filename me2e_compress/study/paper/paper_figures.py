@@ -1,11 +1,13 @@
 """The paper's figures 5 and 7, from what was driven and timed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 
 from me2e_compress.metrics.route_values import DC, DE, DS, RouteColumn
 from me2e_compress.study.paper.paper_cells import held_at
@@ -14,7 +16,6 @@ from me2e_compress.study.paper.published import RATES
 from me2e_compress.study.report.figures import WIDTH_IN
 from me2e_compress.study.report.style import ACCENT, BASELINE, INK, MUTED, RULE, styled
 from me2e_compress.study.workload import held_frames
-from me2e_compress.workflows.latency_figure import draw_tail, stack_modules
 
 RATE_TICKS = (1, 2, 3, 5, 10, 20, 30)
 SLOWEST_SHOWN = 6
@@ -42,15 +43,14 @@ def where_the_time_goes(result: PaperDrives) -> Figure | None:
         figure = Figure(figsize=(WIDTH_IN, 3.4), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
         # modules of the baseline on the left
-        ordered = sorted(baseline.modules_us.items(), key=lambda part: -sum(part[1]))
-        inference = f"inference of {baseline.variant}, under a profiler"
-        stack_modules(left, dict(ordered), inference, ", on the device", 7.5)
+        _stack(left, baseline.modules_us, baseline.variant)
         # tails of several variants on the right
         names = _shown_tails(result)
         colours = colormaps["tab10"].colors  # type: ignore[attr-defined]
         for name, colour in zip(names, (BASELINE, *colours), strict=False):
-            if samples_us := result.fact(name).latency_us:
-                draw_tail(right, samples_us, name, colour, 1.2)
+            _tail(right, result.fact(name).latency_us, name, colour)
+        right.set_yscale("log")
+        right.yaxis.set_major_formatter(PercentFormatter(1.0))
         right.set_xlabel("milliseconds on the device")
         right.set_title("how many decisions take longer", color=MUTED)
         right.legend(frameon=False, fontsize=7.5, loc="upper right")
@@ -172,6 +172,33 @@ def _rate_axis(axes: Axes) -> None:
     axes.spines["left"].set_visible(False)
 
 
+def _stack(axes: Axes, parts: Mapping[str, tuple[int, ...]], name: str) -> None:
+    """Draw one bar per inference, one colour per module, the largest at the bottom."""
+    # largest module first, at the bottom
+    colours = colormaps["tab10"].colors  # type: ignore[attr-defined]
+    ordered = sorted(parts.items(), key=lambda part: -sum(part[1]))
+    total = sum(sum(samples) for _, samples in ordered)
+    count = len(ordered[0][1])
+    # one bar per inference
+    at, floor = np.arange(1, count + 1), np.zeros(count)
+    for (module, samples), colour in zip(ordered, colours, strict=False):
+        height = np.array(samples) / 1e3
+        label = f"{module}  {sum(samples) / max(1, total):.0%}"
+        axes.bar(at, height, 1.0, floor, color=colour, label=label, linewidth=0)
+        floor += height
+    # legend in the order of the stack
+    axes.set_xlim(0.5, count + 0.5)
+    axes.set_xlabel(f"inference of {name}, under a profiler")
+    axes.set_title("milliseconds by module, on the device", color=MUTED)
+    axes.legend(
+        loc="upper left",
+        bbox_to_anchor=(1.0, 1.0),
+        frameon=False,
+        reverse=True,
+        fontsize=7.5,
+    )
+
+
 def _shown_tails(result: PaperDrives) -> list[str]:
     """Return the baseline, and the other variants with the longest tails."""
     baseline = result.study.baseline
@@ -179,3 +206,19 @@ def _shown_tails(result: PaperDrives) -> list[str]:
     ranked = sorted(others, key=lambda each: -(each.latency_ms(99) or 0.0))
     names = [each.variant for each in ranked if each.variant != baseline]
     return [baseline, *names[: SLOWEST_SHOWN - 1]]
+
+
+def _tail(axes: Axes, samples_us: Sequence[int], name: str, colour: Any) -> None:
+    """Draw the share of inferences that exceed each latency."""
+    if not samples_us:
+        return
+    count = len(samples_us)
+    slower = 1 - np.arange(count) / count
+    axes.step(
+        np.sort(samples_us) / 1e3,
+        slower,
+        where="pre",
+        color=colour,
+        label=name,
+        linewidth=1.2,
+    )
