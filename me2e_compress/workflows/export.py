@@ -134,9 +134,11 @@ def export_stack(
 
 
 def _exported(stack: str, output: Path, options: ExportOptions) -> ExportResult:
-    weights, given = None, options.weights
-    if given is not None:
-        weights = published_weights(stack, given, heads=options.heads, ema=options.ema)
+    weights: PublishedWeights | None = None
+    if options.weights is not None:
+        weights = published_weights(
+            stack, options.weights, heads=options.heads, ema=options.ema
+        )
     # torch writes our own operator, which is translated to the dialect afterwards
     if options.dialect is not None:
         with tempfile.TemporaryDirectory(prefix="me2e-export-") as folder:
