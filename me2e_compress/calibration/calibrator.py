@@ -13,18 +13,8 @@ from me2e_compress.calibration.observers import DEFAULT_METHOD, OBSERVERS
 from me2e_compress.calibration.probes import Counts, Extremes
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
-from me2e_compress.calibration.statistics import (
-    BINS,
-    Statistics,
-    checksum,
-    no_element,
-)
-from me2e_compress.calibration.stream import (
-    Readings,
-    Recording,
-    probed_session,
-    stream,
-)
+from me2e_compress.calibration.statistics import BINS, Statistics, checksum, no_element
+from me2e_compress.calibration.stream import Readings, Recording, probed_session, stream
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.probing import Probe

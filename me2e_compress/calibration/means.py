@@ -104,20 +104,11 @@ class _Average:
         if self.like is None:
             raise FramesError(f"no frames: {self.name} has no mean")
         if self.total is None:
-            return _most_frequent(np.stack(self.kept))
+            from scipy import stats  # takes a second to import
+
+            # the smallest of the most frequent values
+            return np.asarray(stats.mode(np.stack(self.kept)).mode, self.like.dtype)
         mean = np.asarray(self.total / self.count)
         if self.like.dtype == np.bool_:
             return np.asarray(mean >= 0.5)
         return mean.astype(self.like.dtype)
-
-
-def _most_frequent(stack: Array) -> Array:
-    """Return the most frequent value of each element of [frames, ...] integers."""
-    columns = stack.reshape(len(stack), -1).T
-    picked = [_mode(column) for column in columns]
-    return np.array(picked, stack.dtype).reshape(stack.shape[1:])
-
-
-def _mode(column: Array) -> int:
-    values, counts = np.unique(column, return_counts=True)
-    return int(values[counts.argmax()])

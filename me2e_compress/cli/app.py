@@ -171,14 +171,14 @@ def _show_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-def _be_quiet(wanted: bool) -> None:
-    if wanted:
-        set_verbosity(Verbosity.QUIET)
+def _printing(*flags: str, help: str, wanted: Verbosity) -> Any:
+    """Return an option that sets how much is printed."""
 
+    def callback(given: bool) -> None:
+        if given:
+            set_verbosity(wanted)
 
-def _be_verbose(wanted: bool) -> None:
-    if wanted:
-        set_verbosity(Verbosity.VERBOSE)
+    return typer.Option(*flags, help=help, callback=callback, expose_value=False)
 
 
 Version = Annotated[
@@ -189,23 +189,11 @@ Version = Annotated[
 ]
 Quiet = Annotated[
     bool,
-    typer.Option(
-        "-q",
-        "--quiet",
-        help="only results and errors",
-        callback=_be_quiet,
-        expose_value=False,
-    ),
+    _printing("-q", "--quiet", help="only results and errors", wanted=Verbosity.QUIET),
 ]
+_NOTES = "notes and node lists too"
 Verbose = Annotated[
-    bool,
-    typer.Option(
-        "-v",
-        "--verbose",
-        help="notes and node lists too",
-        callback=_be_verbose,
-        expose_value=False,
-    ),
+    bool, _printing("-v", "--verbose", help=_NOTES, wanted=Verbosity.VERBOSE)
 ]
 COMMON = ("quiet", "verbose", "json")
 """Options that stand before or after the name of a command."""

@@ -17,12 +17,13 @@ from statistics import fmean
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.metrics.comfort import WINDOW, filtered
+from me2e_compress.metrics.comfort import WINDOW, Floats, filtered
 from me2e_compress.metrics.efficiency import (
     CHECKPOINTS,
     DONE_PERCENT,
     OUTLIER_PERCENT,
     PERCENT,
+    beside_traffic,
 )
 from me2e_compress.metrics.episode import EgoFrame, Episode
 from me2e_compress.metrics.infraction import InfractionKind
@@ -31,8 +32,6 @@ from me2e_compress.metrics.measure import Measure
 BLOCK_FRAMES = 20
 DELTA_S = 0.1
 SUCCESSES = ("Completed", "Perfect")
-
-Floats = npt.NDArray[np.float64]
 
 
 def success(episode: Episode) -> bool:
@@ -77,16 +76,10 @@ def speed_ratios(episode: Episode) -> tuple[float, ...]:
 
 
 def _percent(stretch: list[EgoFrame]) -> float:
-    seen = [
-        (frame.speed_mps, frame.traffic_speed_mps)
-        for frame in stretch
-        if frame.traffic_speed_mps is not None
-    ]
-    traffic = sum(traffic for _, traffic in seen)
+    ego, traffic, count = beside_traffic(stretch)
     if traffic == 0.0:
         return 100.0
-    mean_ego = sum(ego for ego, _ in seen) / len(seen)
-    return round(100.0 * mean_ego / (traffic / len(seen)), 2)
+    return round(100.0 * (ego / count) / (traffic / count), 2)
 
 
 def smoothness(episode: Episode) -> Measure:

@@ -19,11 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.intervals import mean_estimate
+from me2e_compress.metrics.intervals import Floats, mean_estimate
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_measures import RouteMeasures
-
-Floats = npt.NDArray[np.float64]
 
 MEASURES: tuple[str, ...] = ("driving score", "efficiency", "comfort", "energy")
 SIGNS = np.array([1.0, 1.0, 1.0, -1.0])

@@ -1,6 +1,6 @@
 """Driving efficiency: the ego's speed relative to the traffic around it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from statistics import fmean
 
 from me2e_compress.metrics.episode import EgoFrame, Ending, Episode
@@ -59,11 +59,16 @@ def _stretches(episode: Episode) -> Iterator[list[EgoFrame]]:
         yield stretch
 
 
-def _ratio_percent(stretch: list[EgoFrame]) -> float | None:
+def beside_traffic(stretch: Sequence[EgoFrame]) -> tuple[float, float, int]:
+    """Return summed ego and traffic speeds (m/s) of frames with traffic; how many."""
     seen = [
         (frame.speed_mps, frame.traffic_speed_mps)
         for frame in stretch
         if frame.traffic_speed_mps is not None
     ]
-    traffic = sum(traffic for _, traffic in seen)
-    return 100.0 * sum(ego for ego, _ in seen) / traffic if traffic > 0.0 else None
+    return sum(ego for ego, _ in seen), sum(other for _, other in seen), len(seen)
+
+
+def _ratio_percent(stretch: Sequence[EgoFrame]) -> float | None:
+    ego, traffic, _ = beside_traffic(stretch)
+    return 100.0 * ego / traffic if traffic > 0.0 else None

@@ -8,12 +8,7 @@ from typing import Any
 import numpy as np
 
 from me2e_compress.metrics import bench2drive, comfort, efficiency, surrogate_safety
-from me2e_compress.metrics.abilities import (
-    ABILITIES,
-    MEAN,
-    ability_rates,
-    successes,
-)
+from me2e_compress.metrics.abilities import ABILITIES, MEAN, ability_rates, successes
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import FAILURES, Episode
 from me2e_compress.metrics.intervals import (

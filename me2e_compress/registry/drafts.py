@@ -4,7 +4,7 @@ import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 _SETS: list[list[tuple[Path, Path]]] = []
@@ -78,3 +78,12 @@ def naming(path: Path) -> Iterator[None]:
         if error.errno is None:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+@contextlib.contextmanager
+def written(path: Path, error: Callable[[str], Exception]) -> Iterator[None]:
+    """Turn the system's refusal to write a file here into one line that names it."""
+    try:
+        yield
+    except OSError as cause:
+        raise error(f"{path}: cannot be written: {cause.strerror}") from cause

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from me2e_compress.display import Displayed, Table, counted, not_measured, table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.percentiles import percentile, too_few
-from me2e_compress.registry import documents
+from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.others_load import Load
 
@@ -150,12 +150,8 @@ class LatencyTrace(Displayed):
 
     def save(self, path: Path) -> None:
         """Write the trace atomically."""
-        try:
+        with drafts.written(path, EvaluationError):
             write_document(path, self.to_json())
-        except OSError as error:
-            raise EvaluationError(
-                f"{path}: cannot be written: {error.strerror}"
-            ) from error
 
     @classmethod
     def load(cls, path: Path) -> Self:

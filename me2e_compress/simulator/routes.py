@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.registry import documents
+from me2e_compress.registry import documents, drafts
 from me2e_compress.registry.marks import IN_JSON
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
@@ -180,10 +180,8 @@ def save_routes(routes: Sequence[Route], path: Path) -> None:
         mark |= {VERSION: ROAD_VERSION, DIGEST: digest_of(routes)}
     records[:1] = [mark | each for each in records[:1]]  # a list has no other place
     lines = ",\n".join(map(json.dumps, records))
-    try:
+    with drafts.written(path, EvaluationError):
         write_bytes(path, f"[\n{lines}\n]\n".encode())
-    except OSError as error:
-        raise EvaluationError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def pick_routes(routes: Sequence[Route], which: str) -> tuple[Route, ...]:

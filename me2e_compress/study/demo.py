@@ -2,12 +2,11 @@
 
 import dataclasses
 from collections.abc import Callable
-from pathlib import Path
 
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.manager import recipe
 from me2e_compress.quantization.plan import plan_of
-from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
+from me2e_compress.runtime.providers import CPU, PROVIDERS
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
@@ -18,19 +17,17 @@ from me2e_compress.study.tables import differences, scoreboards
 from me2e_compress.study.verdict import before_and_after, road_verdict
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.study.write import StudyFiles, write_study
-from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.claims import check_ours
-from me2e_compress.workflows.compare import compare
+from me2e_compress.workflows.compare import CompareResult
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import CompressResult, beside
+from me2e_compress.workflows.demo_stack import Demo
 from me2e_compress.workflows.export import ExportOptions, export_stack
-from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.workflows.listener import Listener
-from me2e_compress.workflows.module_changes import ModuleChanges, compare_modules
+from me2e_compress.workflows.module_changes import ModuleChanges
 from me2e_compress.workflows.result import Result, Table
 
-CALIBRATION_FRAMES, CALIBRATION_SEED = 64, 0
-HELD_OUT_FRAMES, HELD_OUT_SEED = 24, 1
+CALIBRATION_FRAMES, HELD_OUT_FRAMES = 64, 24
 LATENCY_SAMPLES = 100
 FLOAT = "float"
 
@@ -76,16 +73,12 @@ class DriveResult(Result):
 
 
 @dataclasses.dataclass(frozen=True)
-class DriverDemo:
+class DriverDemo(Demo):
     """Compress the shipped driver and compare both on the road.
 
     Attributes:
-        name: Name of the driver.
-        recipe_name: A shipped recipe.
         routes: Routes that both drive: a number or ``ID,ID``.
         workers: Number of concurrent routes.
-        provider: Execution provider for the graphs.
-        force: Also replace files that we did not write.
 
     Raises:
         RecipeError: There is no such recipe.
@@ -93,20 +86,14 @@ class DriverDemo:
         GraphError: The output folder is a file, or a user's file would be overwritten.
     """
 
-    name: str
-    out: Path
-    recipe_name: str = "full-fused"
     routes: str = "5"
     workers: int = 2
-    provider: Provider = CPU
-    force: bool = False
     _told: list[Section] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
         """Check recipe, routes and outputs first: the work takes minutes."""
-        recipe.load(self.recipe_name)
+        super().__post_init__()
         pick_routes(load_routes(), self.routes)
-        check_folder(self.out, ())
         records = (beside(self._small, what) for what in ("report", "plan"))
         pages = (self.out / name for name in (JSON, MARKDOWN, HTML))
         check_ours(
@@ -118,12 +105,7 @@ class DriverDemo:
     @property
     def steps(self) -> dict[str, Callable[[Listener], Result]]:
         """The steps by name, in order."""
-        return {
-            "compress": self.compress,
-            "weigh": self.weigh,
-            "compare": self.compare,
-            "drive": self.drive,
-        }
+        return {"compress": self.compress, **super().steps, "drive": self.drive}
 
     def compress(self, listener: Listener) -> CompressResult:
         """Copy the driver, record frames, and compress it.
@@ -132,12 +114,7 @@ class DriverDemo:
         slower than float on the CPU.
         """
         export_stack(self.name, self._source, ExportOptions(force=self.force))
-        for folder, count, seed in (
-            (self._frames, CALIBRATION_FRAMES, CALIBRATION_SEED),
-            (self._held_out, HELD_OUT_FRAMES, HELD_OUT_SEED),
-        ):
-            asked = FramesOptions(count, seed, provider=self.provider, force=self.force)
-            record_frames(self._source, folder, asked, listener)
+        self._record(self._source, (CALIBRATION_FRAMES, HELD_OUT_FRAMES), listener)
         passes = recipe.load(self.recipe_name)
         quantizes = any(each.quantizes for each in passes)
         target = self.provider.target if quantizes else None
@@ -160,19 +137,13 @@ class DriverDemo:
 
     def weigh(self, listener: Listener) -> ModuleChanges:
         """Compare the modules before and after."""
-        found = compare_modules(self._source, self._small)
+        found = super().weigh(listener)
         self._told.append(Section("The modules", found.tables()))
         return found
 
-    def compare(self, listener: Listener) -> Result:
+    def compare(self, listener: Listener) -> CompareResult:
         """Compare the compressed graph with the driver on other frames."""
-        found = compare(
-            self._source,
-            self._small,
-            self._held_out,
-            listener,
-            provider=self.provider,
-        )
+        found = super().compare(listener)
         self._told.append(Section("The outputs", found.tables()))
         return found
 
@@ -237,19 +208,3 @@ class DriverDemo:
             f"  me2e-compress compress {self.name} -r {self.recipe_name} --frames"
             f" {self._frames} -o {self.name}.trt.onnx",
         )
-
-    @property
-    def _source(self) -> Path:
-        return self.out / f"{self.name}.onnx"
-
-    @property
-    def _small(self) -> Path:
-        return self.out / f"{self.name}.{self.recipe_name}.onnx"
-
-    @property
-    def _frames(self) -> Path:
-        return self.out / "frames"
-
-    @property
-    def _held_out(self) -> Path:
-        return self.out / "frames-held-out"

@@ -19,7 +19,7 @@ from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.metrics.route_values import DS, RouteColumn, RouteValues
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.registry import documents
+from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_bytes
 
 
@@ -154,11 +154,9 @@ class DriveRecord:
         }
         rows = [_ROUTE.dump_python(each, mode="json") for each in self.routes]
         lines = [json.dumps(row, ensure_ascii=False) for row in (head, *rows)]
-        try:
+        with drafts.written(path, StudyError):
             path.parent.mkdir(parents=True, exist_ok=True)
             write_bytes(path, ("\n".join(lines) + "\n").encode())
-        except OSError as error:
-            raise StudyError(f"{path}: cannot be written: {error.strerror}") from error
 
     @classmethod
     def load(cls, path: Path) -> Self:

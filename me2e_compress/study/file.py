@@ -226,7 +226,7 @@ class _Reader:
             table.name,
             policy,
             self._passes(table),
-            self._map(table.map),
+            None if table.map is None else self._file_or_name(table.map),
             self._adapter(adapter),
             self._file(table.trace),
             stage,
@@ -246,13 +246,11 @@ class _Reader:
             return recipe.parse(table.passes)
         if table.recipe is None:
             return ()
-        beside = self._beside(table.recipe)
-        return recipe.load(beside if beside.is_file() else table.recipe)
+        return recipe.load(self._file_or_name(table.recipe))
 
-    def _map(self, name: str | None) -> str | None:
-        if name is None or not self._beside(name).is_file():
-            return name
-        return str(self._beside(name))
+    def _file_or_name(self, name: str) -> str:
+        """Return the path of a file beside the study, else what ships by that name."""
+        return str(self._beside(name)) if self._beside(name).is_file() else name
 
     def _routes(
         self, which: str | None, table: _Study

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.latency import LatencySource
@@ -152,9 +153,7 @@ def _measured(
         samples=study.timing.samples,
         threads=study.timing.threads,
         provider=study.provider,
-        on_sample=lambda done, total, words: listener.on_progress(
-            "latency", done, total, words
-        ),
+        on_sample=partial(listener.on_progress, "latency"),
     )
     # put them on the scale of the kept baseline
     if kept is None:

@@ -15,6 +15,7 @@ def before_and_after(outcome: StudyOutcome, name: str) -> Table:
     """Compare the baseline and a variant of a study with one condition."""
     # size, latency, plan and driving, one row each
     before, after = outcome.variant(outcome.study.baseline), outcome.variant(name)
+    medians = before.latency_ms[50], after.latency_ms[50]
     moved, most = after.fidelity.mean_m, after.fidelity.max_m
     far = "" if most.value is None else f"{most.value:.2f} m at most"
     driven = [_drive(outcome, each.name) for each in (before, after)]
@@ -24,7 +25,7 @@ def before_and_after(outcome: StudyOutcome, name: str) -> Table:
         ("", before.name, after.name, ""),
         (
             _row("size, MB", before.size_mb, after.size_mb, ".2f"),
-            _row("time of a decision, ms", *_medians(outcome, name), ".1f"),
+            _row("time of a decision, ms", *medians, ".1f"),
             (
                 Cell("the plan moves by, m"),
                 Cell(MISSING),
@@ -73,11 +74,6 @@ def _road(found: PairedDifference, outcome: StudyOutcome) -> str:
 def _drive(outcome: StudyOutcome, name: str) -> DriveRecord:
     (drive,) = (each for each in outcome.drives if each.variant == name)
     return drive
-
-
-def _medians(outcome: StudyOutcome, name: str) -> tuple[Measure, Measure]:
-    before, after = outcome.variant(outcome.study.baseline), outcome.variant(name)
-    return before.latency_ms[50], after.latency_ms[50]
 
 
 def _row(what: str, before: Measure, after: Measure, form: str) -> tuple[Cell, ...]:

@@ -56,7 +56,7 @@ def write_study(
     else:
         page = study_page(outcome, command, sections)
     # all files are written, or none
-    try:
+    with drafts.written(folder, StudyError):
         folder.mkdir(parents=True, exist_ok=True)
         with (
             writing([written.record, written.tables, written.report], force=force),
@@ -65,6 +65,4 @@ def write_study(
             write_document(written.record, outcome.to_json(), indent=1)
             write_bytes(written.tables, text.encode())
             write_bytes(written.report, page.html().encode())
-    except OSError as error:
-        raise StudyError(f"{folder}: cannot be written: {error.strerror}") from error
     return written

@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
+from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.targets.tensorrt.tensorrt_engine import (
     EngineSettings,
@@ -88,12 +89,8 @@ def build(
         listener.on_progress("build", 0, 1, source.name)
         with _one_file(source) as file:
             engine = build_engine(file, options.settings)
-        try:
+        with drafts.written(output, GraphError):
             write_bytes(output, engine.content)
-        except OSError as error:
-            raise GraphError(
-                f"{output}: cannot be written: {error.strerror}"
-            ) from error
         listener.on_progress("build", 1, 1, source.name)
     return EngineResult(source, output, engine)
 

@@ -36,7 +36,6 @@ from me2e_compress.workflows.calibrate_options import (
     check_sources,
     checkpoint_beside,
     overrides_beside,
-    read_files,
     share_of,
     written_files,
 )
@@ -80,10 +79,9 @@ def calibrate(
     options = options or CalibrateOptions()
     source, output = model_path(model), output_path(output)
     check_sources(frames, options)
-    outputs, inputs = (
-        written_files(output, options),
-        read_files(source, frames, options),
-    )
+    named = (options.recipe, options.module_map, options.imported, options.adapter)
+    outputs = written_files(output, options)
+    inputs = (source, frames, *named, *options.merge)
     if options.onnxruntime_table is not None:
         check_folder(Path(options.onnxruntime_table), inputs, TABLE_FILES)
     with writing(outputs, inputs, force=options.force):

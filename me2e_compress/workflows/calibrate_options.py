@@ -8,7 +8,7 @@ from me2e_compress.calibration.exchange import TABLE_FILES
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.workflows.checks import MOST_THREADS, Given, check_count
+from me2e_compress.workflows.checks import MOST_THREADS, check_count
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,14 +105,6 @@ def written_files(output: Path, options: CalibrateOptions) -> list[Path]:
         if folder.is_dir():
             files += (folder / name for name in TABLE_FILES)
     return files
-
-
-def read_files(
-    source: Path, frames: str | Path | None, options: CalibrateOptions
-) -> tuple[Given, ...]:
-    """List the files and folders that are read."""
-    named = (options.recipe, options.module_map, options.imported, options.adapter)
-    return (source, frames, *named, *options.merge)
 
 
 def share_of(text: str) -> tuple[int, int]:

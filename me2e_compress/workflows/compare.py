@@ -20,10 +20,7 @@ from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack_session import open_session
-from me2e_compress.workflows.checks import (
-    check_number,
-    model_path,
-)
+from me2e_compress.workflows.checks import check_number, model_path
 from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, counted, table

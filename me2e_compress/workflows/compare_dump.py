@@ -25,9 +25,7 @@ from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack_session import open_session
 from me2e_compress.targets.quantized import describe_quantized
-from me2e_compress.workflows.checks import (
-    model_path,
-)
+from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.compress_result import beside
 from me2e_compress.workflows.first_difference import told_of, with_modules
 from me2e_compress.workflows.first_opening import try_model

@@ -173,7 +173,7 @@ class _Measurement:
         added = found.fidelity
         if quantizer is not lossy[0]:  # it is judged by what it adds to the others
             reference = self._reference(quantizer)
-            added = self._compare(reference)
+            added = reference.compare(self._session(self.report.model))
             if not self.floor.shortfalls(added, found.unsteady):
                 others = tuple(each for each in names if each != quantizer.applied.name)
                 return dataclasses.replace(found, guilty=others)
@@ -242,9 +242,6 @@ class _Measurement:
 
     def _reference(self, first: LossyPass) -> Reference:
         return Reference.of(self._session(first.before), self.frames)
-
-    def _compare(self, reference: Reference) -> Fidelity:
-        return reference.compare(self._session(self.report.model))
 
     def _session(self, model: ir.Model) -> Session:
         return Session(model, release=True, provider=self.context.provider)

@@ -10,7 +10,7 @@ from me2e_compress.workflows.result import Table, counted, not_measured, number,
 
 def deadlines_table(title: str, found: Deadlines) -> Table:
     """Return percentiles, and how many decisions took longer than the budget."""
-    rows = [(name, *_cells(measure)) for name, measure in _each(found)]
+    rows = [(n, number(each.value, ".2f"), each.unit) for n, each in _each(found)]
     why = {name: each.reason for name, each in _each(found) if each.value is None}
     return table(
         f"{title}: {counted(found.count, 'decision')}",
@@ -34,7 +34,3 @@ def _each(found: Deadlines) -> Iterator[tuple[str, Measure]]:
     if found.critical_ms.value is not None:
         yield "mean, TTC below 1.5 s", found.critical_ms
         yield "mean, other frames", found.other_ms
-
-
-def _cells(measure: Measure) -> tuple[str, str]:
-    return number(measure.value, ".2f"), measure.unit

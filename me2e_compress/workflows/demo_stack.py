@@ -1,4 +1,4 @@
-"""The demo with a stack of published size, which does not drive."""
+"""Steps of all demos; the demo with a stack of published size, which does not drive."""
 
 import dataclasses
 from collections.abc import Callable
@@ -23,7 +23,6 @@ from me2e_compress.workflows.result import Result, Table, megabytes, table
 
 CALIBRATION_FRAMES, HELD_OUT_FRAMES = 8, 4
 SCENE_LENGTH = 4
-CALIBRATION_SEED, HELD_OUT_SEED = 0, 1
 ROUNDS, THREADS = 4, 2
 """How latencies are measured: rounds of all files, and threads of onnxruntime."""
 
@@ -113,40 +112,92 @@ class FilesResult(Result):
 
 
 @dataclasses.dataclass(frozen=True)
-class StackDemo:
-    """A stack of the zoo, ``vad-tiny``, to export, compress, compare and time."""
+class Demo:
+    """Steps of a demo: make a model small, weigh it and compare it with its source.
 
-    stack: str
+    Attributes:
+        name: a stack or driver of the zoo.
+        out: the folder that everything is written to.
+        recipe_name: a shipped recipe, or a TOML file.
+        provider: what runs the graphs.
+        force: replace files that we did not write, too.
+
+    Raises:
+        RecipeError: There is no such recipe.
+        GraphError: The output folder is a file.
+    """
+
+    name: str
     out: Path
     recipe_name: str = "full-fused"
     provider: Provider = CPU
     force: bool = False
-    _compared: list[CompareResult] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
+        """Check recipe and folder first: the work takes minutes."""
         recipe.load(self.recipe_name)
         check_folder(self.out, ())
 
     @property
     def steps(self) -> dict[str, Callable[[Listener], Result]]:
+        """The steps by name, in order, once the model is compressed."""
+        return {"weigh": self.weigh, "compare": self.compare}
+
+    def weigh(self, listener: Listener) -> ModuleChanges:
+        """Weigh the modules before and after."""
+        return compare_modules(self._source, self._small)
+
+    def compare(self, listener: Listener) -> CompareResult:
+        """Compare the small graph with its source on the held-out frames."""
+        graphs = self._source, self._small
+        return compare(*graphs, self._held_out, listener, provider=self.provider)
+
+    def _record(
+        self,
+        source: str | Path,
+        counts: tuple[int, int],
+        listener: Listener,
+        scene_length: int | None = None,
+    ) -> None:
+        """Record frames to calibrate on, and others to compare on, of the next seed."""
+        folders = self._frames, self._held_out
+        for seed, (folder, count) in enumerate(zip(folders, counts, strict=True)):
+            asked = count, seed, scene_length, self.force, self.provider
+            record_frames(source, folder, FramesOptions(*asked), listener)
+
+    @property
+    def _source(self) -> Path:
+        return self.out / f"{self.name}.onnx"
+
+    @property
+    def _small(self) -> Path:
+        return self.out / f"{self.name}.{self.recipe_name}.onnx"
+
+    @property
+    def _frames(self) -> Path:
+        return self.out / "frames"
+
+    @property
+    def _held_out(self) -> Path:
+        return self.out / "frames-held-out"
+
+
+@dataclasses.dataclass(frozen=True)
+class StackDemo(Demo):
+    """A stack of the zoo, ``vad-tiny``, to export, compress, compare and time."""
+
+    _compared: list[CompareResult] = dataclasses.field(default_factory=list, init=False)
+
+    @property
+    def steps(self) -> dict[str, Callable[[Listener], Result]]:
         """The steps by name, in order."""
-        return {
-            "compress": self.compress,
-            "weigh": self.weigh,
-            "compare": self.compare,
-            "time": self.time,
-        }
+        return {"compress": self.compress, **super().steps, "time": self.time}
 
     def compress(self, listener: Listener) -> CompressResult:
         """Export the stack, write its frames and compress it."""
-        # calibration and comparison get frames of different seeds
-        export_stack(self.stack, self._source, ExportOptions(force=self.force))
-        for folder, count, seed in (
-            (self._frames, CALIBRATION_FRAMES, CALIBRATION_SEED),
-            (self._held_out, HELD_OUT_FRAMES, HELD_OUT_SEED),
-        ):
-            options = FramesOptions(count, seed, SCENE_LENGTH, force=self.force)
-            record_frames(self.stack, folder, options, listener)
+        export_stack(self.name, self._source, ExportOptions(force=self.force))
+        counts = CALIBRATION_FRAMES, HELD_OUT_FRAMES
+        self._record(self.name, counts, listener, SCENE_LENGTH)
         # Fidelity is measured on frames of another seed, see `compare`.
         unmeasured = CompressOptions(
             measure_frames=0, provider=self.provider, force=self.force
@@ -160,26 +211,15 @@ class StackDemo:
             listener,
         )
 
-    def weigh(self, listener: Listener) -> ModuleChanges:
-        """Weigh the modules before and after."""
-        return compare_modules(self._source, self._small)
-
-    def compare(self, listener: Listener) -> Result:
+    def compare(self, listener: Listener) -> CompareResult:
         """Compare the small graph with the stack on the held-out frames."""
-        found = compare(
-            self._source,
-            self._small,
-            self._held_out,
-            listener,
-            provider=self.provider,
-        )
-        self._compared.append(found)
-        return found
+        self._compared.append(super().compare(listener))
+        return self._compared[-1]
 
     def time(self, listener: Listener) -> FilesResult:
         """Time the stack, its exact form and the small graph in turn."""
         # the exact form shows how much of the gain is not int8's
-        exact = self.out / f"{self.stack}.exact.onnx"
+        exact = self.out / f"{self.name}.exact.onnx"
         unchecked = CompressOptions(
             verify_frames=0, provider=self.provider, force=self.force
         )
@@ -202,19 +242,3 @@ class StackDemo:
             self._compared[-1].headline if self._compared else "plan: not measured",
             self.provider,
         )
-
-    @property
-    def _source(self) -> Path:
-        return self.out / f"{self.stack}.onnx"
-
-    @property
-    def _small(self) -> Path:
-        return self.out / f"{self.stack}.{self.recipe_name}.onnx"
-
-    @property
-    def _frames(self) -> Path:
-        return self.out / "frames"
-
-    @property
-    def _held_out(self) -> Path:
-        return self.out / "frames-held-out"

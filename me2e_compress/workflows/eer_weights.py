@@ -9,7 +9,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, with_config
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.eer import MEASURES, EerResult, EerScale, Normalization
-from me2e_compress.registry import documents
+from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_json
 
 Kind = Literal["measured", "modelled"]
@@ -67,11 +67,8 @@ def save_weights(path: Path, found: Mapping[Kind, EerResult]) -> None:
         reason = next(iter(result.scores.values())).measure.reason
         raise EvaluationError(f"{path}: there are no weights to save: {reason}")
     saved = SavedWeights.of(result.scale, kind)
-    try:
+    with drafts.written(path, EvaluationError):
         write_json(path, dataclasses.asdict(saved), indent=1)
-    except OSError as error:
-        said = f"{path}: cannot be written: {error.strerror}"
-        raise EvaluationError(said) from error
 
 
 _FILE = TypeAdapter(SavedWeights)

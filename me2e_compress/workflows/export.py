@@ -9,12 +9,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.graph import file_bytes, rewrite
-from me2e_compress.operators import (
-    dialect_of,
-    fused_nodes,
-    import_domains,
-    translate,
-)
+from me2e_compress.operators import dialect_of, fused_nodes, import_domains, translate
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.passes.fold_constants.knowledge import Sweep
 from me2e_compress.passes.import_normalize import with_own_domains
@@ -139,7 +134,11 @@ def export_stack(
 
 
 def _exported(stack: str, output: Path, options: ExportOptions) -> ExportResult:
-    weights = _read(stack, options)
+    weights: PublishedWeights | None = None
+    if options.weights is not None:
+        weights = published_weights(
+            stack, options.weights, heads=options.heads, ema=options.ema
+        )
     # torch writes our own operator, which is translated to the dialect afterwards
     if options.dialect is not None:
         with tempfile.TemporaryDirectory(prefix="me2e-export-") as folder:
@@ -151,14 +150,6 @@ def _exported(stack: str, output: Path, options: ExportOptions) -> ExportResult:
         _written(stack, output, options, weights)
     record = None if weights is None else weights.record
     return ExportResult(stack, output, options.opset, record)
-
-
-def _read(stack: str, options: ExportOptions) -> PublishedWeights | None:
-    if options.weights is None:
-        return None
-    return published_weights(
-        stack, options.weights, heads=options.heads, ema=options.ema
-    )
 
 
 def _written(

@@ -15,10 +15,7 @@ from me2e_compress.fidelity.places import Place
 from me2e_compress.graph import LoadedModel, provenance
 from me2e_compress.graph.modules import ModuleMap, assign, map_of
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.workflows.checks import (
-    check_count,
-    model_path,
-)
+from me2e_compress.workflows.checks import check_count, model_path
 from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, counted, number, table

@@ -26,11 +26,7 @@ from me2e_compress.runtime.energy.modelled import (
     modelled_energy,
 )
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.workflows.checks import (
-    lacking_shapes,
-    load_map,
-    model_path,
-)
+from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
 from me2e_compress.workflows.inspect_result import FedInput, InspectResult
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.module_costs import (

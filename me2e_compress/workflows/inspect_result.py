@@ -5,14 +5,7 @@ import dataclasses
 from me2e_compress.graph import Port
 from me2e_compress.graph.modules import Item
 from me2e_compress.runtime.energy.modelled import ModelledEnergy
-from me2e_compress.workflows.result import (
-    Result,
-    Table,
-    giga,
-    megabytes,
-    number,
-    table,
-)
+from me2e_compress.workflows.result import Result, Table, giga, megabytes, number, table
 
 _SHOWN = 8
 """Number of reasons for unknown MACs that are named."""

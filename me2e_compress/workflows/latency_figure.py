@@ -14,6 +14,7 @@ from matplotlib.ticker import PercentFormatter
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.percentiles import percentile, too_few
+from me2e_compress.registry import drafts
 from me2e_compress.registry.marks import MARK
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.latency_trace import LatencyTrace, Microseconds
@@ -51,10 +52,8 @@ def draw_modules(trace: LatencyTrace, name: str, path: Path) -> None:
         about = {"Software" if kind == "png" else "Creator": MARK}
         undated = {"Date": None} if kind == "svg" else {}
         figure.savefig(drawn, format=kind, dpi=160, metadata=about | undated)
-    try:
+    with drafts.written(path, EvaluationError):
         write_bytes(path, drawn.getvalue())
-    except OSError as error:
-        raise EvaluationError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def modules_figure(trace: LatencyTrace, name: str) -> Figure:

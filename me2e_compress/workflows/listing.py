@@ -19,7 +19,6 @@ from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapter
 from me2e_compress.errors import RecipeError
 from me2e_compress.evaluators import EVALUATORS
 from me2e_compress.graph import modules
-from me2e_compress.manager import recipe
 from me2e_compress.operators import OPERATORS
 from me2e_compress.passes import PASSES
 from me2e_compress.quantization.rules import RULE_SETS, RULES
@@ -81,14 +80,9 @@ def _registered(kind: str) -> tuple[Entry, ...]:
     return describe(REGISTRIES[kind])
 
 
-def _recipes() -> tuple[Entry, ...]:
-    folder = resources.files("me2e_compress") / "recipes"
-    return tuple(_file(folder / f"{name}.toml") for name in recipe.shipped())
-
-
-def _studies() -> tuple[Entry, ...]:
-    folder = resources.files("me2e_compress") / "study" / "shipped"
-    files = sorted(folder.iterdir(), key=lambda path: path.name)
+def _shipped(*folder: str) -> tuple[Entry, ...]:
+    found = resources.files("me2e_compress").joinpath(*folder).iterdir()
+    files = sorted(found, key=lambda path: path.name.removesuffix(".toml"))
     return tuple(_file(path) for path in files if path.name.endswith(".toml"))
 
 
@@ -137,8 +131,8 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
 """Registries to which other packages add."""
 KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
     **{kind: partial(_registered, kind) for kind in REGISTRIES},
-    "recipes": _recipes,
-    "studies": _studies,
+    "recipes": partial(_shipped, "recipes"),
+    "studies": partial(_shipped, "study", "shipped"),
     "adapters": _adapters,
     "module-maps": _module_maps,
     "stacks": _stacks,

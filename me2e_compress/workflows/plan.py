@@ -106,18 +106,8 @@ class PlanResult(Result):
 
     def records(self) -> list[dict[str, object]]:
         """Return one row per node."""
-        return [
-            {
-                "module": each.module,
-                "node": each.node,
-                "op": each.op,
-                "dtype": each.dtype,
-                "rule": each.rule,
-                "reason": each.reason,
-                "borderline": each.borderline,
-            }
-            for each in self.plan.decisions
-        ]
+        names = ("module", "node", "op", "dtype", "rule", "reason", "borderline")
+        return [{n: getattr(each, n) for n in names} for each in self.plan.decisions]
 
     def to_json(self) -> object:
         """Return the plan, or the differences from another."""

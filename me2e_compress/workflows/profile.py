@@ -20,10 +20,7 @@ from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.energy.energy_counter import check_counter
 from me2e_compress.runtime.energy.models import measure_energy
 from me2e_compress.runtime.energy.schedule import EnergySchedule
-from me2e_compress.runtime.latency_trace import (
-    LatencyTrace,
-    Microseconds,
-)
+from me2e_compress.runtime.latency_trace import LatencyTrace, Microseconds
 from me2e_compress.runtime.others_load import OthersLoad
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure

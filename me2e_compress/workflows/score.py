@@ -15,13 +15,7 @@ from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.workflows.deadlines_table import check_budget, deadlines_table
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import (
-    Result,
-    Table,
-    not_measured,
-    number,
-    table,
-)
+from me2e_compress.workflows.result import Result, Table, not_measured, number, table
 from me2e_compress.workflows.score_bench2drive import (
     STANDING,
     Bench2DriveOptions,
@@ -107,9 +101,7 @@ class ScoreResult(Result):
         }
 
     def _of(self, name: str, scores: Scores) -> tuple[Table, ...]:
-        late = [
-            deadlines_table(name, each) for at, each in self.late.items() if at == name
-        ]
+        late = [deadlines_table(name, self.late[name])] if name in self.late else []
         if name not in self.real:
             return (scores_table(name, scores), *late)
         real = self.real[name]

@@ -135,17 +135,11 @@ class RealRun:
         }
 
     def _named(self) -> dict[str, tuple[str, ...]]:
-        found = self.collected
-        return {
-            "crashed": found.crashed,
-            "missing": found.missing,
-            "foreign": found.foreign,
-            "repeated": found.repeated,
-            "rerun": found.rerun,
-            "contradictory": found.contradictory,
-            "unrecorded": found.unrecorded,
-            "stood": self.stood,
-        }
+        names = (
+            *("crashed", "missing", "foreign", "repeated", "rerun"),
+            *("contradictory", "unrecorded"),
+        )
+        return {n: getattr(self.collected, n) for n in names} | {"stood": self.stood}
 
     def _stated(self) -> Iterator[str]:
         """Yield where merged files contradict their own records."""

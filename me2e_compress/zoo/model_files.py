@@ -15,11 +15,11 @@ def write(path: Path, content: bytes) -> Path:
         raise GraphError(
             f"{path}: its folder cannot be made: {error.strerror}"
         ) from error
-    try:
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".model-") as folder:
-            draft = Path(folder) / path.name
-            draft.write_bytes(content)
-            drafts.put(draft, path)
-    except OSError as error:
-        raise GraphError(f"{path}: cannot be written: {error.strerror}") from error
+    with (
+        drafts.written(path, GraphError),
+        tempfile.TemporaryDirectory(dir=path.parent, prefix=".model-") as folder,
+    ):
+        draft = Path(folder) / path.name
+        draft.write_bytes(content)
+        drafts.put(draft, path)
     return path

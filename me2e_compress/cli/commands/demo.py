@@ -48,7 +48,8 @@ def demo(
         need_extra("highway", "driving in the demo")
         from me2e_compress.study.demo import DriverDemo
 
-        steps = DriverDemo(stack, output, recipe, routes, workers, runs, force).steps
+        driver = stack, output, recipe, runs, force
+        steps = DriverDemo(*driver, routes, workers).steps
     else:
         steps = StackDemo(stack, output, recipe, runs, force).steps
     # each step says what it found as soon as it is done

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.latency_trace import LatencyTrace
 
@@ -49,12 +50,8 @@ class MetricInfo:
         own = getattr(self.agent, "save_path", None)
         path = (self.folder if own is None else Path(own)) / FILE
         records = {str(step): record for step, record in self.records.items()}
-        try:
+        with drafts.written(path, EvaluationError):
             write_json(path, records)
-        except OSError as error:
-            raise EvaluationError(
-                f"{path}: cannot be written: {error.strerror}"
-            ) from error
 
 
 LINES = "decisions.jsonl"

@@ -10,7 +10,7 @@ from pydantic import Field, TypeAdapter
 
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import EnergyError
-from me2e_compress.registry import documents
+from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.energy.estimate import Window, estimate
 from me2e_compress.runtime.energy.reader import DeviceState
@@ -158,10 +158,8 @@ class EnergyResult(Displayed):
 
     def save(self, path: Path) -> None:
         """Write the result atomically."""
-        try:
+        with drafts.written(path, EnergyError):
             write_document(path, self.to_json(), indent=2)
-        except OSError as error:
-            raise EnergyError(f"{path}: cannot be written: {error.strerror}") from error
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -126,9 +127,7 @@ def _joules(
         module_map=study.reference.module_map,
         threads=study.timing.threads,
         provider=study.provider,
-        on_window=lambda done, total, name: listener.on_progress(
-            "energy", done, total, name
-        ),
+        on_window=partial(listener.on_progress, "energy"),
     )
 
 

@@ -17,7 +17,7 @@ from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.infraction import COLLISIONS, InfractionKind
 from me2e_compress.metrics.route_summary import RouteSummary
-from me2e_compress.registry import documents
+from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import Route
@@ -81,10 +81,8 @@ class Accident:
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""
-        try:
+        with drafts.written(path, StudyError):
             write_json(path, _ACCIDENT.dump_python(self, mode="json"))
-        except OSError as error:
-            raise StudyError(f"{path}: cannot be written: {error.strerror}") from error
 
     @classmethod
     def load(cls, path: Path) -> "Accident":

@@ -79,7 +79,7 @@ def energy_cells(
         name: (
             estimate_cell(_joules(result.fact(name)), ".3g"),
             estimate_cell(score[name]),
-            plain_cell(_milli(result.fact(name).modelled_j), ".3g", "not counted"),
+            plain_cell(times(result.fact(name).modelled_j, 1e3), ".3g", "not counted"),
             estimate_cell(modelled_score[name]),
         )
         for name in variants
@@ -140,5 +140,6 @@ def _joules(fact: ModelFacts) -> Estimate:
     return Estimate(Measure(mean, "J"), low, high, 0)
 
 
-def _milli(joules: float | None) -> float | None:
-    return None if joules is None else 1e3 * joules
+def times(joules: float | None, factor: float) -> float | None:
+    """Multiply joules per frame by frames per second, or to another unit."""
+    return None if joules is None else joules * factor

@@ -10,7 +10,7 @@ from pydantic import ConfigDict, TypeAdapter, with_config
 
 from me2e_compress.errors import StudyError
 from me2e_compress.metrics.route_values import COLUMNS, RouteColumn
-from me2e_compress.registry import documents
+from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.study.drive_record import DriveRecord
@@ -112,11 +112,9 @@ class KeptFacts:
 
     def save(self, path: Path) -> None:
         """Write them as JSON."""
-        try:
+        with drafts.written(path, StudyError):
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, _KEPT.dump_python(self, mode="json"))
-        except OSError as error:
-            raise StudyError(f"{path}: cannot be written: {error.strerror}") from error
 
     @classmethod
     def load(cls, path: Path) -> "KeptFacts":

@@ -14,14 +14,7 @@ from me2e_compress.study.paper.paper_cells import held_at
 from me2e_compress.study.paper.paper_drives import PaperDrives
 from me2e_compress.study.paper.published import RATES
 from me2e_compress.study.report.figures import WIDTH_IN
-from me2e_compress.study.report.style import (
-    ACCENT,
-    BASELINE,
-    INK,
-    MUTED,
-    RULE,
-    styled,
-)
+from me2e_compress.study.report.style import ACCENT, BASELINE, INK, MUTED, RULE, styled
 from me2e_compress.study.workload import held_frames
 
 RATE_TICKS = (1, 2, 3, 5, 10, 20, 30)

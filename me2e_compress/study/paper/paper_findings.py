@@ -8,11 +8,7 @@ from me2e_compress.metrics.differences import holm
 from me2e_compress.study.cells import MISSING, estimate_cell
 from me2e_compress.study.paper.evidence import Found, evidence
 from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.study.paper.questions import (
-    BEFORE,
-    PaperQuestion,
-    PaperQuestions,
-)
+from me2e_compress.study.paper.questions import BEFORE, PaperQuestion, PaperQuestions
 from me2e_compress.workflows.result import Cell, Table
 
 FIRST = "first form"

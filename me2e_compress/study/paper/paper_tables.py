@@ -22,6 +22,7 @@ from me2e_compress.study.paper.paper_cells import (
     ranking_note,
     rate_cells,
     score_cells,
+    times,
 )
 from me2e_compress.study.paper.paper_counts import partners, table_4
 from me2e_compress.study.paper.paper_drives import PaperDrives
@@ -178,8 +179,8 @@ def table_6(result: PaperDrives, block: StudyBlock) -> Table:
         (
             *cells,
             Cell(MISSING, reason="power at a limited rate is not measured"),
-            plain_cell(_times(joules, given.fps), ".3g", fact.no_joules),
-            plain_cell(_times(fact.modelled_j, given.fps), ".3g", "not counted"),
+            plain_cell(times(joules, given.fps), ".3g", fact.no_joules),
+            plain_cell(times(fact.modelled_j, given.fps), ".3g", "not counted"),
             *given_cells(given),
             Cell("" if given.watts is None else f"{given.watts:.0f}"),
         )
@@ -277,11 +278,6 @@ def _less(whole: int | None, left: int | None, unit: float) -> Cell:
     if whole is None or left is None:
         return Cell(MISSING, reason="not counted")
     return Cell(f"{(whole - left) / unit:.3f}")
-
-
-def _times(joules: float | None, fps: float) -> float | None:
-    """Multiply joules per frame by frames per second."""
-    return None if joules is None else joules * fps
 
 
 def _latency(result: PaperDrives, name: str, condition: str) -> tuple[Cell, Cell, Cell]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from me2e_compress import graph
@@ -189,9 +190,7 @@ def _with_joules(
         CalibrationSet(study.held_out),
         threads=study.timing.threads,
         provider=study.provider,
-        on_window=lambda done, total, name: listener.on_progress(
-            "energy", done, total, name
-        ),
+        on_window=partial(listener.on_progress, "energy"),
     )
     return [
         each.with_energy(measured[each.variant]) if each.variant in measured else each

@@ -207,11 +207,10 @@ def _road(drive: DriveRecord, several: bool) -> str:
     if drive.difference is None:
         return ""
     found = drive.difference.driving_score
-    value = number(found.value or 0.0, "+.1f")
-    if found.low is None or found.high is None:
+    said = _signed(f"{where}driving score ", found)
+    if not said:
+        value = number(found.value or 0.0, "+.1f")
         return f"{where}driving score {value} points on {found.n} route"
-    low, high = (number(each, "+.1f") for each in (found.low, found.high))
-    said = f"{where}driving score {value} points ({low} to {high})"
     limit = f"{found.n} routes show none below {drive.difference.smallest_shown:.1f}"
     kept = _signed("; room kept ", drive.difference.room_kept)
     return f"{said}, {drive.difference.verdict}; {limit}{kept}"
