@@ -85,12 +85,14 @@ class EngineDump(Displayed):
             FramesError: frames are missing or unknown, a tensor is missing in one or
                 not of numbers, or a file is cut.
         """
+        stems = {each.stem: None for each in frames.files}
         if len(self) != len(frames):
+            lacking = [each for each in stems if self.named and each not in self.stems]
+            first = f"{lacking[0]} is not answered: " if lacking else ""
             raise FramesError(
-                f"{self.path}: answers to {counted(len(self), 'frame')},"
+                f"{self.path}: {first}answers to {counted(len(self), 'frame')},"
                 f" {frames.folder} has {len(frames)}: the dump is of other frames"
             )
-        stems = {each.stem for each in frames.files}
         unknown = [each for each in self.stems if each not in stems]
         if self.named and unknown:
             raise FramesError(

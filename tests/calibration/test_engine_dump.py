@@ -207,6 +207,14 @@ def test_fewer_frames(tmp_path: Path, frames: CalibrationSet) -> None:
     )
 
 
+def test_a_frame_that_is_not_answered_is_named(
+    tmp_path: Path, frames: CalibrationSet
+) -> None:
+    (as_npz(tmp_path / "dump") / "000001.npz").unlink()
+    said = refused(tmp_path / "dump", frames)
+    assert said.startswith(f"{tmp_path}/dump: 000001 is not answered: answers to 2")
+
+
 def test_frames_of_another_name(tmp_path: Path, frames: CalibrationSet) -> None:
     as_npz(tmp_path / "dump")
     (tmp_path / "dump" / "000002.npz").rename(tmp_path / "dump" / "000009.npz")
