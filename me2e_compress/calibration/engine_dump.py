@@ -26,6 +26,8 @@ from me2e_compress.runtime.frames import Array
 _NPZ, _JSON = ".npz", ".json"
 _NOT_JSON = re.compile(rb"(?<=[\[,\s])(-?)(nan|inf)(?=[\],\s])", re.IGNORECASE)
 """What C++ writes, and trtexec with it, where a number is not finite."""
+_UNFIT = (AttributeError, TypeError, LookupError, ValueError)
+"""What reading a document raises that is JSON and of another form."""
 _KEPT = 8
 """Frames in memory: some are read again and again."""
 
@@ -80,15 +82,17 @@ class EngineDump(Displayed):
         """Check that every frame was answered, and with the same tensors.
 
         Raises:
-            FramesError: frames are missing or unknown, a tensor is missing in one, or a
-                file is cut.
+            FramesError: frames are missing or unknown, a tensor is missing in one or
+                not of numbers, or a file is cut.
         """
+        stems = {each.stem: None for each in frames.files}
         if len(self) != len(frames):
+            lacking = [each for each in stems if self.named and each not in self.stems]
+            first = f"{lacking[0]} is not answered: " if lacking else ""
             raise FramesError(
-                f"{self.path}: answers to {counted(len(self), 'frame')},"
+                f"{self.path}: {first}answers to {counted(len(self), 'frame')},"
                 f" {frames.folder} has {len(frames)}: the dump is of other frames"
             )
-        stems = {each.stem for each in frames.files}
         unknown = [each for each in self.stems if each not in stems]
         if self.named and unknown:
             raise FramesError(
@@ -108,6 +112,12 @@ class EngineDump(Displayed):
             raise FramesError(
                 f"{self.where(0)}: {more[0]} is missing; other frames have it"
             )
+        for name, each in found.items():
+            if each.dtype.kind not in "fiub":
+                raise FramesError(
+                    f"{self.where(index)}: {name} is {each.dtype}, which is no number;"
+                    " write bfloat16 as float32"
+                )
 
     @property
     def _is_npz(self) -> bool:
@@ -166,7 +176,7 @@ def _exported(path: Path) -> Mapping[str, Array]:
     found = _document(path)
     try:
         return {str(each["name"]): _values(each) for each in found}
-    except (TypeError, KeyError, ValueError) as error:
+    except _UNFIT as error:
         raise FramesError(
             f"{path}: not what trtexec --exportOutput writes, a list of name,"
             f" dimensions and values ({reason(error)})"
@@ -197,7 +207,7 @@ def _run_results(path: Path, document: Mapping[str, Any]) -> list[Mapping[str, A
             {name: _array(name, each) for name, each in iteration["outputs"].items()}
             for iteration in runners[0][1]
         ]
-    except (TypeError, KeyError, IndexError, ValueError, EOFError) as error:
+    except (*_UNFIT, EOFError) as error:
         line = f"no {error}" if isinstance(error, KeyError) else reason(error)
         raise FramesError(
             f"{path}: not the RunResults that polygraphy --save-outputs writes ({line})"

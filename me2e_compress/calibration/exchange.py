@@ -93,6 +93,8 @@ def _parse(
     found = {}
     for number, line in enumerate(lines[first:], first + 1):
         name, parted, text = line.rpartition(mark)
+        if name in found:
+            raise FramesError(f"{path}: line {number} names {name} again")
         try:
             found[name] = read(text)
         except (ValueError, struct.error) as error:

@@ -101,8 +101,9 @@ class Ranges(Displayed):
 
     @property
     def dead(self) -> tuple[str, ...]:
-        """The tensors that were zero in every frame."""
-        return tuple(name for name, each in self.tensors.items() if each == (0.0, 0.0))
+        """The tensors that were zero in every frame, not those that a method cut."""
+        zero = [name for name, each in self.tensors.items() if each == (0.0, 0.0)]
+        return tuple(name for name in zero if not self.rms.get(name))
 
     @property
     def crests(self) -> dict[str, float]:

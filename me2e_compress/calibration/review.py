@@ -156,7 +156,11 @@ def _scales(ranges: Ranges) -> Iterable[RangeFinding]:
         "clipped",
         "warning",
         "range below the root mean square, which cuts most of the signal",
-        {name: crest for name, crest in reversed(crests) if 0 < crest < 1},
+        {
+            name: crest
+            for name, crest in reversed(crests)
+            if ranges.rms[name] and crest < 1
+        },
         "These ranges are of other frames or units, or the method clips too much:"
         " calibrate again, by max-min",
     )
@@ -216,8 +220,8 @@ def _only_in_one(ranges: Ranges, other: Ranges, called: str) -> Iterable[RangeFi
     """Name the tensors that are zero, or missing, in one of two files."""
     sides = ((ranges, other, called), (other, ranges, "the first file"))
     for here, there, lacks in sides:
-        zero = [name for name in there.dead if name in here.tensors]
-        zero = [name for name in zero if reach_of(here.tensors[name])]
+        zero = [name for name, each in there.tensors.items() if not reach_of(each)]
+        zero = [name for name in zero if reach_of(here.tensors.get(name, (0.0, 0.0)))]
         missing = [name for name in here.tensors if name not in there.tensors]
         yield from _named(
             "dead tensor",

@@ -48,9 +48,7 @@ def listening(*, stages: bool = False) -> Iterator[Listener]:
     bar = Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=20),
-        TextColumn(
-            "{task.completed:.0f}/{task.total:.0f} {task.fields[what]}", markup=False
-        ),
+        TextColumn("{task.fields[what]}", markup=False),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
@@ -65,9 +63,15 @@ def listening(*, stages: bool = False) -> Iterator[Listener]:
             if stage != shown:
                 bar.reset(task)
             shown = stage
-            bar.update(task, description=stage, completed=done, total=total, what=what)
+            told = _done(done, total, what)
+            bar.update(task, description=stage, completed=done, total=total, what=told)
 
         yield Listener(on_progress, _warn)
+
+
+def _done(done: int, total: int, what: str) -> str:
+    """Write how much is done; a total of 0 is not known."""
+    return f"{done}/{total} {what}".rstrip() if total else f"{done} {what}".rstrip()
 
 
 def _warn(line: str) -> None:
@@ -240,7 +244,7 @@ class ProgressLines:
             return
         self._said = now
         left = _left(now - self._begun, done, total)
-        said = f"{stage}: {done}/{total} {what}".rstrip()
+        said = f"{stage}: {_done(done, total, what)}"
         self._write(", ".join(filter(None, [said, left])))
 
 

@@ -152,6 +152,8 @@ def _read_wrongly(run: EngineRun, close: Closeness) -> Iterator[HostFault]:
         shown = means[1] - means[0] >= NAMED_DB and means[1] >= EVIDENT_DB
         if not readings or (fits and not shown):
             del run.readings[name]
+            # a reading that is dropped may have hidden what is not finite
+            run.check([name])
             continue
         said = f"output {name} {' and '.join(each.said for each in readings)}"
         yield HostFault(readings[0].kind, said, *means, len(run), name)

@@ -94,7 +94,7 @@ class Liveness:
             (share, each.output, name)
             for each in self.outputs
             for name, share in (("the next frame", each.moves), *each.answers.items())
-            if share is not None and name not in each.cut
+            if share is not None and name not in each.cut and each.verdict == "alive"
         ]
         if least and not self.faults:
             share, output, name = min(least)
@@ -203,7 +203,8 @@ class Movement:
             share = f"{ends:.0%} of it are at its largest value, {before:.0%} before"
             return "saturated", share
         if deaf:
-            return "deaf", f"of the movement before it answers {', '.join(deaf)}"
+            said = f"of the movement before it answers {', '.join(deaf)}"
+            return "deaf", "; ".join(filter(None, [said, cause.words]))
         return "alive", ""
 
 

@@ -159,7 +159,8 @@ class Int8Outcome:
                 if count >= LEAST_SHOWN
             )
             total = megabytes(sum(self.float_bytes.values()))
-            said += f"; {total} MB of weights stay float, by rule: {rules}"
+            said += f"; {total} MB of weights stay float"
+            said += f", by rule: {rules}" if rules else ""
         if self.weight_only_bytes:
             saved = megabytes(self.weight_only_bytes)
             said += f"; --weight-only-gemv would save {saved} MB"

@@ -168,6 +168,31 @@ def test_another_json_file(tmp_path: Path) -> None:
     assert "not what trtexec --exportOutput writes" in refused(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[{"name": "plan", "dimensions": [1, 2], "values": [1, 2]}]',
+        '{"lst": [["trt", [{"outputs": {"plan": {"values": "no dictionary"}}}]]]}',
+        '{"lst": [["trt", [{"outputs": ["plan"]}]]]}',
+    ],
+)
+def test_json_of_another_form(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(text)
+    assert f"{tmp_path}/a.json: not " in refused(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["complex64", "U4", "V4"])
+def test_arrays_of_no_numbers(
+    kind: str, tmp_path: Path, frames: CalibrationSet
+) -> None:
+    changed = [dict(each) for each in ANSWERS]
+    changed[2]["plan"] = np.zeros((1, 6, 2), kind)
+    as_npz(tmp_path / "dump", changed)
+    assert refused(tmp_path / "dump", frames).startswith(
+        f"{tmp_path}/dump/000002: plan is {np.dtype(kind)}, which is no number"
+    )
+
+
 def test_values_that_are_fewer_than_their_shape(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(
         '[{"name": "plan", "dimensions": "1x6x2", "values": [1, 2]}]'
@@ -180,6 +205,14 @@ def test_fewer_frames(tmp_path: Path, frames: CalibrationSet) -> None:
     assert refused(tmp_path / "dump", frames).endswith(
         f"answers to 2 frames, {frames.folder} has 3: the dump is of other frames"
     )
+
+
+def test_a_frame_that_is_not_answered_is_named(
+    tmp_path: Path, frames: CalibrationSet
+) -> None:
+    (as_npz(tmp_path / "dump") / "000001.npz").unlink()
+    said = refused(tmp_path / "dump", frames)
+    assert said.startswith(f"{tmp_path}/dump: 000001 is not answered: answers to 2")
 
 
 def test_frames_of_another_name(tmp_path: Path, frames: CalibrationSet) -> None:

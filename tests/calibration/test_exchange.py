@@ -97,6 +97,7 @@ def test_the_table_of_onnxruntime_holds_the_magnitudes(tmp_path: Path) -> None:
         ("TRT-8501-X\nimage: zz", "line 2 is not a name and a number: 'image: zz'"),
         ("TRT-8501-X\nimage: 3c0a", "line 2 is not a name and a number"),
         ("TRT-8501-X\nimage: 7fc00000", "line 2 is not a range"),
+        ("TRT-8501-X\na: 3c0a0000\na: 3d0a0000", "line 3 names a again"),
         ("image", "line 1 is not a name"),
         ("image -2", "line 1 is not a range"),
         ("image inf", "line 1 is not a range"),

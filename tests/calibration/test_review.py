@@ -58,6 +58,18 @@ def test_a_range_is_held_against_the_tensor_itself(
     assert re.search(said, "".join(line for _, line in found))
 
 
+def test_a_range_of_zero_cuts_a_tensor_that_is_not_zero() -> None:
+    cut = dataclasses.replace(
+        GOOD, method="percentile:50.0", tensors={"a": (0.0, 0.0)}, rms={"a": 0.9}
+    )
+
+    ((severity, said),) = lines(cut)
+
+    assert severity == "warning"
+    assert said.startswith("1 range below the root mean square, which cuts most of")
+    assert cut.dead == ()
+
+
 def test_the_worst_are_named_first_and_the_rest_counted() -> None:
     names = [f"t{at}" for at in range(7)]
     bounds = {name: (0.0, 1000.0 * (at + 1)) for at, name in enumerate(names)}

@@ -90,8 +90,10 @@ STEPS = [(done * 0.3, "calibrate", done, 100, "frames") for done in range(101)]
          True, ["collect", "learn"]),
         ([(EVERY_S, "frames", 0, 8, ""), (2 * EVERY_S, "frames", 7, 8, "")],
          False, ["frames: 0/8", "frames: 7/8, 1 s left"]),
+        ([(EVERY_S, "inferences", 33, 0, "")], False, ["inferences: 33"]),
     ],
-    ids=["a line now and then", "none of a short run", "every stage", "no name"],
+    ids=["a line now and then", "none of a short run", "every stage", "no name",
+         "no total"],
 )  # fmt: skip
 def test_off_a_terminal_progress_is_lines(
     told: list[tuple[float, str, int, int, str]], stages: bool, said: list[str]

@@ -210,6 +210,12 @@ def test_a_number_that_is_none_is_an_error() -> None:
         named(dump, noise=None)
 
 
+def test_a_number_that_is_none_on_every_frame_is_an_error() -> None:
+    dump = [of | {"plan": of["plan"] * np.nan} for of in drive(opened(), frames())]
+    with pytest.raises(EvaluationError, match=r"plan .* NaN at frame 0, \[0, 0, 0\]"):
+        named(dump, noise=None)
+
+
 def test_a_size_that_nothing_explains_is_an_error() -> None:
     dump = [of | {"plan": of["plan"][:, :1]} for of in drive(opened(), frames())]
     with pytest.raises(EvaluationError, match=r"plan is \[1, 1, 2\] in the dump"):

@@ -17,7 +17,12 @@ from me2e_compress.fidelity.liveness import (
     measure_liveness,
     parts_of,
 )
-from me2e_compress.fidelity.output_liveness import Liveness, share_without_jumps
+from me2e_compress.fidelity.output_liveness import (
+    Cause,
+    Liveness,
+    Movement,
+    share_without_jumps,
+)
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
 from tests.command import Command, command
@@ -140,6 +145,33 @@ def test_a_scale_that_is_too_small_is_named_though_the_output_moves() -> None:
     assert fault.endswith(
         "/Quantize cuts 100% of what it reads: its scale is too small"
     )
+
+
+TWO = """
+<ir_version: 9, opset_import: ["" : 17]>
+two (float[1,8] x, float[1,8] z) => (float[1,8] y)
+<float scale = {%s}, int8 zero = {0}> {
+    q = QuantizeLinear(x, scale, zero)
+    d = DequantizeLinear(q, scale, zero)
+    y = Add(d, z)
+}
+"""
+
+
+def test_the_scale_that_makes_an_output_deaf_to_one_input_is_named() -> None:
+    random = np.random.default_rng(0)
+    frames = [
+        Frame(at, not at, {name: random.random((1, 8), np.float32) for name in "xz"})
+        for at in range(4)
+    ]
+    models = [ir.from_onnx_text(TWO % scale) for scale in ("0.01", "5e7")]
+    models[1].graph[0].name = "/Quantize"
+    tally = LivenessTally(*map(Session, models))
+    compare(*map(Session, models), frames, tally.add)
+
+    (fault,) = tally.result(model=models[1]).faults
+
+    assert fault == f"y is {DEAF} x (0.00%){LARGE}"
 
 
 PICTURE = """
@@ -309,6 +341,20 @@ def test_compare_exits_with_1_if_an_output_is_dead(
     said = capsys.readouterr()
     assert ("b.onnx: plan is constant" in said.err) == bool(code)
     assert ("Liveness" in said.out) == bool(code)
+
+
+def test_what_is_not_judged_is_no_proof_that_all_is_alive() -> None:
+    """Labels that rest in the second graph alone are whole numbers, and not judged."""
+    rests = Movement()
+    for at in range(2):
+        now, before = ([np.array([each]), np.array([0])] for each in (at, at - 1))
+        rests.add(now, before if at else None)
+    judged = rests.judged("label", {}, 0.01, lambda: Cause(), ablated=False)
+    assert (judged.verdict, judged.moves) == ("not judged", 0)
+
+    said = list(Liveness((judged,), 0.01).lines())
+
+    assert said == ["liveness not judged: label (whole numbers)"]
 
 
 def test_compare_finds_a_graph_alive_beside_itself(
