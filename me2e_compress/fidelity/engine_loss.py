@@ -2,13 +2,15 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from me2e_compress.fidelity.dump_readings import LOWEST_DB
 from me2e_compress.fidelity.engine_run import EngineRun
+from me2e_compress.fidelity.floor import ALIVE
+from me2e_compress.fidelity.output_liveness import Cause, Movement
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
 
@@ -26,6 +28,9 @@ class OutputLoss:
             the output beyond comparison.
         all_db: The engine as it was dumped against the float source, or against the
             graph without one; None if it cannot be compared.
+        moves: How far the engine's answers move from frame to frame, as a share of the
+            source's, or the graph's without one; None if those rest.
+        dead: What is wrong if it moves hardly at all; empty otherwise.
     """
 
     name: str
@@ -33,6 +38,8 @@ class OutputLoss:
     compilation_db: float
     host_db: float | None
     all_db: float | None
+    moves: float | None
+    dead: str
 
 
 class _Sums:
@@ -62,9 +69,15 @@ class _Sums:
         return 10 * math.log10(self.signal / self.noise) if self.signal else -math.inf
 
 
-def losses(run: EngineRun, source: AnySession | None) -> tuple[OutputLoss, ...]:
-    """Run all graphs side by side over the frames, and split what each output lost."""
+def losses(
+    run: EngineRun, source: AnySession | None, alive: float = ALIVE
+) -> tuple[OutputLoss, ...]:
+    """Run all graphs side by side over the frames, and split what each output lost.
+
+    An output is dead that moves less than ``alive`` of what it should.
+    """
     names = run.names
+    movements, last = {name: Movement() for name in names}, dict[str, Sequence[Array]]()
     shared = [] if source is None else [n for n in names if n in source.outputs]
     parts = ("quantization", "compilation", "host", "all")
     sums = {name: {part: _Sums() for part in parts} for name in names}
@@ -85,7 +98,14 @@ def losses(run: EngineRun, source: AnySession | None) -> tuple[OutputLoss, ...]:
             found = None if changed is None else np.add(as_fed[name], changed)
             each["host"].add(truth[name], found)
             each["all"].add(exact.get(name, truth[name]), dumped[name])
+            pair = np.array(exact.get(name, as_fed[name])), np.array(read[name])
+            movements[name].add(pair, last.get(name))
+            last[name] = pair
     faulty = run.causes or run.order
+    moved = {
+        name: each.judged(name, {}, alive, Cause, ablated=False)
+        for name, each in movements.items()
+    }
     return tuple(
         OutputLoss(
             name,
@@ -93,6 +113,8 @@ def losses(run: EngineRun, source: AnySession | None) -> tuple[OutputLoss, ...]:
             _known(each["compilation"].decibels),
             each["host"].decibels if faulty or run.readings.get(name) else None,
             each["all"].decibels,
+            moved[name].moves,
+            str(moved[name]) if moved[name].is_dead else "",
         )
         for name, each in sums.items()
     )

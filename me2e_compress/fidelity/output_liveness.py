@@ -55,6 +55,11 @@ class OutputLiveness:
     at_end: float
     reason: str
 
+    @property
+    def is_dead(self) -> bool:
+        """Whether it does not answer as it should."""
+        return self.verdict not in ("alive", "not judged")
+
     def __str__(self) -> str:
         return f"{self.output} is {self.verdict}: {self.reason}"
 
@@ -81,8 +86,7 @@ class Liveness:
     @property
     def faults(self) -> tuple[str, ...]:
         """A sentence for each dead output, and for each state that is not fed."""
-        fine = "alive", "not judged"
-        dead = [str(each) for each in self.outputs if each.verdict not in fine]
+        dead = [str(each) for each in self.outputs if each.is_dead]
         return (*dead, *(f"{name} is not fed back any more" for name in self.not_fed))
 
     def lines(self) -> Iterator[str]:

@@ -18,6 +18,7 @@ from me2e_compress.fidelity.engine_run import EngineRun
 from me2e_compress.fidelity.engine_values import first_difference_of_engine
 from me2e_compress.fidelity.feed_faults import Pixels
 from me2e_compress.fidelity.first_difference import FirstDifference
+from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.fidelity.host_faults import HostFault, explain
 from me2e_compress.graph import LoadedModel
 from me2e_compress.registry import documents
@@ -30,7 +31,7 @@ from me2e_compress.workflows.compress_result import beside
 from me2e_compress.workflows.first_difference import told_of, with_modules
 from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, counted, number, table
+from me2e_compress.workflows.result import Result, Status, Table, counted, number, table
 from me2e_compress.zoo.shipped import SHIPPED, shipped
 
 STAGE = "inferences"
@@ -86,8 +87,23 @@ class DumpResult(Result):
         return (self.headline, *inside, *self.notes)
 
     def alerts(self) -> tuple[str, ...]:
-        """Return the faults of the host."""
-        return tuple(each.line for each in self.faults)
+        """Return the faults of the host, and outputs that are dead."""
+        return (*(each.line for each in self.faults), *self.dead)
+
+    @property
+    def dead(self) -> tuple[str, ...]:
+        """The outputs that hardly move, where they should, in words."""
+        return tuple(each.dead for each in self.outputs if each.dead)
+
+    @property
+    def status(self) -> Status:
+        """``refused`` if an output of the engine is dead."""
+        return "refused" if self.dead else super().status
+
+    def check(self) -> None:
+        """Raise EvaluationError if an output of the engine is dead."""
+        if self.dead:
+            raise EvaluationError(f"{self.dump}: {'; '.join(self.dead)}")
 
     def tables(self) -> tuple[Table, ...]:
         """Return one row per output."""
@@ -98,6 +114,7 @@ class DumpResult(Result):
                 number(each.compilation_db, ".1f"),
                 number(each.host_db, ".1f"),
                 number(each.all_db, ".1f"),
+                number(each.moves, ".2f"),
             )
             for each in self.outputs
         ]
@@ -106,10 +123,10 @@ class DumpResult(Result):
             if self.float_graph is None
             else f"Float source: {self.float_graph}."
         )
-        note = f"SQNR in dB; state: {self.state}. {source}"
-        columns = ("output", "quantization", "compilation", "host", "all")
+        note = f"SQNR in dB; moves: a share of what it should; state: {self.state}. "
+        columns = ("output", "quantization", "compilation", "host", "all", "moves")
         title = f"What the engine lost over {counted(self.frames, 'frame')}"
-        return (table(title, columns, rows, note),)
+        return (table(title, columns, rows, note + source),)
 
     def records(self) -> list[dict[str, object]]:
         """Return one row per output."""
@@ -123,6 +140,7 @@ def compare_dump(
     listener: Listener = SILENT,
     *,
     float_graph: str | Path | None = None,
+    alive: float = ALIVE,
     provider: Provider = CPU,
     adapter: str | Path | None = None,
     module_map: str | Path | None = None,
@@ -132,7 +150,8 @@ def compare_dump(
     The graph's nodes run as they are written: int8 is simulated. It is fed the state
     that the engine gave, where the dump has it, so that each frame is judged by itself;
     else that of its own run. ``float_graph`` None looks for the source that the report
-    beside the graph names.
+    beside the graph names. Below ``alive`` of the movement that it should have, an
+    output is dead.
 
     Raises:
         GraphError: A model does not exist or run.
@@ -167,7 +186,7 @@ def compare_dump(
     opened = None
     if source is not None:
         opened = open_session(source, release=True, provider=provider, said=said)
-    outputs = losses(run, opened)
+    outputs = losses(run, opened, alive)
     if set(answered.names) - set(session.outputs):
         named = with_modules(loaded.model)
         inner = first_difference_of_engine(named, run, provider=provider)

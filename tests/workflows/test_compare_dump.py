@@ -12,8 +12,11 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.compare_dump import compare_dump
+from tests.command import Command, command
 from tests.fidelity.hosts import Arrays, drive, frames, noisy, stack
 from tests.frames import record
+
+__all__ = ["command"]
 
 QUANTIZED = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -70,6 +73,7 @@ def test_an_engine_that_answers_as_its_graph(files: Path) -> None:
     dumped(files, answered(files))
     found = compare_dump(files / "m.onnx", files / "dump", files / "frames")
     assert found.headline.startswith("the engine answers as its graph does")
+    assert (found.status, found.alerts()) == ("ok", ())
 
 
 def test_a_fault_is_told_apart_from_what_the_compiler_lost(files: Path) -> None:
@@ -88,6 +92,42 @@ def test_a_fault_is_told_apart_from_what_the_compiler_lost(files: Path) -> None:
     (said,) = found.alerts()
     assert said.startswith("host: output plan is the graph's times ")
     assert found.status == "warning"
+
+
+def test_a_plan_that_rests_is_dead_though_all_else_is_right(files: Path) -> None:
+    shown = answered(files)
+    dumped(files, [each | {"plan": shown[0]["plan"]} for each in shown])
+    given = files / "m.onnx", files / "dump", files / "frames"
+
+    found = compare_dump(*given)
+
+    assert found.status == "refused"
+    assert found.dead == ("plan is constant: it moves 0.00% as far as before",)
+    assert {each.name: each.moves for each in found.outputs} == {
+        "plan": 0.0, "boxes": pytest.approx(1), "prev_out": pytest.approx(1),
+    }  # fmt: skip
+    with pytest.raises(EvaluationError, match="dump: plan is constant"):
+        found.check()
+    assert compare_dump(*given, alive=0.0).dead == ()
+
+
+@pytest.mark.parametrize(("more", "code"), [((), 1), (("--alive", "0"), 0)])
+def test_the_command_ends_with_1_if_an_output_of_the_engine_is_dead(
+    more: tuple[str, ...], code: int, command: Command, files: Path
+) -> None:
+    shown = answered(files)
+    dumped(files, [each | {"plan": shown[0]["plan"]} for each in shown])
+    model, dump, recorded = (str(files / n) for n in ("m.onnx", "dump", "frames"))
+
+    assert command("compare", model, recorded, "--outputs", dump, *more) == code
+
+
+def test_a_float_source_without_a_dump_is_refused(
+    command: Command, files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, recorded = str(files / "m.onnx"), str(files / "frames")
+    assert command("compare", model, model, recorded, "--float", model) == 1
+    assert "--float is for --outputs" in capsys.readouterr().err
 
 
 def test_bytes_that_read_as_signaling_nan_are_no_warning(files: Path) -> None:

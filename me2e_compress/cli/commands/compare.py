@@ -61,15 +61,17 @@ def compare(
             "--first-difference holds two graphs together, all nodes as they stand:"
             " leave out --reference and --outputs"
         )
+    if float_graph is not None and outputs is None:
+        raise RecipeError("--float is for --outputs, which is not given")
     with listening() as listener:
         if outputs is not None and frames is None:
             dumped = against_engine.compare_dump(
                 *(reference, outputs, candidate, listener),
-                float_graph=float_graph, provider=runs_on, adapter=adapter,
-                module_map=module_map,
+                float_graph=float_graph, alive=alive, provider=runs_on,
+                adapter=adapter, module_map=module_map,
             )  # fmt: skip
             show(dumped)
-            return
+            return dumped.check()
         if outputs is not None or frames is None:
             said = "M.onnx FRAMES --outputs DUMP" if frames else "A.onnx B.onnx FRAMES"
             raise typer.BadParameter(f"expected {said}", param_hint="FRAMES")
