@@ -22,10 +22,11 @@ import csv
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, median
+from typing import Self
 
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.generate import (
@@ -34,11 +35,15 @@ from me2e_compress.evaluators.highway.generate import (
     seed_of,
 )
 from me2e_compress.evaluators.highway.runner import Listeners, drive
+from me2e_compress.metrics.intervals import mean_estimate
+from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.runtime.children import pool
 from me2e_compress.simulator.routes import SETS, Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from me2e_compress.simulator.scene import EventKind, Scene, SignalKind, SignalState
 from me2e_compress.simulator.world import World
+from me2e_compress.study.drive_record import DriveRecord
 
 NEAR_M, MOVING_MPS = 80.0, 0.3
 AHEAD_M = 40.0
@@ -164,18 +169,60 @@ def admission(path: Path) -> None:
         print(f"{words} | {count}")
 
 
-def drives_of(
-    files: Sequence[Path],
-) -> dict[str, dict[str, tuple[float, float | None]]]:
-    """Read driving score and room kept by ``SCHEME.CONDITION`` and route."""
-    found = dict[str, dict[str, tuple[float, float | None]]]()
+@dataclass(frozen=True)
+class RouteScores:
+    """What a drive got on one route, in percent, and how it ended, with infractions.
+
+    Room kept is None if unknown.
+    """
+
+    end: str
+    score: float
+    success: float
+    room: float | None
+
+    @classmethod
+    def of(cls, route: RouteSummary) -> Self:
+        """Take a record's route."""
+        end = " ".join([route.ending, *(kind for kind, _ in route.moments)])
+        success = 100.0 * route.succeeded
+        return cls(end, route.driving_score, success, route.room_kept)
+
+
+def drives_of(files: Sequence[Path]) -> dict[str, dict[str, RouteScores]]:
+    """Read drives by ``SCHEME.CONDITION`` and route: ``routes.csv``, or records."""
+    found = dict[str, dict[str, RouteScores]]()
     for path in files:
+        if path.suffix == ".jsonl":
+            record = DriveRecord.load(path)
+            found[record.name] = {
+                each.route: RouteScores.of(each) for each in record.routes
+            }
+            continue
         with path.open(encoding="utf-8", newline="") as file:
             for row in csv.DictReader(file):
-                own = found.setdefault(f"{row['scheme']}.{row['condition']}", {})
                 room = row.get("room_kept_percent")
-                score = float(row["driving_score_percent"])
-                own[row["route"]] = score, float(room) if room else None
+                found.setdefault(f"{row['scheme']}.{row['condition']}", {})[
+                    row["route"]
+                ] = RouteScores(
+                    f"{row['ending']} {row['infractions']}".strip(),
+                    float(row["driving_score_percent"]),
+                    100.0 * int(row["succeeded"]),
+                    float(room) if room else None,
+                )
+    return found
+
+
+def means_of(own: Mapping[str, RouteScores]) -> dict[str, Estimate]:
+    """Return means over routes with both intervals; without room where unknown."""
+    found = dict[str, Estimate]()
+    for column in ("score", "success", "room"):
+        every = {name: getattr(each, column) for name, each in own.items()}
+        known = {name: value for name, value in every.items() if value is not None}
+        if known:
+            types = [type_of(name) for name in known]
+            values = [*known.values()]
+            found[column] = mean_estimate(values, types, "%", bounds=(0.0, 100.0))
     return found
 
 
@@ -184,26 +231,28 @@ def compare(files: Sequence[Path], chosen: Sequence[str]) -> None:
     drives = drives_of(files)
     drives = {name: drives[name] for name in chosen or drives}
     for name, own in drives.items():
-        scores = [score for score, _ in own.values()]
-        room = [each for _, each in own.values() if each is not None]
-        kept = f"{fmean(room):.1f} %" if room else "not recorded"
-        print(
-            f"{name}: {len(own)} routes, {fmean(s == 100.0 for s in scores):.1%} at"
-            f" exactly 100; DS {fmean(scores):.1f}, room kept {kept}"
-        )
-    shared = [
-        n for n in next(iter(drives.values())) if all(n in d for d in drives.values())
-    ]
-    unlike = {n for n in shared if len({own[n][0] for own in drives.values()}) > 1}
-    print(f"{len(unlike)} of {len(shared)} routes do not end alike for all\n")
+        whole = fmean(each.score == 100.0 for each in own.values())
+        print(f"{name}: {len(own)} routes, {whole:.1%} at exactly 100")
+        for column, found in means_of(own).items():
+            here = f"{found.low:.1f} to {found.high:.1f}"
+            anew = f"{found.anew_low:.1f} to {found.anew_high:.1f}"
+            print(f"  {column} {found.value:.1f} ({here}; types anew {anew})")
+    first, *others = drives.values()
+    shared = [name for name in first if all(name in own for own in others)]
+    unlike = {n for n in shared if len({d[n].end for d in drives.values()}) > 1}
+    scored = sum(len({d[n].score for d in drives.values()}) > 1 for n in shared)
+    print(
+        f"{len(unlike)} of {len(shared)} routes do not end alike for all, by ending and"
+        f" infractions; {scored} have other scores\n"
+    )
     print(f"type | {' | '.join(drives)} | not alike")
     print("---|" * (1 + len(drives)) + "---")
     for kind in dict.fromkeys(map(type_of, shared)):
-        own_routes = [each for each in shared if type_of(each) == kind]
-        means = (fmean(own[n][0] for n in own_routes) for own in drives.values())
+        names = [each for each in shared if type_of(each) == kind]
+        means = (fmean(own[n].score for n in names) for own in drives.values())
         told = " | ".join(f"{mean:.1f}" for mean in means)
-        parted = len(unlike.intersection(own_routes))
-        print(f"{kind} | {told} | {parted} of {len(own_routes)}")
+        parted = len(unlike.intersection(names))
+        print(f"{kind} | {told} | {parted} of {len(names)}")
 
 
 def type_of(route: str) -> str:
@@ -223,7 +272,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--admission", type=Path, help="what routes --json printed")
-    parser.add_argument("--compare", type=Path, nargs="+", help="routes.csv of drives")
+    parser.add_argument(
+        "--compare", type=Path, nargs="+", help="routes.csv, or records"
+    )
     parser.add_argument("--drives", default="", help="SCHEME.CONDITION; all")
     given = parser.parse_args()
     speeds = [float(each) for each in given.speeds.split(",")]

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.bench_intervals import KeptDrive, kept_drives
+from benchmarks.bench_road import drives_of, means_of
 from me2e_compress.metrics.differences import SCATTER
 from me2e_compress.metrics.intervals import binomial_interval
 from me2e_compress.metrics.measure import Estimate
@@ -97,12 +98,17 @@ def known() -> frozenset[Triple]:
     found = set[Triple]()
     folders = [DRIVER / each for each in ("baselines", "ablation", "pairs", "schemes")]
     folders += [DRIVER / each for each in ("scales", "latency")]
-    folders += (RECORDS / "road_2" / "study").iterdir()
     for folder in folders:
         for drive in compared(kept_drives(folder / "routes.csv")):
             found.update(rounded(drive.mean()))
     for drive in asked():
         found.update(rounded(drive.mean()))
+    # both roads: driving score, success and room kept
+    roads = [*(RECORDS / "road_2" / "study").glob("*/routes.csv")]
+    roads += [RECORDS / "paper" / f"float.{name}.jsonl" for name in ("ideal", "fps-4")]
+    for own in drives_of(roads).values():
+        for each in means_of(own).values():
+            found.update(rounded(each))
     # success, as a rate: float's alone and over types anew, the expert's when slow
     rate = kept_drives(DRIVER / "baselines" / "routes.csv")["float.ideal"].mean(1)
     found.update(rounded(rate))
