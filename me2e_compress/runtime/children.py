@@ -25,12 +25,6 @@ _TRACKER_IS_SILENT = "ignore::UserWarning:multiprocessing.resource_tracker"
 _STARTING = threading.RLock()
 
 
-def cpu_seconds() -> float:
-    """Return the CPU time of this process and of its children that have ended."""
-    times = os.times()
-    return sum((times.user, times.system, times.children_user, times.children_system))
-
-
 @contextlib.contextmanager
 def sheltered() -> Iterator[None]:
     """Start processes in this block without Ctrl-C and without the current folder.

@@ -8,8 +8,6 @@ from typing import Self
 
 import psutil
 
-from me2e_compress.runtime.children import cpu_seconds
-
 BUSY = 0.1
 """Share of the cores that other processes may take before a latency is in doubt: they
 move our threads between cores and evict caches long before all cores are taken."""
@@ -84,3 +82,9 @@ def _machine_s() -> float:
     idle = times.idle + getattr(times, "iowait", 0.0)
     guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)
     return float(sum(times) - idle - guests)  # guests are in user and nice already
+
+
+def cpu_seconds() -> float:
+    """Return the CPU time of this process and of its children that have ended."""
+    times = os.times()
+    return sum((times.user, times.system, times.children_user, times.children_system))

@@ -24,8 +24,8 @@ from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import QuantPlan, plan_of
 from me2e_compress.quantization.plan.overrides import Override, overrides_text
-from me2e_compress.runtime.children import cpu_seconds
 from me2e_compress.runtime.frames import Frames
+from me2e_compress.runtime.others_load import cpu_seconds
 from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.sensitivity.estimate import estimate

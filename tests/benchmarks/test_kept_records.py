@@ -106,9 +106,9 @@ def known() -> frozenset[Triple]:
     # both roads: driving score, success and room kept
     roads = [*(RECORDS / "road_2" / "study").glob("*/routes.csv")]
     roads += [RECORDS / "paper" / f"float.{name}.jsonl" for name in ("ideal", "fps-4")]
-    for own in drives_of(roads).values():
-        for each in means_of(own).values():
-            found.update(rounded(each))
+    for own in (each for path in roads for each in drives_of([path]).values()):
+        for mean in means_of(own).values():
+            found.update(rounded(mean))
     # success, as a rate: float's alone and over types anew, the expert's when slow
     rate = kept_drives(DRIVER / "baselines" / "routes.csv")["float.ideal"].mean(1)
     found.update(rounded(rate))
