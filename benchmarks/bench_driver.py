@@ -121,7 +121,7 @@ def run(bench: Bench, name: str, workers: int) -> None:
         parts.append(losers(outcome))
     text = "\n".join(parts)
     write_bytes(folder / MARKDOWN, f"# {study.title}\n\n{text}".encode())
-    write_bytes(folder / "routes.csv", routes_csv(outcome).encode())
+    write_bytes(folder / "routes.csv", routes_csv(outcome.drives).encode())
     print(text)
 
 

@@ -237,20 +237,20 @@ def compare(files: Sequence[Path], chosen: Sequence[str]) -> None:
             here = f"{found.low:.1f} to {found.high:.1f}"
             anew = f"{found.anew_low:.1f} to {found.anew_high:.1f}"
             print(f"  {column} {found.value:.1f} ({here}; types anew {anew})")
-    first, *others = drives.values()
-    shared = [name for name in first if all(name in own for own in others)]
-    unlike = {n for n in shared if len({d[n].end for d in drives.values()}) > 1}
-    scored = sum(len({d[n].score for d in drives.values()}) > 1 for n in shared)
+    every = dict.fromkeys(name for own in drives.values() for name in own)
+    by_route = {n: [own[n] for own in drives.values() if n in own] for n in every}
+    unlike = {n for n, each in by_route.items() if len({one.end for one in each}) > 1}
+    scored = sum(len({one.score for one in each}) > 1 for each in by_route.values())
     print(
-        f"{len(unlike)} of {len(shared)} routes do not end alike for all, by ending and"
-        f" infractions; {scored} have other scores\n"
+        f"{len(unlike)} of {len(every)} routes do not end alike for all who drove them,"
+        f" by ending and infractions; {scored} have other scores\n"
     )
     print(f"type | {' | '.join(drives)} | not alike")
     print("---|" * (1 + len(drives)) + "---")
-    for kind in dict.fromkeys(map(type_of, shared)):
-        names = [each for each in shared if type_of(each) == kind]
-        means = (fmean(own[n].score for n in names) for own in drives.values())
-        told = " | ".join(f"{mean:.1f}" for mean in means)
+    for kind in dict.fromkeys(map(type_of, every)):
+        names = [each for each in every if type_of(each) == kind]
+        scores = ([o[n].score for n in names if n in o] for o in drives.values())
+        told = " | ".join(f"{fmean(each):.1f}" if each else "-" for each in scores)
         parted = len(unlike.intersection(names))
         print(f"{kind} | {told} | {parted} of {len(names)}")
 

@@ -2,11 +2,13 @@
 
     python -m benchmarks.bench_study shifts OUT [--tables A,B] [--workers N]
     python -m benchmarks.bench_study benchmarks/observers/seed-10.toml OUT
+    python -m benchmarks.bench_study benchmarks/road_2/study.toml OUT --so-far
 
 Drives what OUT lacks, as ``me2e-compress study NAME -o OUT`` does: hours, and it goes
 on where it was ended. OUT/NAME gets its report; benchmarks/NAME (of a file the folder
 beside it that has its name) its tables and a line a route; with ``--tables A`` they are
-kept in a folder A of it, so that what took hours lands by itself.
+kept in a folder A of it, so that what took hours lands by itself. ``--so-far`` drives
+nothing, and keeps a line of every route that OUT has.
 """
 
 import argparse
@@ -17,8 +19,11 @@ from benchmarks.bench_driver import told
 from benchmarks.driver_records import routes_csv
 from me2e_compress.errors import Me2eError
 from me2e_compress.evaluators.highway.engine import LocalEngine
+from me2e_compress.evaluators.highway.results import ResultsFolder
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.study import Study, load_study, run_study
+from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.workspace import Workspace
 from me2e_compress.study.write import write_study
 
 KEPT = Path(__file__).parent
@@ -35,11 +40,32 @@ def keep(name: str, part: str, study: Study, out: Path, workers: int) -> None:
     found = run_study(study, out, LocalEngine(workers), told())
     command = ("python", "-m", "benchmarks.bench_study", name, str(out))
     written = write_study(found, out / Path(name).stem, command)
+    folder = kept_in(name, part)
+    write_bytes(folder / "tables.md", written.tables.read_bytes())
+    write_bytes(folder / "routes.csv", routes_csv(found.drives).encode())
+
+
+def keep_so_far(name: str, part: str, study: Study, out: Path) -> None:
+    """Keep the routes that were driven, of drives that are not at their end."""
+    workspace, drives = Workspace(out), list[DriveRecord]()
+    for condition in study.conditions:
+        for variant in study.driven_under(condition):
+            path = workspace.results(variant, condition)
+            if path.is_dir():
+                driven = ResultsFolder.open(path).episodes().values()
+                names = variant.name, condition.name
+                drives.append(DriveRecord.of(*names, {}, driven))
+                print(f"{'.'.join(names)}: {len(driven)} of {study.set_size} routes")
+    folder = kept_in(name, part)
+    write_bytes(folder / "routes.csv", routes_csv(drives).encode())
+
+
+def kept_in(name: str, part: str) -> Path:
+    """Return the folder of what is kept of a study, or of a part of its blocks."""
     folder = KEPT / name if Path(name).suffix == "" else Path(name).with_suffix("")
     folder /= part
     folder.mkdir(parents=True, exist_ok=True)
-    write_bytes(folder / "tables.md", written.tables.read_bytes())
-    write_bytes(folder / "routes.csv", routes_csv(found).encode())
+    return folder
 
 
 def main() -> None:
@@ -50,13 +76,17 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--tables", help="of its blocks only these")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--so-far", action="store_true", help="drive nothing")
     given = parser.parse_args()
     try:
         study = load_study(given.study)
         if given.tables is not None:
             study = study.of_blocks(given.tables.split(","))
         part = (given.tables or "").replace(",", "-")
-        keep(given.study, part, study, given.out, given.workers)
+        if given.so_far:
+            keep_so_far(given.study, part, study, given.out)
+        else:
+            keep(given.study, part, study, given.out, given.workers)
     except Me2eError as error:
         sys.exit(f"bench_study: {error}")
 

@@ -9,6 +9,7 @@ from me2e_compress.metrics.differences import PairedDifference, difference
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.study import Condition, StudyResult, Variant
 from me2e_compress.study.cells import estimate_cell
+from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import Cell, Table
 
@@ -20,12 +21,12 @@ COLUMNS = (
 Drive = tuple[Variant, Condition]
 
 
-def routes_csv(outcome: StudyResult) -> str:
+def routes_csv(drives: Iterable[DriveRecord]) -> str:
     """One row a variant, condition and route."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
-    for drive in outcome.drives:
+    for drive in drives:
         for each in drive.routes:
             infractions = " ".join(kind for kind, _ in each.moments)
             found = (each.driving_score, int(each.succeeded), each.ending, infractions)
