@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -107,7 +108,8 @@ class _Average:
             from scipy import stats  # takes a second to import
 
             # the smallest of the most frequent values
-            return np.asarray(stats.mode(np.stack(self.kept)).mode, self.like.dtype)
+            stack = cast("npt.NDArray[np.int64]", np.stack(self.kept))  # any integers
+            return np.asarray(stats.mode(stack).mode, self.like.dtype)
         mean = np.asarray(self.total / self.count)
         if self.like.dtype == np.bool_:
             return np.asarray(mean >= 0.5)

@@ -166,8 +166,9 @@ def test_the_scale_that_makes_an_output_deaf_to_one_input_is_named() -> None:
     ]
     models = [ir.from_onnx_text(TWO % scale) for scale in ("0.01", "5e7")]
     models[1].graph[0].name = "/Quantize"
-    tally = LivenessTally(*map(Session, models))
-    compare(*map(Session, models), frames, tally.add)
+    a, b = map(Session, models)
+    tally = LivenessTally(a, b)
+    compare(a, b, frames, tally.add)
 
     (fault,) = tally.result(model=models[1]).faults
 
