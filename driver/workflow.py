@@ -3,8 +3,8 @@
 import dataclasses
 from pathlib import Path
 
-from driver.course import NO_LATENCY, RoundResult, run
-from driver.curriculum import FULL, SMALL, SMALL_LATENCY
+from driver.course import RoundResult, run
+from driver.curriculum import FULL, FULL_LATENCY, SMALL, SMALL_LATENCY
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.simulator.routes import check_road
 from me2e_compress.workflows.checks import check_count, check_folder
@@ -96,7 +96,7 @@ def train(
     check_folder(output, ())
     check_road(road)
     check_count("--seed", seed)
-    course, latency = (SMALL, SMALL_LATENCY) if small else (FULL, NO_LATENCY)
+    course, latency = (SMALL, SMALL_LATENCY) if small else (FULL, FULL_LATENCY)
     course = dataclasses.replace(course.seeded(seed), road=road)
     if overlook is not None:
         course = course.overlooking(overlook)

@@ -28,6 +28,7 @@ from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.children import pool
+from me2e_compress.simulator.cameras import CameraRig
 
 SUFFIX, SKIPPED = ".npz", ".skipped"
 SHORTEST_US = 2_000_000
@@ -153,10 +154,16 @@ def episode_of(
         TrainingError: The student failed.
     """
     recording = RecordingPolicy(
-        what.seed, what.noise, what.expert_share, student, cameras_only=what.road == 2
+        what.seed,
+        what.noise,
+        what.expert_share,
+        student,
+        what.every,
+        CameraRig(*what.image_size),
+        cameras_only=what.road == 2,
     )
     route = task.route()
-    episode = drive(route, recording, Conditions(image_size=what.image_size))
+    episode = drive(route, recording, Conditions())
     if episode.ending is Ending.POLICY_FAILED or recording.world is None:
         raise TrainingError(f"route {task.name}: {episode.failure}")
     frames, world = recording.frames, recording.world

@@ -9,7 +9,7 @@ from me2e_compress.simulator.routes import SETS, Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 
 MANIFEST = "dataset.json"
-FORMAT = 1
+FORMAT = 2
 """Of the episodes; another one cannot go on with a folder."""
 
 

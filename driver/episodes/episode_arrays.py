@@ -15,15 +15,11 @@ from driver.episodes.agents import (
     agents,
 )
 from driver.episodes.jpeg import pictures
-from driver.episodes.recording_policy import LabelledFrame
+from driver.episodes.recording_policy import LabelledFrame, cameras_of
 from me2e_compress.evaluators.highway.expert.expert_policy import decide
 from me2e_compress.evaluators.highway.observe import can_bus_of
 from me2e_compress.evaluators.highway.reentry import beyond
-from me2e_compress.simulator.cameras import (
-    CameraRig,
-    Cameras,
-    paint_texture,
-)
+from me2e_compress.simulator.cameras import CameraRig
 from me2e_compress.simulator.cameras.birdseye import ground_classes
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
 from me2e_compress.simulator.privileged import Privileged
@@ -102,8 +98,7 @@ def arrays_of(
         every: Frames between two samples.
         image_size: Rows and columns of a camera.
     """
-    texture = paint_texture(world.roadmap, world.path.points)
-    cameras = Cameras(texture, CameraRig(*image_size))
+    cameras = cameras_of(world, CameraRig(*image_size))
     chosen = range(0, len(frames), every)
     rests = list(_rests(frames))
     later = FUTURE_US // world.dt_us
@@ -117,7 +112,7 @@ def arrays_of(
                 "rest_s": np.array(rests[i], np.float32),
                 **_route(frames[i], world.path, top),
                 **agents(frames[i].scene, future),
-                "ground": ground_classes(frames[i].scene.ego, texture, GRID),
+                "ground": ground_classes(frames[i].scene.ego, cameras.texture, GRID),
             }
         )
     images = pictures(cameras, [frames[i].scene for i in chosen])

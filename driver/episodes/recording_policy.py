@@ -4,13 +4,13 @@ Noise on the driven plan makes the data show how to return to the route.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Self
 from zlib import crc32
 
 import numpy as np
 
-from me2e_compress.driving.answer import six_waypoints
+from me2e_compress.driving.answer import PLAN_TIMES_S, six_waypoints
 from me2e_compress.driving.contract import (
     PLAN_SHAPE,
     Observation,
@@ -24,7 +24,13 @@ from me2e_compress.evaluators.highway.expert.expert_policy import (
     decide,
 )
 from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
-from me2e_compress.evaluators.highway.observe import scene_and_world, seen
+from me2e_compress.evaluators.highway.observe import (
+    ObservationBuilder,
+    scene_and_world,
+    seen,
+)
+from me2e_compress.runtime.trajectory import Trajectory
+from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.privileged import Phase
 from me2e_compress.simulator.scene import Scene
@@ -145,18 +151,48 @@ class LabelledFrame:
     decision: ExpertDecision
 
 
+def cameras_of(world: World, rig: CameraRig) -> Cameras:
+    """Return the cameras of a route, with its ground and its weather."""
+    texture = paint_texture(world.roadmap, world.path.points)
+    return Cameras(texture, rig, world.weather)
+
+
+@dataclass(frozen=True, eq=False)
+class PlanInForce:
+    """A plan that is driven until the next one is made.
+
+    Attributes:
+        made: When and where it was made.
+        plan: [6, 2] metres in the ego frame of then.
+    """
+
+    made: Scene
+    plan: Plan
+
+    def seen_at(self, now: Scene) -> Plan:
+        """Return its waypoints of 0.5 to 3 s from now, in the ego frame of now."""
+        since_s = (now.time_us - self.made.time_us) / 1e6
+        if since_s == 0.0:
+            return self.plan
+        ahead = Trajectory(self.plan, PLAN_TIMES_S).at(PLAN_TIMES_S + since_s)
+        return now.ego.seen(*self.made.ego.placed(ahead).T)
+
+
 @dataclass
 class RecordingPolicy:
     """The expert decides at every frame; it or the student drives, with noise.
 
-    The student plans at every frame, also while the expert drives, so that its
-    recurrent state has no gaps.
+    The student plans at every stored sample, as it learns from them, also while the
+    expert drives, so that its recurrent state has no gaps; between two of them its
+    last plan is driven on.
 
     Args:
         seed: Of noise and turns, together with the id of the route.
         noise: Strength of the noise on the driven plan, see `Perturbation`.
         expert_share: Share of the 2 s turns in which the expert drives.
         student: Who drives in the others; None if the expert always does.
+        every: Frames between two stored samples.
+        rig: The student's cameras.
         cameras_only: Whether the expert knows only what the cameras show.
 
     Attributes:
@@ -168,7 +204,10 @@ class RecordingPolicy:
     noise: float = 1.0
     expert_share: float = 1.0
     student: Policy | None = None
+    every: int = 1
+    rig: CameraRig = field(default_factory=CameraRig)
     cameras_only: bool = False
+    needs_images: bool = field(default=False, init=False)
     privileged: bool = field(default=True, init=False)
     frames: list[LabelledFrame] = field(default_factory=list, init=False)
     world: World | None = field(default=None, init=False)
@@ -176,11 +215,8 @@ class RecordingPolicy:
     _noise: Perturbation = field(init=False, repr=False)
     _draw: np.random.Generator = field(init=False, repr=False)
     _turns: list[bool] = field(default_factory=list, init=False, repr=False)
-
-    @property
-    def needs_images(self) -> bool:
-        """Whether the student does."""
-        return self.student is not None and self.student.needs_images
+    _observer: ObservationBuilder = field(init=False, repr=False)
+    _planned: PlanInForce = field(init=False, repr=False)
 
     def reset(self, route: RouteInfo) -> None:
         """Begin a route."""
@@ -195,7 +231,7 @@ class RecordingPolicy:
         """Keep the expert's decision and return what is driven."""
         scene, world = scene_and_world(observation, "recording")
         if self.world is None:
-            self.world, self.top = world, ceiling(world.path)
+            self._begin(world)
         memory = self.frames[-1].decision.memory if self.frames else Memory()
         shown = seen(scene) if self.cameras_only else scene
         known = world.privileged([actor.id for actor in shown.actors])
@@ -205,10 +241,18 @@ class RecordingPolicy:
         )
         plan = decision.waypoints
         if self.student is not None:
-            answer = self.student.plan(replace(observation, scene=None, world=None))
+            if (len(self.frames) - 1) % self.every == 0:
+                answer = self.student.plan(self._observer.observe(scene))
+                self._planned = PlanInForce(scene, six_waypoints(answer))
             if not self._expert_drives(scene.time_us):
-                plan = six_waypoints(answer)
+                plan = self._planned.seen_at(scene)
         return self._noise.apply(plan, scene.time_us)
+
+    def _begin(self, world: World) -> None:
+        self.world, self.top = world, ceiling(world.path)
+        if self.student is not None:
+            shown = cameras_of(world, self.rig) if self.student.needs_images else None
+            self._observer = ObservationBuilder(world, self.student, self.rig, shown)
 
     def _expert_drives(self, time_us: int) -> bool:
         while len(self._turns) <= time_us // TURN_US:

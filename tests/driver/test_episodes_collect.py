@@ -77,7 +77,7 @@ def test_a_file_a_route_and_what_they_are(folder: Path) -> None:
         assert decode(first).shape == (6, 16, 24, 3)
     told = json.loads((folder / "dataset.json").read_bytes())
     assert told == {
-        **{"format": 1, "seed": 3, "variants": 1, "every": 40, "noise": 1.0},
+        **{"format": 2, "seed": 3, "variants": 1, "every": 40, "noise": 1.0},
         **{"image_size": [16, 24], "expert_share": 1.0, "student": None},
         **{"scenarios": [], "road": 1},
     }

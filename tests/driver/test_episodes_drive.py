@@ -1,8 +1,10 @@
 """A whole episode, against an independent drive of the same route."""
 
 import json
+import math
 import zlib
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +13,14 @@ import pytest
 from driver.episodes import GRID, Collection, decode
 from driver.episodes.collecting import episode_of
 from driver.episodes.collection import Task, tasks_of
-from driver.episodes.episode_arrays import Arrays
+from driver.episodes.episode_arrays import Arrays, arrays_of
 from driver.episodes.recording_policy import (
     Perturbation,
+    PlanInForce,
     RecordingPolicy,
+    cameras_of,
 )
-from me2e_compress.driving.contract import Observation, Plan
+from me2e_compress.driving.contract import Observation, Plan, RouteInfo
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
@@ -30,6 +34,7 @@ from me2e_compress.simulator.cameras import (
     paint_texture,
 )
 from me2e_compress.simulator.scene import Scene
+from me2e_compress.simulator.weather import CLEAR
 from me2e_compress.simulator.world import World
 from tests.evaluators.highway.drivers import straight_on
 
@@ -284,3 +289,72 @@ def test_every_route_is_its_own_noise(noisy: Arrays) -> None:
 
     assert again is not None
     assert not np.array_equal(noisy["pose"][:4], again["pose"][:4])
+
+
+def test_a_recorded_picture_shows_the_weather() -> None:
+    tasks = tasks_of(replace(CALM, scenarios=("HighwayExit",), variants=12, road=2))
+    dark = next(e for e in tasks if World(e.route()).weather.night > 0.5)
+    policy = RecordingPolicy(seed=3)
+    drive(dark.route(), policy, Conditions(), enough=lambda w: w.time_us >= 100_000)
+    assert policy.world is not None
+    cameras = cameras_of(policy.world, CameraRig(*SIZE))
+
+    arrays = arrays_of(policy.world, policy.top, policy.frames, 20, SIZE)
+
+    expected = cameras.render(policy.frames[0].scene).astype(int)
+    by_day = replace(cameras, weather=CLEAR).render(policy.frames[0].scene)
+    found = decode(arrays["jpeg"]).astype(int)
+    assert np.abs(found - expected).mean() < 3.0
+    assert np.abs(by_day - expected).mean() > 20.0
+
+
+class Ahead:
+    """Plans 4 m/s straight on, and keeps what it was shown."""
+
+    needs_images, privileged = False, False
+
+    def __init__(self) -> None:
+        self.shown = list[Observation]()
+
+    def reset(self, route: RouteInfo) -> None:
+        self.shown.clear()
+
+    def plan(self, observation: Observation) -> Plan:
+        self.shown.append(observation)
+        return np.stack([np.arange(2.0, 14.0, 2.0), np.zeros(6)], axis=1)
+
+
+def test_a_student_decides_at_the_stored_samples() -> None:
+    student = Ahead()
+    policy = RecordingPolicy(3, 0.0, 0.0, student, every=4)
+
+    drive(
+        task("HighwayExit").route(),
+        policy,
+        Conditions(),
+        enough=lambda w: w.time_us >= 1_000_000,
+    )
+
+    assert [each.time_us for each in student.shown] == list(
+        range(0, 1_000_000, 200_000)
+    )
+    # it is told of the way since its own last decision, not since the last frame
+    poses = [each.scene.ego for each in policy.frames[::4]]
+    moved = [math.dist((a.x, a.y), (b.x, b.y)) for a, b in pairwise(poses)]
+    told = [float(np.hypot(*each.can_bus[:2])) for each in student.shown[1:]]
+    assert told == pytest.approx(moved, abs=1e-4)
+    assert min(moved) > 0.5
+
+
+def test_a_plan_in_force_stays_where_it_was_made() -> None:
+    ego = replace(World(task("HighwayExit").route()).scene().ego, heading=0.7)
+    then = Scene(0, ego, (), ())
+    ahead = np.array([0.4 * math.cos(0.7), 0.4 * math.sin(0.7)])
+    moved = replace(ego, x=ego.x + ahead[0], y=ego.y + ahead[1])
+    plan = np.stack([np.arange(2.0, 14.0, 2.0), np.zeros(6)], axis=1)
+
+    on_course = PlanInForce(then, plan).seen_at(Scene(100_000, moved, (), ()))
+    standing = PlanInForce(then, plan).seen_at(Scene(100_000, ego, (), ()))
+
+    assert on_course == pytest.approx(plan)
+    assert standing == pytest.approx(plan + np.array([0.4, 0.0]))
