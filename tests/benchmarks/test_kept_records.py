@@ -90,6 +90,10 @@ def asked() -> Iterator[KeptDrive]:
     shifts = kept_drives(RECORDS / "shifts" / "routes.csv")
     int8 = shifts["full.fps-2"] - shifts["full.fps-4"]
     yield int8 - (shifts["float.fps-2"] - shifts["float.fps-4"])
+    # the second road
+    blocks = (RECORDS / "road_2" / "study" / name for name in ("ideal", "int8"))
+    float_, full = (kept_drives(block / "routes.csv") for block in blocks)
+    yield full["full.ideal"] - float_["float.ideal"]
 
 
 @cache
