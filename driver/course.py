@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from driver import trial
-from driver.checkpoint import Start, fit
+from driver.checkpoint import Start, TrainingCheckpoint, fit
 from driver.curriculum import Course, Round, held_out_files
 from driver.episodes import Collection, collect
 from driver.log import Log
@@ -138,6 +138,7 @@ class _CourseRun:
             files = (self.learned, self.held_out)
             start = made[-1] if made else self.start
             made.append(train(training, config, *files, start, folder, on_done))
+            _hand_on(made[-1])
         return made[-1], Log(made[-1].with_name(LOG))
 
     def _evaluate(self, driver: Path, folder: Path, label: str) -> Scores:
@@ -160,6 +161,13 @@ def load(checkpoint: Path, config: HighwayConfig) -> Highway:
     model = Highway(config)
     fit(model, Start.load(checkpoint).mean, checkpoint)
     return model.eval()
+
+
+def _hand_on(checkpoint: Path) -> None:
+    """Keep of a stage at its end what the next one needs, so that it can be kept."""
+    found = TrainingCheckpoint.load(checkpoint)
+    if found.optimizer:
+        found.handed_on().save(checkpoint)
 
 
 def episodes_in(folder: Path) -> list[Path]:

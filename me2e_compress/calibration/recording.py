@@ -179,8 +179,8 @@ def _check_replaceable(folder: Path, mark: str = INDEX) -> None:
 
 
 def _write_npz(path: Path, arrays: Mapping[str, Array]) -> None:
-    """Write like numpy.savez_compressed, at a fast level, reproducibly."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+    """Write like numpy.savez_compressed, reproducibly."""
+    with zipfile.ZipFile(path, "w") as archive:
         archive.comment = marks.BYTES
         for name, value in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy")

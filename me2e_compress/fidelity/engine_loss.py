@@ -10,7 +10,8 @@ import numpy as np
 from me2e_compress.fidelity.dump_readings import LOWEST_DB
 from me2e_compress.fidelity.engine_run import EngineRun
 from me2e_compress.fidelity.floor import ALIVE
-from me2e_compress.fidelity.output_liveness import Cause, Movement
+from me2e_compress.fidelity.output_liveness import Movement
+from me2e_compress.fidelity.saturation import Cause
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
 

@@ -19,12 +19,12 @@ from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.fidelity.output_liveness import (
     Liveness,
     Movement,
-    cause_of,
     gap,
     length,
     share_of,
     share_without_jumps,
 )
+from me2e_compress.fidelity.saturation import cause_of
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import detached

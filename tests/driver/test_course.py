@@ -1,6 +1,7 @@
 """The whole way in small: once through, killed, resumed, refused."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from driver.curriculum import (
 )
 from driver.episodes.collection import Collection, tasks_of
 from driver.log import Log
+from driver.network.stack import Highway
 from driver.options import difference
 from driver.process import Training
 from me2e_compress.driving.onnx_policy import OnnxPolicy
@@ -36,6 +38,9 @@ from tests.driver.made import arrays_of, write
 from tests.driver.small import WORKERS
 
 pytestmark = pytest.mark.xdist_group("small-course")
+
+KEPT = ("last.pt", "log.jsonl")
+"""Of a stage, in the repository."""
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +96,28 @@ def test_trial_routes_are_neither_learned_from_nor_judged_on(small: Path) -> Non
     }
     assert len(tried) == SMALL.trial.routes
     assert not tried & (judged | learned)
+
+
+@pytest.mark.slow
+def test_weights_and_logs_are_enough_to_go_on(small: Path, tmp_path: Path) -> None:
+    kept = ("course.json", "trial.json", *(f"training-0/{each}" for each in KEPT))
+    for name in kept:
+        source = Path(name) if name.endswith(".json") else Path("round-0", name)
+        (tmp_path / source).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(small / source, tmp_path / source)
+
+    run(SMALL, tmp_path, WORKERS, latency=SMALL_LATENCY)
+
+    drivers = [place / "round-1" / "driver.onnx" for place in (tmp_path, small)]
+    assert drivers[0].read_bytes() == drivers[1].read_bytes()
+
+
+@pytest.mark.slow
+def test_a_stage_at_its_end_keeps_no_state_of_learning(small: Path) -> None:
+    for stage in ("round-0/training-0", "round-1/training-1"):
+        found = TrainingCheckpoint.load(small / stage / "last.pt")
+        assert found.optimizer == found.model == {}
+        assert found.mean.keys() == Highway(SMALL.config).state_dict().keys()
 
 
 @pytest.mark.slow

@@ -18,11 +18,11 @@ from me2e_compress.fidelity.liveness import (
     parts_of,
 )
 from me2e_compress.fidelity.output_liveness import (
-    Cause,
     Liveness,
     Movement,
     share_without_jumps,
 )
+from me2e_compress.fidelity.saturation import Cause
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
 from tests.command import Command, command
