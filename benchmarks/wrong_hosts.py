@@ -81,12 +81,6 @@ def never(first: Arrays, starts: bool, before: list[Arrays]) -> Arrays:
     return first
 
 
-def one_never(name: str) -> Any:
-    return lambda first, starts, before: (
-        first if starts else before[-1] | {name: first[name]}
-    )
-
-
 def hosts(stack: str) -> dict[str, Host]:
     """Return the seeded faults by name."""
     on_vad = stack != "highway"

@@ -29,12 +29,10 @@ def cause_of(
     model: ir.Model | None, output: str, feeds: Mapping[str, Array], provider: Provider
 ) -> Cause:
     """Hold the scales of the last int8 values before an output against one frame."""
-    nodes = [] if model is None else _quantizers(model, output)
-    if model is None or not nodes:
+    if model is None or not (nodes := _quantizers(model, output)):
         return Cause()
     # run the graph once with what those nodes read as outputs
-    probed = model.clone()
-    wanted = {str(node.inputs[0].name) for node in nodes if node.inputs[0]}
+    probed, wanted = model.clone(), set(nodes.values())
     made = [value for node in probed.graph for value in node.outputs]
     kept = {value.name for value in probed.graph.outputs}
     probed.graph.outputs.extend(v for v in made if v.name in wanted - kept)
@@ -44,10 +42,9 @@ def cause_of(
         found = {**feeds, **(session.run(feeds, names) if names else {})}
     except (FramesError, GraphError):
         return Cause()
-    reads = {
-        node: found.get(str(node.inputs[0].name)) for node in nodes if node.inputs[0]
-    }
-    causes = (_cause(node, read) for node, read in reads.items() if read is not None)
+    causes = (
+        _cause(node, found[read]) for node, read in nodes.items() if read in found
+    )
     return max(causes, key=lambda each: (each.saturated, each.words), default=Cause())
 
 
@@ -69,13 +66,16 @@ def _cause(node: ir.Node, read: Array) -> Cause:
     return Cause()
 
 
-def _quantizers(model: ir.Model, output: str) -> list[ir.Node]:
-    """List the last QuantizeLinear nodes before an output."""
+def _quantizers(model: ir.Model, output: str) -> dict[ir.Node, str]:
+    """Find the last QuantizeLinear nodes before an output, and what each reads."""
     waiting = [value for value in model.graph.outputs if value.name == output]
-    seen = dict[ir.Node, None]()
+    seen, found = set[ir.Node](), dict[ir.Node, str]()
     while waiting:
         node = waiting.pop().producer()
         if node is not None and node not in seen:
-            seen[node] = None
-            waiting += () if node.op_type == "QuantizeLinear" else reads_of(node)
-    return [node for node in seen if node.op_type == "QuantizeLinear"]
+            seen.add(node)
+            if node.op_type == "QuantizeLinear":
+                found[node] = str(next(reads_of(node)).name)
+            else:
+                waiting += reads_of(node)
+    return found

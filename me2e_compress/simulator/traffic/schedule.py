@@ -40,26 +40,22 @@ class Schedule:
     Attributes:
         claimed: Lanes into the map whose traffic a script has drawn.
         lines: Lights by the lane that they stop, with the arc length of the line.
+        arrivals: In order of time, once closed.
     """
 
     plans: list[SignalPlan] = field(default_factory=list)
     claimed: list[LaneIndex] = field(default_factory=list)
     lines: dict[LaneIndex, list[tuple[float, Regulator]]] = field(default_factory=dict)
-    _arrivals: list[Arrival] = field(default_factory=list)
+    arrivals: list[Arrival] = field(default_factory=list)
     _next: int = 0
-
-    @property
-    def arrivals(self) -> tuple[Arrival, ...]:
-        """All arrivals in order of time."""
-        return tuple(self._arrivals)
 
     def add(self, time_s: float, body: Car | Walker) -> None:
         """Let a body appear at a time."""
-        self._arrivals.append(Arrival(round(time_s * 1e6), body))
+        self.arrivals.append(Arrival(round(time_s * 1e6), body))
 
     def close(self) -> None:
         """Put the arrivals in order; none is added afterwards."""
-        self._arrivals.sort(key=lambda each: (each.time_us, each.body.id))
+        self.arrivals.sort(key=lambda each: (each.time_us, each.body.id))
 
     def show(self, time_us: int) -> None:
         """Set all lights."""
@@ -69,8 +65,8 @@ class Schedule:
     def due(self, time_us: int, present: Sequence[Body]) -> list[Car | Walker]:
         """Return who appears now; who finds the place taken stays away for good."""
         found = list[Car | Walker]()
-        while self._next < len(self._arrivals):
-            arrival = self._arrivals[self._next]
+        while self._next < len(self.arrivals):
+            arrival = self.arrivals[self._next]
             if arrival.time_us > time_us:
                 break
             self._next += 1
