@@ -67,9 +67,14 @@ class TrainingCheckpoint:
         """
         return cls(**_read(path, [field.name for field in fields(cls)]))
 
-    def handed_on(self) -> Self:
-        """Return what the next stage begins with: a quarter of the bytes."""
-        return replace(self, model={}, optimizer={})
+    def handed_on(self, *, needed: bool) -> Self:
+        """Return what is kept of a stage at its end: not the state of learning.
+
+        Args:
+            needed: whether a stage is still to begin with its weights.
+        """
+        kept = replace(self, model={}, optimizer={})
+        return kept if needed else replace(kept, mean={}, lamps={})
 
     def save(self, path: Path) -> None:
         """Write it atomically.

@@ -138,7 +138,9 @@ class _CourseRun:
             files = (self.learned, self.held_out)
             start = made[-1] if made else self.start
             made.append(train(training, config, *files, start, folder, on_done))
-            _hand_on(made[-1])
+            _hand_on(made[-1], needed=True)
+        for begun_from in made[:-1]:
+            _hand_on(begun_from, needed=False)
         return made[-1], Log(made[-1].with_name(LOG))
 
     def _evaluate(self, driver: Path, folder: Path, label: str) -> Scores:
@@ -163,11 +165,11 @@ def load(checkpoint: Path, config: HighwayConfig) -> Highway:
     return model.eval()
 
 
-def _hand_on(checkpoint: Path) -> None:
-    """Keep of a stage at its end what the next one needs, so that it can be kept."""
+def _hand_on(checkpoint: Path, *, needed: bool) -> None:
+    """Keep of a stage at its end what a later one needs, so that it can be kept."""
     found = TrainingCheckpoint.load(checkpoint)
-    if found.optimizer:
-        found.handed_on().save(checkpoint)
+    if found.optimizer or (found.mean and not needed):
+        found.handed_on(needed=needed).save(checkpoint)
 
 
 def episodes_in(folder: Path) -> list[Path]:

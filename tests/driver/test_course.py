@@ -114,10 +114,12 @@ def test_weights_and_logs_are_enough_to_go_on(small: Path, tmp_path: Path) -> No
 
 @pytest.mark.slow
 def test_a_stage_at_its_end_keeps_no_state_of_learning(small: Path) -> None:
-    for stage in ("round-0/training-0", "round-1/training-1"):
+    ends = ("round-0/training-0", "round-1/training-1")
+    for stage in (*ends, "round-1/training-0"):
         found = TrainingCheckpoint.load(small / stage / "last.pt")
         assert found.optimizer == found.model == {}
-        assert found.mean.keys() == Highway(SMALL.config).state_dict().keys()
+        names = Highway(SMALL.config).state_dict().keys() if stage in ends else ()
+        assert found.mean.keys() == set(names)
 
 
 @pytest.mark.slow
