@@ -23,8 +23,10 @@ DRIVER = RECORDS / "driver"
 PAGES = (
     ROOT / "README.md",
     DRIVER / "README.md",
+    RECORDS / "road_2" / "training" / "README.md",
     *sorted((ROOT / "docs").glob("*.md")),
 )
+TRIAL = RECORDS / "road_2" / "training" / "trial.csv"
 ELSEWHERE = ("paper.md", "energy.md")
 """One a test of its own holds against its script, the other tells of no drives."""
 
@@ -94,6 +96,8 @@ def asked() -> Iterator[KeptDrive]:
     blocks = (RECORDS / "road_2" / "study" / name for name in ("ideal", "int8"))
     float_, full = (kept_drives(block / "routes.csv") for block in blocks)
     yield full["full.ideal"] - float_["float.ideal"]
+    # drivers trained there, and the one that ships
+    yield from compared(kept_drives(TRIAL))
 
 
 @cache
@@ -108,7 +112,7 @@ def known() -> frozenset[Triple]:
     for drive in asked():
         found.update(rounded(drive.mean()))
     # both roads: driving score, success and room kept
-    roads = [*(RECORDS / "road_2" / "study").glob("*/routes.csv")]
+    roads = [*(RECORDS / "road_2" / "study").glob("*/routes.csv"), TRIAL]
     roads += [RECORDS / "paper" / f"float.{name}.jsonl" for name in ("ideal", "fps-4")]
     for own in (each for path in roads for each in drives_of([path]).values()):
         for mean in means_of(own).values():
