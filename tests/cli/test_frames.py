@@ -123,6 +123,9 @@ def test_a_file_with_one_camera_sees_it_alone(cli: Cli, tmp_path: Path) -> None:
         ("front.onnx --from nuscenes:log", "img is [None, 80], an open size: give it"),
         ("vad-tiny --from kitti:log", "no driving log 'kitti'; there are nuscenes"),
         ("nothing --from nuscenes:log", "no stack 'nothing' in the zoo"),
+        ("vad-tiny --from nuscenes:log --road 2", "--road 2: nobody drives for these"),
+        ("vad-tiny --road 1", "--road 1: nobody drives for these frames"),
+        ("highway --road 3", "--road 3: there are 1 and 2"),
         (
             "vad-tiny --from nuscenes:log --adapter a.toml",
             "name the ONNX file that it adapts",

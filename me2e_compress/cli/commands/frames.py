@@ -36,6 +36,7 @@ def frames(
     scene_length: Length = None,
     log: Log = None,
     adapter: given.Adapter = None,
+    road: given.Road = None,
     seed: given.Seed = 0,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
@@ -43,10 +44,10 @@ def frames(
 ) -> None:
     """Write calibration frames, coherent in time, seen by six cameras.
 
-    A synthetic world is drawn for stacks of the zoo; for highway, or any ONNX file or
-    stack of files (STACK.toml) that keeps the policy contract (--adapter), the expert
-    drives fresh routes. With --from, recorded driving of nuScenes or Bench2Drive is
-    laid out as either takes it.
+    A synthetic world is drawn for stacks of the zoo; for a driver that ships, or any
+    ONNX file or stack of files (STACK.toml) that keeps the policy contract (--adapter),
+    the expert drives fresh routes of a --road. With --from, recorded driving of
+    nuScenes or Bench2Drive is laid out as either takes it.
     """
     options = workflow.FramesOptions(
         count,
@@ -56,6 +57,7 @@ def frames(
         provider_named(provider, plugins or ()),
         None if log is None else LOGS.parse(log),
         adapter,
+        road,
     )
     with listening() as listener:
         workflow.record_frames(stack, output, options, listener)

@@ -16,7 +16,7 @@ from me2e_compress.evaluators.highway.observe import ObservationBuilder
 from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
-from me2e_compress.simulator.routes import Route, load_routes
+from me2e_compress.simulator.routes import SETS, Route, check_road, load_routes
 from me2e_compress.simulator.scenarios.catalogue import EXPERT_S
 from me2e_compress.simulator.world import World
 
@@ -34,21 +34,24 @@ def driven_frames(
     scene_length: int = 16,
     done: int = 0,
     first: int = 0,
+    road: int = 1,
 ) -> Iterator[Frame]:
     """Yield what a model sees on fresh routes, every half second.
 
-    A scene is a random stretch of one route, driven by the expert without latency;
-    fewer frames than ``scene_length`` if the route ends before. Its clock, its CAN bus
-    and (since they are left out) its recurrent inputs start anew. Scenario types
-    alternate; none of the routes is one of the shipped 220. Frames are keyed by the
-    graph's input names, without the recurrent inputs; the policy defines image size,
-    normalisation, names and types.
+    A scene is a random stretch of one route of a road, driven by the expert without
+    latency, on the second road by what the cameras show; fewer frames than
+    ``scene_length`` if the route ends before. Its clock, its CAN bus and (since they
+    are left out) its recurrent inputs start anew. Scenario types alternate; none of the
+    routes is one of the 220 that ship. Frames are keyed by the graph's input names,
+    without the recurrent inputs; the policy defines image size, normalisation, names
+    and types.
 
     To resume, ``done`` is the number of frames that exist, in whole scenes, and
     ``first`` the index of the route of the first missing scene.
 
     Raises:
         FramesError: A count is below 1, or the seed below 0.
+        EvaluationError: There is no such road.
     """
     if count < 1 or scene_length < 1:
         raise FramesError(
@@ -56,8 +59,10 @@ def driven_frames(
         )
     if seed < 0:
         raise FramesError(f"seed {seed}: must be 0 or more")
+    check_road(road)
     # one scene per route, from a random moment on
-    for place, route in enumerate(islice(fresh_routes(seed), first, None), first):
+    routes = islice(fresh_routes(seed, road), first, None)
+    for place, route in enumerate(routes, first):
         random = np.random.default_rng([SEED_OFFSET + seed, place])
         spare_us = EXPERT_S[route.scenario] * 1_000_000 - scene_length * STEP_US
         begin_us = int(random.integers(0, max(1, spare_us // DT_US))) * DT_US
@@ -70,19 +75,19 @@ def driven_frames(
             return
 
 
-def fresh_routes(seed: int) -> Iterator[Route]:
+def fresh_routes(seed: int, road: int = 1) -> Iterator[Route]:
     """Yield proposed routes endlessly, cycling through the types in random order.
 
-    The shipped 220 are skipped; the admission gate is not applied.
+    The 220 of the road that ship are skipped; the admission gate is not applied.
     """
-    judged = {(route.scenario, route.seed) for route in load_routes()}
+    judged = {(route.scenario, route.seed) for route in load_routes(SETS[road])}
     types = np.random.default_rng(SEED_OFFSET + seed).permutation(sorted(EXPERT_S))
     attempt = 0
     while True:
         for scenario in map(str, types):
             drawn = seed_of(SEED_OFFSET + seed, scenario, attempt)
             if (scenario, drawn) not in judged:
-                yield propose(scenario, drawn, f"{scenario}_{attempt}")
+                yield propose(scenario, drawn, f"{scenario}_{attempt}", road)
         attempt += 1
 
 
@@ -92,7 +97,7 @@ def _look(
     """Yield the model's feeds from a moment on, until enough or the route ends."""
     world, expert, rules = (
         World(route),
-        Expert(),
+        Expert(cameras_only=route.road == 2),
         EndingRules(),
     )
     # the expert drives, the model looks on

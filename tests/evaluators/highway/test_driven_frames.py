@@ -8,10 +8,12 @@ from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import FramesError
 from me2e_compress.evaluators.highway import driven_frames as room
 from me2e_compress.evaluators.highway.driven_frames import driven_frames, fresh_routes
+from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import replay
 from me2e_compress.simulator.cameras import CameraRig
-from me2e_compress.simulator.routes import load_routes
+from me2e_compress.simulator.routes import ROADS, SETS, Route
+from me2e_compress.simulator.world import World
 from tests.evaluators.highway.drivers import straight_on
 from tests.stand_in import write_model
 
@@ -120,14 +122,39 @@ def test_the_types_take_turns() -> None:
     assert types[:44] == types[44:]
 
 
+@pytest.mark.parametrize("road", ROADS)
 def test_no_route_is_one_that_drivers_are_judged_on(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, road: int
 ) -> None:
-    """A route that the shipped set has is passed over."""
-    first, second = itertools.islice(fresh_routes(0), 2)
-    monkeypatch.setattr(room, "load_routes", lambda: (first, *load_routes()))
+    """A route that the road's set has is passed over."""
+    first, second = itertools.islice(fresh_routes(0, road), 2)
+    sets = {SETS[road]: (first,)}
+    monkeypatch.setattr(room, "load_routes", lambda path: sets[path])
 
-    assert next(fresh_routes(0)) == second
+    assert next(fresh_routes(0, road)) == second
+
+
+@pytest.mark.parametrize("road", ROADS)
+def test_a_recording_keeps_to_its_road(
+    policy: OnnxPolicy, monkeypatch: pytest.MonkeyPatch, road: int
+) -> None:
+    """On the second the expert drives by what the cameras show."""
+    driven = list[Route]()
+    experts = list[bool]()
+
+    def world(route: Route) -> World:
+        driven.append(route)
+        return World(route)
+
+    def expert(*, cameras_only: bool) -> Expert:
+        experts.append(cameras_only)
+        return Expert(cameras_only=cameras_only)
+
+    monkeypatch.setattr(room, "World", world)
+    monkeypatch.setattr(room, "Expert", expert)
+    assert len(list(driven_frames(policy, 2, seed=0, scene_length=1, road=road))) == 2
+    assert {route.road for route in driven} == {road}
+    assert set(experts) == {road == 2}
 
 
 @pytest.mark.parametrize(
