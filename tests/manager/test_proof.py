@@ -173,3 +173,56 @@ def test_what_onnxruntime_itself_changes_is_no_fault_of_a_pass(
     (remark,) = check.remarks
     assert "another y of the graph before the passes at its level basic" in remark
     assert "from node /backbone/Bias (Add)" in remark
+
+
+LINEAR = """linear (float[1,8] x) => (float[1,8] y)
+<float[8] w = {1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0}> {
+    ["/backbone/Mul"] y = Mul(x, w)
+}"""
+"""Moves by the share that its weights move by."""
+
+
+def test_rounding_is_no_breach_of_exactness(context: Context) -> None:
+    (check,) = checks(LINEAR, context, passes.scales(1 + 5e-5))
+    assert check.errors["y"] == pytest.approx(5e-5, rel=0.01)
+
+
+@pytest.mark.parametrize("share", [2e-4, 1e-3, 5e-2])
+def test_an_exact_pass_must_not_move_an_output_by_a_little(
+    share: float, context: Context
+) -> None:
+    with pytest.raises(VerificationError, match=r"^scales promises .* changed y by"):
+        checks(LINEAR, context, passes.scales(1 + share))
+
+
+def test_the_place_is_named_where_a_pass_breaks_its_promise(context: Context) -> None:
+    words = r"\(allowed .* inputs\); values differ from node /backbone/Mul \(Mul\) on$"
+    with pytest.raises(VerificationError, match=words):
+        checks(LINEAR, context, passes.scales(1.05))
+
+
+HARD = """hard (float[1,8] x) => (float[1,8] choice, float[1,8] steady)
+<float[8] w = {1.5, 2.1, 3.7, 4.3, 5.9, 6.1, 7.7, 8.3}, float k = {1e8}> {
+    ["/backbone/Mul"] a = Mul(x, w)
+    ["/plan_head/Mul"] b = Mul(a, k)
+    ["/plan_head/Sin"] c = Sin(b)
+    ["/plan_head/Sign"] choice = Sign(c)
+    ["/occ_head/Tanh"] steady = Tanh(a)
+}"""
+"""``choice`` hangs on the last places of ``x``."""
+
+
+def test_what_rounding_alone_decides_is_not_held_against_a_pass(
+    context: Context,
+) -> None:
+    (check,) = checks(HARD, context, passes.ROUNDS)
+    assert check.unsteady == ("choice",)
+    assert check.errors["choice"] > 1.0
+    assert 0.0 < check.errors["steady"] < check.tolerances["steady"]
+
+
+def test_what_is_steady_is_judged_beside_it(context: Context) -> None:
+    suspects = (passes.ROUNDS, passes.TurnsTanhIntoSigmoid())
+    words = r"^turns-tanh-into-sigmoid promises .* changed steady by"
+    with pytest.raises(VerificationError, match=words):
+        checks(HARD, context, *suspects)
