@@ -51,6 +51,8 @@ THREE_FILES = TWO_PARTS.replace(
     'file = "head.onnx"', 'file = "head.onnx"\nfirst_frame = "head_first.onnx"'
 )
 
+STATE = TWO_PARTS + "[state]\nprev_bev = {first = %r}\n"
+"""Where the state of the two parts begins."""
 
 TWO_MODULES = """
 [modules.a]
