@@ -11,7 +11,10 @@ from me2e_compress import graph
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.provenance import Provenance
+from me2e_compress.quantization.plan import Decision, QuantPlan, make_plan
+from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.rules.paper_rules import PaperRules
+from me2e_compress.quantization.scheme import QuantScheme
 
 PAPER = PaperRules()
 """Rules under which graphs as small as these have int8: no kernel is asked."""
@@ -74,6 +77,17 @@ def net(text: str, weights: Mapping[str, npt.NDArray[np.floating]]) -> ir.Model:
         provenance.stamp(node, Provenance(module, (name,)))
     graph.infer_shapes(model)
     return model
+
+
+def planned(model: ir.Model, rules: str = "safe") -> QuantPlan:
+    """Plan the module ``head`` in int8, by a set of rules."""
+    scheme = QuantScheme.of(("head",), MODULES)
+    return make_plan(model, scheme, RULE_SETS.parse(rules))
+
+
+def by_output(plan: QuantPlan) -> dict[str, Decision]:
+    """Map the output of every layer to what was decided of it."""
+    return {each.output: each for each in plan.decisions}
 
 
 def save_text(path: Path, text: str, **metadata: str) -> Path:

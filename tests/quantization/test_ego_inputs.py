@@ -3,12 +3,9 @@
 import numpy as np
 import pytest
 
-from me2e_compress.quantization.plan import Decision, make_plan
-from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.quantization.scheme import QuantScheme
-from tests.nets import MODULES, net
+from me2e_compress.quantization.plan import Decision
+from tests.nets import by_output, net, planned
 
-HEAD = QuantScheme.of(("head",), MODULES)
 NET = """<ir_version: 9, opset_import: ["" : 17]>
 ego (float[3,18] can_bus, float[1,3,%d,32] image, float[3,32] memory,
      float[18,32] a, float[32,32] b, float[32,64] c, float[64,32] d,
@@ -34,8 +31,7 @@ SIZES = {"a": (18, 32), "b": (32, 32), "c": (32, 64), "d": (64, 32), "grid": (50
 
 def decisions(height: int, rule_set: str) -> dict[str, Decision]:
     model = net(NET % height, {name: np.ones(size) for name, size in SIZES.items()})
-    plan = make_plan(model, HEAD, RULE_SETS.parse(rule_set))
-    return {each.output: each for each in plan.decisions}
+    return by_output(planned(model, rule_set))
 
 
 def rules(height: int, rule_set: str) -> dict[str, str]:

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from me2e_compress.quantization.plan import Decision, QuantPlan, make_plan
+from me2e_compress.quantization.plan import QuantPlan, make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.rules.safe_rules import Geometry
 from me2e_compress.quantization.scheme import QuantScheme
-from tests.nets import MODULES, net
+from tests.nets import MODULES, by_output, net
 
 HEAD = QuantScheme.of(("head",), MODULES)
 OPSETS = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
@@ -20,10 +20,6 @@ ALONE = "paper{extra=[geometry], without=[gemv]}"
 def planned(text: str, shapes: Mapping[str, tuple[int, ...]], rules: str) -> QuantPlan:
     weights = {name: np.ones(shape) for name, shape in shapes.items()}
     return make_plan(net(OPSETS + text, weights), HEAD, RULE_SETS.parse(rules))
-
-
-def by_output(plan: QuantPlan) -> dict[str, Decision]:
-    return {each.output: each for each in plan.decisions}
 
 
 PROJECTIONS: dict[str, tuple[str, dict[str, tuple[int, ...]]]] = {

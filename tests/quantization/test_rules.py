@@ -1,34 +1,16 @@
 """The rules beyond the paper's two stages."""
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import ClassVar
-
 import numpy as np
-import onnx_ir as ir
 import pytest
 
 from me2e_compress.errors import RecipeError
-from me2e_compress.graph import static_shape
-from me2e_compress.passes import Context
-from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.plan import Decision, QuantPlan, make_plan
-from me2e_compress.quantization.rules import RULE_SETS, Rule, RuleFacts, RuleSet
-from me2e_compress.quantization.rules.paper_rules import PaperRules
+from me2e_compress.quantization.plan import make_plan
+from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
-from tests.installed import install
-from tests.nets import MODULES, net
+from tests.nets import MODULES, by_output, net, planned
 
 HEAD = QuantScheme.of(("head",), MODULES)
 OPSETS = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
-
-
-def planned(model: ir.Model, rules: str = "safe") -> QuantPlan:
-    return make_plan(model, HEAD, RULE_SETS.parse(rules))
-
-
-def by_output(plan: QuantPlan) -> dict[str, Decision]:
-    return {each.output: each for each in plan.decisions}
 
 
 def test_no_such_rule_set() -> None:
@@ -226,60 +208,6 @@ def test_a_layer_behind_a_layer_is_no_position() -> None:
     found = by_output(planned(net(text, weights)))
 
     assert (found["h"].rule, found["o"].rule) == ("layer", "coordinates")
-
-
-@dataclass(frozen=True)
-class OnlySmall(Rule):
-    """Products of more than some columns stay float."""
-
-    name: ClassVar[str] = "only-small"
-    columns: int = 8
-
-    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
-        shape = static_shape(node.outputs[0])
-        return "too wide" if shape and shape[-1] > self.columns else None
-
-
-def test_a_rule_of_another_package_joins_a_set(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    entry = {"only-small": f"{__name__}:OnlySmall"}
-    install(monkeypatch, tmp_path, "a-rule", "me2e_compress.rules", entry)
-    model = net(PRODUCTS, {"w": np.ones((32, 32)), "v": np.ones((32, 64))})
-
-    plan = planned(model, "paper{extra=[only-small{columns=32}]}")
-
-    assert by_output(plan)["y"].rule == "layer"
-    assert by_output(plan)["z"].rule == "only-small"
-    assert plan.rules == 'paper{extra=["only-small{columns=32}"]}'
-
-
-PRODUCTS = OPSETS + (
-    "p (float[9,32] x, float[32,32] w, float[32,64] v)"
-    " => (float[9,32] y, float[9,64] z) { y = MatMul(x, w) z = MatMul(x, v) }"
-)
-
-
-@dataclass(frozen=True)
-class NoRules(RuleSet):
-    """Everything that can be is int8."""
-
-    name: ClassVar[str] = "no-rules"
-
-    def own_rules(self) -> tuple[Rule, ...]:
-        return PaperRules().own_rules()[:3]
-
-
-def test_a_set_of_another_package_decides(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    entry = {"no-rules": f"{__name__}:NoRules"}
-    install(monkeypatch, tmp_path, "a-set", "me2e_compress.rule_sets", entry)
-    model = net(PRODUCTS, {"w": np.ones((32, 32)), "v": np.ones((32, 64))})
-
-    assert planned(model, "no-rules").counts()["layer"] == 2
-    with pytest.raises(RecipeError, match="no-rules has no option 'attention_limit'"):
-        QuantizeInt8(rules="no-rules", attention_limit=8).plan(model, Context(MODULES))
 
 
 ATTENTION = (
