@@ -1,91 +1,34 @@
 """The paper's study on drivers that need no images."""
 
 import hashlib
-import json
 import math
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from me2e_compress.errors import StudyError
-from me2e_compress.study import (
-    Condition,
-    Listener,
-    Study,
-    StudyResult,
-    Timing,
-    Variant,
-    run_study,
-)
+from me2e_compress.study import Condition, Listener, Study, StudyResult, Timing, Variant
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.paper.accident import Accident, plans_before
 from me2e_compress.study.paper.evidence import FEWEST_RUNS
-from me2e_compress.study.paper.paper_result import PaperResult
 from me2e_compress.study.paper.paper_run import read_paper
 from me2e_compress.study.paper.questions import SHIPPED
 from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
 from me2e_compress.study.workload import held_frames, workload
-from me2e_compress.workflows.listener import SILENT
-from tests.study.conftest import BLIND, IDEAL, ROUTES, SLOW, Here
-
-FASTER = Variant("faster", "blind:9")
-BROKEN = Variant("broken", "gone.onnx")
-ASKED = Study(
-    "Asked again",
-    (BLIND, FASTER, BROKEN),
-    (IDEAL, SLOW),
-    "blind",
+from tests.study.conftest import (
+    ASKED,
+    BLIND,
+    FASTER,
+    IDEAL,
     ROUTES,
-    220,
-    report="paper",
-    blocks=(
-        StudyBlock("table-2", ("blind",), ("ideal", "slow")),
-        StudyBlock("table-3", ("blind", "faster", "broken"), ("ideal",)),
-    ),
+    SLOW,
+    First,
+    Here,
+    run_paper,
 )
-
-
-def run_paper(
-    study: Study,
-    folder: Path,
-    engine: Here,
-    listener: Listener = SILENT,
-    on_block: Callable[[StudyResult], None] | None = None,
-) -> PaperResult:
-    found = run_study(study, folder, engine, listener, on_block=on_block)
-    assert isinstance(found, PaperResult)
-    return found
-
-
-@dataclass(frozen=True)
-class First:
-    """The first run in a folder."""
-
-    folder: Path
-    engine: Here
-    landed: list[int]
-
-
-@pytest.fixture(scope="module")
-def first(tmp_path_factory: pytest.TempPathFactory) -> First:
-    made = First(tmp_path_factory.mktemp("paper"), Here(), [])
-    run_paper(
-        ASKED,
-        made.folder,
-        made.engine,
-        on_block=lambda found: made.landed.append(
-            sum(not each.reason for each in found.drives)
-        ),
-    )
-    return made
-
-
-@pytest.fixture
-def driven(first: First) -> Path:
-    return first.folder
 
 
 def test_a_block_drives_what_no_other_has_driven(first: First) -> None:
@@ -195,16 +138,6 @@ def test_a_drive_knows_its_questions_unless_they_came_later(
     assert "before its drives" not in {each.asked for each in found.findings}
 
 
-def test_a_record_of_another_evaluation_is_not_taken(driven: Path) -> None:
-    other = replace(ASKED, variants=(BLIND, Variant("faster", "blind:7"), BROKEN))
-
-    found = run_paper(other, driven, Here())
-
-    assert (
-        "of another evaluation: its policy is" in found.drive("faster", "ideal").reason
-    )
-
-
 def test_the_blocks_of_a_study_can_be_chosen() -> None:
     part = ASKED.of_blocks(["2"])
 
@@ -227,50 +160,6 @@ def test_a_dry_run_counts_what_is_left(driven: Path, tmp_path: Path) -> None:
     assert ahead.headline.startswith("Asked again: 4 drives, 8 routes, 0 of them driv")
     assert ahead.drives[0].hours > ahead.drives[-1].hours > 0.0
     assert [each.done for each in after.drives] == [2, 2, 0, 2]
-
-
-def test_a_record_keeps_what_the_tables_need(driven: Path) -> None:
-    path = driven / "records" / "blind.slow.jsonl"
-    record = DriveRecord.load(path)
-
-    assert [each.route for each in record.routes] == [each.id for each in ROUTES]
-    assert record.routes[0].latency_us == (500_000,) * 4
-    assert path.stat().st_size < 2_000
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda text: text[: len(text) // 2], "its last line was cut off"),
-        (lambda text: text + text.splitlines()[-1] + "\n", "names route .* twice"),
-        (lambda text: text.replace("completion", "finish"), "not a record of a drive"),
-        (lambda text: "", "its last line was cut off"),
-    ],
-)
-def test_a_spoilt_record_is_named(
-    driven: Path, tmp_path: Path, spoil: object, message: str
-) -> None:
-    text = (driven / "records" / "blind.slow.jsonl").read_text()
-    path = tmp_path / "blind.slow.jsonl"
-    path.write_text(spoil(text))  # type: ignore[operator]
-
-    with pytest.raises(StudyError, match=rf"^{path}: .*{message}"):
-        DriveRecord.load(path)
-
-
-def test_records_of_other_routes_do_not_stand_together(
-    driven: Path, tmp_path: Path
-) -> None:
-    for path in (driven / "records").iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    path = tmp_path / "faster.ideal.jsonl"
-    head, *rows = path.read_text().splitlines()
-    made = json.loads(head)
-    made["made_by"]["routes_sha256"] = "0"
-    path.write_text("\n".join([json.dumps(made), *rows]) + "\n")
-
-    with pytest.raises(StudyError, match="drives of different sets of routes"):
-        read_paper(ASKED, tmp_path)
 
 
 def test_what_a_block_or_a_recording_cannot_be() -> None:
