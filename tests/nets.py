@@ -15,6 +15,7 @@ from me2e_compress.quantization.plan import Decision, QuantPlan, make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.rules.paper_rules import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.runtime.frames import Frame
 
 PAPER = PaperRules()
 """Rules under which graphs as small as these have int8: no kernel is asked."""
@@ -102,3 +103,13 @@ def image(seed: int) -> dict[str, npt.NDArray[np.float32]]:
     """One input of :func:`conv_attention`, its memory left out."""
     array = np.random.default_rng(seed).standard_normal((1, 3, 8, 8))
     return {"image": array.astype(np.float32)}
+
+
+def image_frames(count: int = 2) -> list[Frame]:
+    """Give one scene of frames of :func:`conv_attention`, its memory left out."""
+    return [Frame(at, at == 0, dict(image(at))) for at in range(count)]
+
+
+def turn_softmax(model: ir.Model) -> None:
+    """Break :func:`conv_attention`: its attention is shared along another axis."""
+    model.graph.node("/head/Softmax").attributes["axis"] = ir.AttrInt64("axis", 1)
