@@ -1,11 +1,14 @@
-"""Deformable attention as exporters write it, in ONNX text."""
+"""Deformable attention as exporters write it, and as none does, in ONNX text."""
 
 import dataclasses
 
 import numpy as np
 import onnx_ir as ir
 
+from me2e_compress.graph import infer_shapes
 from tests.passes.small import read
+
+FUSED = "MultiScaleDeformableAttention"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,3 +133,31 @@ def _levels(s: Sizes, shapes: dict[str, list[int]], split: bool) -> list[str]:
             f"g{i} = Squeeze(gk{i}, axis3)",
         )
     ]
+
+
+def inferred(model: ir.Model) -> ir.Model:
+    infer_shapes(model)
+    return model
+
+
+SAMPLED = 'GridSample<mode = "bilinear", padding_mode = "zeros">'
+PLAIN = """<ir_version: 9, opset_import: ["" : 17]>
+g (float[6,4,5,7] image, float[6,9,3,2] grid, WEIGHTS weights) => (float y) {
+    s = SAMPLER(image, grid)
+    m = Mul(weights, s)
+    y = ReduceSum<keepdims = KEEP>(m, AXES)
+}"""
+
+
+def plain(
+    sampler: str = SAMPLED,
+    weights: str = "float[6,1,9,3]",
+    axes: tuple[int, ...] = (3,),
+    keep: int = 0,
+) -> ir.Model:
+    """One level, as a graph that no exporter of an attention wrote may have it."""
+    text = PLAIN.replace("SAMPLER", sampler).replace("WEIGHTS", weights)
+    text = text.replace("AXES", "axes").replace("KEEP", str(keep))
+    rank = 4 if keep else 4 - len(axes)
+    text = text.replace("float y", f"float[{','.join('ABCD'[:rank])}] y")
+    return read(text, axes=np.array(axes, np.int64))

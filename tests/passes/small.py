@@ -1,19 +1,27 @@
-"""Small graphs for the tests of the exact passes."""
+"""Small graphs for the tests of the passes, and what passes make of them."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import onnx
 import onnx_ir as ir
 import onnxruntime
 
 from me2e_compress import graph
-from me2e_compress.graph import provenance
+from me2e_compress.graph import provenance, static_shape
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.fuse_basic import FuseBasic
+from me2e_compress.passes.import_normalize import ImportNormalize
+from tests.nets import net
 
 NO_MODULES = Context(ModuleMap("none", ()))
+EVERYTHING = ModuleMap.parse(
+    '[modules.all]\nrole = "feature"\noptional = ["**"]', "everything"
+)
+RANDOM = np.random.default_rng(7)
 
 
 def read(text: str, **weights: Any) -> ir.Model:
@@ -60,3 +68,67 @@ def compute(model: ir.Model, feeds: Mapping[str, Any]) -> list[Any]:
         providers=["CPUExecutionProvider"],
     )
     return list(session.run(None, dict(feeds)))
+
+
+def bare(text: str, arrays: Mapping[str, npt.NDArray[np.float32]]) -> ir.Model:
+    """Read a graph whose nodes have neither names nor a past."""
+    model = net(text, arrays)
+    for node in model.graph:
+        node.metadata_props.clear()
+    return model
+
+
+def types_of(model: ir.Model) -> dict[str, str]:
+    """Map every operator but Cast to the element type of what it reads first."""
+    return {
+        node.op_type: node.inputs[0].dtype.name
+        for node in model.graph
+        if node.op_type != "Cast"
+        and node.inputs[0] is not None
+        and node.inputs[0].dtype is not None
+    }
+
+
+def casts(model: ir.Model) -> int:
+    return sum(node.op_type == "Cast" for node in model.graph)
+
+
+def opset(version: int) -> str:
+    return f'<ir_version: 9, opset_import: ["" : {version}]>\n'
+
+
+def normal(*shape: int) -> Any:
+    return RANDOM.normal(size=shape).astype(np.float32)
+
+
+def fuse_basic(text: str, left: list[str], **weights: Any) -> ir.Model:
+    """Run ``fuse-basic``; compare operators, and values within 1e-4 of the largest."""
+    before, after = read(text, **weights), read(text, **weights)
+    apply(FuseBasic(), after)
+    assert ops(after) == left
+    feeds = {
+        port.name or "": normal(*(static_shape(port) or ()))
+        for port in before.graph.inputs
+    }
+    for want, got in zip(compute(before, feeds), compute(after, feeds), strict=True):
+        np.testing.assert_allclose(got, want, rtol=0, atol=1e-4 * np.abs(want).max())
+    return after
+
+
+def unstamped(text: str) -> ir.Model:
+    """Read ONNX text of opset 17 as it comes in, names and past left out."""
+    return ir.from_onnx_text(f'<ir_version: 8, opset_import: ["": 17]>\n{text}')
+
+
+def normalise(model: ir.Model) -> PassResult:
+    """Import a graph of one module, once every node has a name."""
+    for node in model.graph.all_nodes():
+        node.name = node.name or f"/part/{node.outputs[0].name}"
+    return ImportNormalize().run(model, Context(EVERYTHING))
+
+
+def settled(model: ir.Model) -> bool:
+    """Tell whether another import changes nothing."""
+    before = graph.digest(model)
+    again = ImportNormalize().run(model, Context(EVERYTHING))
+    return again.changes == 0 and graph.digest(again.model) == before

@@ -5,7 +5,6 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import (
     FramesError,
     ModuleMapError,
@@ -13,54 +12,20 @@ from me2e_compress.errors import (
     RecipeError,
 )
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.passes.ablate_modules import AblateModules
-from me2e_compress.passes.base import Context
 from me2e_compress.runtime.session import run_once
-from tests.frames import record
 from tests.nets import net
-
-STACK = """
-<ir_version: 9, opset_import: ["" : 17]>
-stack (float[1,4] camera) => (float[1,4] plan, float[1,2,2] lanes)
-<int64[3] square = {1, 2, 2}, int64[2] flat = {1, 4}> {
-    ["/backbone/Relu"] f = Relu(camera)
-    ["/agents/Abs"] agents = Abs(f)
-    ["/map/Neg"] m = Neg(f)
-    ["/map/Reshape"] lanes = Reshape(m, square)
-    ["/planner/look/Reshape"] seen = Reshape(lanes, flat)
-    ["/planner/look/Exp"] ego_map = Exp(seen)
-    ["/planner/meet/Sqrt"] met = Sqrt(agents)
-    ["/planner/Add"] plan = Add(ego_map, met)
-}
-"""
-
-MAP = """
-[modules.backbone]
-role = "feature"
-patterns = ["backbone"]
-[modules.agents]
-role = "prediction"
-patterns = ["agents"]
-[modules.map]
-role = "prediction"
-patterns = ["map"]
-%s
-[modules.planner]
-role = "prediction"
-patterns = ["planner"]
-"""
-
-CAMERA = np.array([[-1, 0, 4, 9]], np.float32)
-
-
-def context(substitutes: str = "") -> Context:
-    return Context(ModuleMap.parse(MAP % substitutes, "stack"))
-
-
-def substitute(scope: str, by: str | None = None) -> str:
-    substitute = "" if by is None else f', by = "{by}"'
-    return f'substitutes = [{{ scope = "{scope}"{substitute} }}]'
+from tests.passes.ablated import (
+    CAMERA,
+    NO_AGENTS,
+    NO_MAP,
+    SIZED,
+    STACK,
+    context,
+    plan_of,
+    substitute,
+)
+from tests.passes.small import ops
 
 
 @pytest.fixture
@@ -68,17 +33,8 @@ def stack() -> ir.Model:
     return net(STACK, {})
 
 
-def plan_of(model: ir.Model) -> list[float]:
-    plan: list[float] = run_once(model, {"camera": CAMERA})["plan"][0].tolist()
-    return plan
-
-
-def ops(model: ir.Model) -> list[str]:
-    return [node.op_type for node in model.graph]
-
-
 def test_readers_of_a_dropped_module_read_zeros(stack: ir.Model) -> None:
-    result = AblateModules(drop=("agents",)).run(stack, context())
+    result = NO_AGENTS.run(stack, context())
 
     assert "Abs" not in ops(result.model)
     assert plan_of(result.model) == np.exp(np.array([0, 0, -4, -9], "f")).tolist()
@@ -87,9 +43,7 @@ def test_readers_of_a_dropped_module_read_zeros(stack: ir.Model) -> None:
 
 
 def test_outputs_go_where_that_was_asked_for(stack: ir.Model) -> None:
-    chosen = AblateModules(drop=("map",), drop_outputs=True)
-
-    result = chosen.run(stack, context())
+    result = NO_MAP.run(stack, context())
 
     assert [value.name for value in result.model.graph.outputs] == ["plan"]
     assert plan_of(result.model) == [1, 1, 3, 4]
@@ -97,9 +51,7 @@ def test_outputs_go_where_that_was_asked_for(stack: ir.Model) -> None:
 
 
 def test_a_substitute_takes_the_place_of_a_scope(stack: ir.Model) -> None:
-    chosen = AblateModules(drop=("map",), drop_outputs=True)
-
-    result = chosen.run(stack, context(substitute("*.look", "*.meet")))
+    result = NO_MAP.run(stack, context(substitute("*.look", "*.meet")))
 
     assert ops(result.model) == ["Relu", "Abs", "Sqrt", "Add"]
     assert plan_of(result.model) == [0, 0, 4, 6]
@@ -107,9 +59,7 @@ def test_a_substitute_takes_the_place_of_a_scope(stack: ir.Model) -> None:
 
 
 def test_a_substitute_without_by_reads_as_zeros(stack: ir.Model) -> None:
-    chosen = AblateModules(drop=("map",), drop_outputs=True)
-
-    result = chosen.run(stack, context(substitute("*.look")))
+    result = NO_MAP.run(stack, context(substitute("*.look")))
 
     assert plan_of(result.model) == [0, 0, 2, 3]
 
@@ -129,21 +79,14 @@ def test_a_substitute_of_the_same_elements_is_reshaped(stack: ir.Model) -> None:
     )  # fmt: skip
     text = text.replace("int64[2] flat", "int64[3] long = {1, 1, 4}, int64[2] flat")
     text = text.replace("float[1,4] plan", "float[1,1,4] plan")
-    chosen = AblateModules(drop=("map",), drop_outputs=True)
 
-    result = chosen.run(net(text, {}), context(substitute("*.look", "*.meet")))
+    result = NO_MAP.run(net(text, {}), context(substitute("*.look", "*.meet")))
 
     run = run_once(result.model, {"camera": CAMERA})["plan"]
     np.testing.assert_array_equal(run, [[[0, 0, 4, 6]]])
 
 
 OPEN = STACK.replace("float[1,4] camera", "float[n,4] camera")
-SIZED = STACK.replace(
-    '["/planner/look/Reshape"] seen = Reshape(lanes, flat)',
-    '["/map/Shape"] size = Shape(f)\n["/planner/look/Reshape"] seen = Reshape(f, size)',
-)
-NO_MAP = AblateModules(drop=("map",), drop_outputs=True)
-NO_AGENTS = AblateModules(drop=("agents",))
 NEITHER = replace(NO_MAP, drop=("map", "agents"))
 
 
@@ -200,101 +143,9 @@ def test_a_kept_scope_stays(stack: ir.Model) -> None:
 def test_unknown_and_absent_modules_are_named(stack: ir.Model) -> None:
     with pytest.raises(ModuleMapError, match=r"occ: .*backbone, agents, map, planner"):
         AblateModules(drop=("occ",)).run(stack, context())
-    once = AblateModules(drop=("agents",)).run(stack, context()).model
+    once = NO_AGENTS.run(stack, context()).model
     with pytest.raises(PreconditionError, match=r"module agents; .*backbone, map, pl"):
-        AblateModules(drop=("agents",)).run(once, context())
-
-
-@pytest.fixture
-def recording(tmp_path: Path) -> CalibrationSet:
-    """Two cameras; agents (their magnitude where positive) average 1, 0, 3, 6."""
-    cameras = ([[2, 0, 2, 3]], [[-2, 0, 4, 9]])
-    frames = [{"camera": np.array(camera, np.float32)} for camera in cameras]
-    return CalibrationSet(record(tmp_path / "frames", frames))
-
-
-def test_readers_read_the_mean_over_the_frames(
-    stack: ir.Model, recording: CalibrationSet
-) -> None:
-    chosen = AblateModules(drop=("agents",), fill="means")
-
-    result = chosen.run(stack, replace(context(), frames=recording))
-
-    met = np.sqrt(np.array([1, 0, 3, 6], "f"))
-    alone = np.exp(np.array([0, 0, -4, -9], "f"))
-    np.testing.assert_allclose(plan_of(result.model), met + alone, rtol=1e-6)
-    assert "agents reads as its mean over 2 frames" in result.notes
-    assert "Abs" not in ops(result.model)
-    assert not provenance.missing(result.model)
-
-
-def test_means_leave_substitutes_aside(
-    stack: ir.Model, recording: CalibrationSet
-) -> None:
-    chosen = AblateModules(drop=("map",), fill="means", drop_outputs=True)
-    substitutes = context(substitute("*.look", "*.meet"))
-
-    result = chosen.run(stack, replace(substitutes, frames=recording))
-
-    seen = np.exp(-np.array([1, 0, 3, 6], "f"))
-    met = np.sqrt(np.array([0, 0, 4, 9], "f"))
-    np.testing.assert_allclose(plan_of(result.model), seen + met, rtol=1e-6)
-    assert result.removed_outputs == ("lanes",)
-
-
-def test_means_from_a_file_go_before_frames(
-    stack: ir.Model, recording: CalibrationSet, tmp_path: Path
-) -> None:
-    file = tmp_path / "means.npz"
-    np.savez(file, agents=np.array([[4, 9, 16, 25]], np.float32))
-    chosen = AblateModules(drop=("agents",), fill="means", means=file)
-
-    result = chosen.run(stack, replace(context(), frames=recording))
-
-    expected = np.exp(np.array([0, 0, -4, -9], "f")) + np.array([2, 3, 4, 5], "f")
-    np.testing.assert_allclose(plan_of(result.model), expected, rtol=1e-6)
-    assert f"agents reads as its mean in {file}" in result.notes
-
-
-@pytest.mark.parametrize(
-    ("name", "array", "error", "words"),
-    [
-        ("boxes", np.zeros((1, 4), "f"), FramesError, "no mean of agents; .* boxes"),
-        (
-            "agents",
-            np.zeros((1, 5), "f"),
-            PreconditionError,
-            r"float32 \[1, 5\] cannot stand for agents, which is float32 \[1, 4\]",
-        ),
-        (
-            "agents",
-            np.zeros((1, 4), "d"),
-            PreconditionError,
-            "a constant float64 .* agents, which is float32",
-        ),
-    ],
-)
-def test_means_of_another_graph(
-    stack: ir.Model,
-    tmp_path: Path,
-    name: str,
-    array: np.ndarray,
-    error: type[Exception],
-    words: str,
-) -> None:
-    file = tmp_path / "means.npz"
-    np.savez(file, **{name: array})  # type: ignore[arg-type]
-    chosen = AblateModules(drop=("agents",), fill="means", means=file)
-
-    with pytest.raises(error, match=words):
-        chosen.run(stack, context())
-
-
-def test_shapes_have_no_mean(recording: CalibrationSet) -> None:
-    with pytest.raises(PreconditionError, match="size is arithmetic on shapes"):
-        replace(NO_MAP, fill="means").run(
-            net(SIZED, {}), replace(context(), frames=recording)
-        )
+        NO_AGENTS.run(once, context())
 
 
 SHARED = STACK.replace(
@@ -306,9 +157,7 @@ SHARED = STACK.replace(
 
 def test_a_cast_that_another_module_shares_stays() -> None:
     """The planner reads features through a cast and a reshape in the map's scope."""
-    chosen = AblateModules(drop=("map",), drop_outputs=True)
-
-    result = chosen.run(net(SHARED, {}), context())
+    result = NO_MAP.run(net(SHARED, {}), context())
 
     assert plan_of(result.model) == [1, 1, 9, 19]
     assert {provenance.module_of(node) for node in result.model.graph} == {
@@ -319,6 +168,4 @@ def test_a_cast_that_another_module_shares_stays() -> None:
 
 def test_a_layout_of_its_own_results_goes(stack: ir.Model) -> None:
     """``lanes`` is a reshape too, of what the map itself made."""
-    chosen = AblateModules(drop=("map",), drop_outputs=True)
-
-    assert "lanes reads as zeros" in chosen.run(stack, context()).notes
+    assert "lanes reads as zeros" in NO_MAP.run(stack, context()).notes

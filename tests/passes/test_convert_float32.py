@@ -1,15 +1,22 @@
 """Whatever half there is in a graph, convert-float32 tells what it changed."""
 
+from collections import Counter
+
 import onnx
 import onnx_ir as ir
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from me2e_compress.passes import Context
+from me2e_compress.passes.convert_float16 import ConvertFloat16
 from me2e_compress.passes.convert_float32 import ConvertFloat32
-from tests.passes.small import apply, ops, read
+from me2e_compress.testing import check_pass
+from tests.nets import MODULES, conv_attention
+from tests.passes.small import apply, bare, casts, ops, read, types_of
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17, "own" : 1]>\n'
+HALF, FLOAT = ir.DataType.FLOAT16, ir.DataType.FLOAT
 
 
 @pytest.mark.parametrize(
@@ -91,3 +98,36 @@ def test_what_it_claims_it_did_and_only_once(model: ir.Model) -> None:
     result = apply(ConvertFloat32(), model)
 
     onnx.checker.check_model(ir.to_proto(result.model), full_check=True)
+
+
+def test_back_to_float32() -> None:
+    source = conv_attention()
+    half = check_pass(ConvertFloat16(), source).model
+    back = check_pass(ConvertFloat32(), half).model
+
+    assert Counter(n.op_type for n in back.graph) == Counter(
+        n.op_type for n in source.graph
+    )
+    assert {v.dtype for v in back.graph.initializers.values()} <= {
+        FLOAT, ir.DataType.INT64
+    }  # fmt: skip
+    assert ConvertFloat32().run(back, Context(MODULES)).changes == 0
+
+
+def test_casts_to_other_types_stay_what_they_are() -> None:
+    text = (
+        "h (float16[4] x) => (int32[4] y, float16[4] z)"
+        " { y = Cast<to=6>(x)\n a = Cast<to=1>(x)\n z = Cast<to=10>(a) }"
+    )
+    back = check_pass(ConvertFloat32(), bare(HEAD + text, {})).model
+    kinds = [value.dtype for value in back.graph.outputs]
+
+    assert kinds == [ir.DataType.INT32, HALF]
+
+
+def test_float32_inside_leaves_a_half_interface() -> None:
+    text = "h (float16[4] x) => (float16[4] y) { a = Relu(x)\n y = Sigmoid(a) }"
+    back = check_pass(ConvertFloat32(), bare(HEAD + text, {})).model
+
+    assert types_of(back) == {"Relu": "FLOAT", "Sigmoid": "FLOAT"}
+    assert casts(back) == 2

@@ -1,105 +1,24 @@
-"""Edges that the ablation pass adds, broadcasts, and what it refuses."""
+"""Edges that the ablation pass adds, and broadcasts."""
 
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 import onnx_ir as ir
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress import graph
-from me2e_compress.errors import ModuleMapError, PreconditionError, RecipeError
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.errors import PreconditionError
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import PASSES
 from me2e_compress.passes.ablate_modules import AblateModules
-from me2e_compress.passes.base import Context
 from me2e_compress.passes.edges import Edge
 from me2e_compress.passes.parts import stretched
 from me2e_compress.runtime.session import run_once
-from tests.nets import net
+from tests.passes.queries import KEYS, Numbers, context, stack, weights
 from tests.profiles import scaled
 
-Numbers = npt.NDArray[np.float32]
-
-STACK = """
-<ir_version: 9, opset_import: ["" : 17]>
-stack (float[1,5,8] camera, float[1,3,5] pick, float[1,6,8] embedding,
-       float[1,2,5] pair) => (float[1,1,8] plan, float[1,3,8] lanes, float[1,2,5] taken)
-<int64[1] one = {1}, int64[2] whole = {1, 8}, int64[4] cut = {1, 5, 2, 4},
- int64[4] asked = {1, 1, 2, 4}, int64[3] back = {1, 1, 8}> {
-    ["/backbone/Tanh"] bev = Tanh(camera)
-    ["/track/ReduceMean"] ego = ReduceMean <axes = [1], keepdims = 0> (bev)
-    ["/map/MatMul"] lanes = MatMul(pick, bev)
-    ["/motion/Unsqueeze"] own = Unsqueeze(ego, one)
-    ["/motion/Add"] modes = Add(own, embedding)
-    ["/motion/agents/MatMul"] agents = MatMul(pair, bev)
-    ["/occ/Transpose"] turned = Transpose <perm = [0, 2, 1]> (bev)
-    ["/occ/MatMul"] taken = MatMul(agents, turned)
-    ["/planner/Unsqueeze"] known = Unsqueeze(ego, one)
-    ["/planner/Add"] told = Add(modes, known)
-    ["/planner/ReduceMax"] query = ReduceMax <axes = [1]> (told)
-    ["/planner/attn/Reshape"] q0 = Reshape(query, asked)
-    ["/planner/attn/Transpose"] q = Transpose <perm = [0, 2, 1, 3]> (q0)
-    ["/planner/attn/Reshape_1"] k0 = Reshape(bev, cut)
-    ["/planner/attn/Transpose_1"] k = Transpose <perm = [0, 2, 3, 1]> (k0)
-    ["/planner/attn/Transpose_2"] v = Transpose <perm = [0, 2, 1, 3]> (k0)
-    ["/planner/attn/MatMul"] logits = MatMul(q, k)
-    ["/planner/attn/Softmax"] weights = Softmax <axis = -1> (logits)
-    ["/planner/attn/MatMul_1"] mixed0 = MatMul(weights, v)
-    ["/planner/attn/Transpose_3"] mixed = Transpose <perm = [0, 2, 1, 3]> (mixed0)
-    ["/planner/attn/Reshape_2"] plan = Reshape(mixed, back)
-}
-"""
-
-MAP = """
-[modules.backbone]
-role = "feature"
-patterns = ["backbone"]
-[modules.track]
-role = "prediction"
-patterns = ["track"]
-[modules.map]
-role = "prediction"
-patterns = ["map"]
-[modules.motion]
-role = "prediction"
-patterns = ["motion"]
-%s
-[modules.occ]
-role = "prediction"
-patterns = ["occ"]
-[modules.planner]
-role = "prediction"
-patterns = ["planner"]
-"""
-
-KEYS = Edge("map", "*.attn")
-"""The planner's attention reads lanes behind the cells."""
-
-
-def weights() -> dict[str, Numbers]:
-    noise = np.random.default_rng(0).normal(size=(3, 6, 8)).astype("f")
-    return {
-        "pick": noise[None, 0, :3, :5],
-        "embedding": noise[None, 1],
-        "pair": noise[None, 2, :2, :5],
-    }
-
-
 CAMERA = np.random.default_rng(1).normal(size=(1, 5, 8)).astype("f")
-
-
-def stack() -> ir.Model:
-    model = net(STACK, weights())
-    graph.infer_shapes(model)
-    return model
-
-
-def context(substitutes: str = "") -> Context:
-    return Context(ModuleMap.parse(MAP % substitutes, "stack"))
 
 
 def answers(model: ir.Model, camera: Numbers = CAMERA) -> Mapping[str, Numbers]:
@@ -221,101 +140,6 @@ def test_edges_have_text_and_toml() -> None:
     assert recipe.parse(text) == (chosen,)
     assert '{source="map", reader="*.attn"}' in text
     assert '{"source" = "map", "reader" = "*.attn"}' in toml
-
-
-@pytest.mark.parametrize(
-    ("edge", "message"),
-    [
-        (
-            Edge("occ", "*.attn"),
-            r"edge occ -> \*.attn: nothing that leaves occ \(taken \[1,2,5\]\) fits"
-            r" what \*.attn reads \(query \[1,1,8\], bev \[1,5,8\]\)",
-        ),
-        (Edge("*.lidar", "*.attn"), r"the graph has no \*.lidar"),
-        (Edge("map", "*.lidar"), r"\*.lidar reads nothing"),
-        (Edge("map", "planner", "add", of="occ"), "planner reads nothing of occ, only"),
-        (Edge("planner", "map"), r"plan \[1,1,8\] does not fit /map/MatMul"),
-        (Edge("motion", "*.attn", axis=7), "nothing that leaves motion"),
-        (Edge("*.attn", "backbone", axis=1), r"plan depends on what backbone makes"),
-    ],
-)
-def test_an_edge_that_does_not_fit_is_refused(edge: Edge, message: str) -> None:
-    with pytest.raises(PreconditionError, match=message):
-        AblateModules((), edges=(edge,)).run(stack(), context())
-
-
-def test_a_longer_value_that_breaks_an_operator_is_named() -> None:
-    """Positions of the cells are added to the keys: there are none of the lanes."""
-    text = STACK.replace("Reshape(bev, cut)", "Reshape(placed, cut)").replace(
-        '["/planner/attn/Reshape_1"]',
-        '["/planner/attn/Add"] placed = Add(bev, places)\n["/planner/attn/Reshape_1"]',
-    )
-    text = text.replace("float[1,2,5] pair)", "float[1,2,5] pair, float[1,5,8] places)")
-    model = net(text, {**weights(), "places": np.ones((1, 5, 8), "f")})
-    graph.infer_shapes(model)
-
-    with pytest.raises(
-        PreconditionError,
-        match=r"lanes \[1,3,8\] does not fit /planner/attn/Add \(Add\), which reads"
-        r" bev_joined \[1,8,8\], places \[1,5,8\]",
-    ):
-        AblateModules((), edges=(KEYS,)).run(model, context())
-
-
-def test_queries_that_a_reshape_merges_are_refused() -> None:
-    text = STACK.replace("int64[4] cut = {1, 5, 2, 4}", "int64[4] cut = {1, 10, 1, 4}")
-    text = text.replace("<perm = [0, 2, 3, 1]> (k0)", "<perm = [0, 2, 3, 1]> (k1)")
-    text = text.replace("<perm = [0, 2, 1, 3]> (k0)", "<perm = [0, 2, 1, 3]> (k1)")
-    text = text.replace(
-        '["/planner/attn/Transpose_1"]',
-        '["/planner/attn/Reshape_3"] k1 = Reshape(k0, again)\n'
-        '["/planner/attn/Transpose_1"]',
-    ).replace("int64[3] back", "int64[4] again = {1, 5, 2, 4}, int64[3] back")
-    model = net(text, weights())
-    graph.infer_shapes(model)
-
-    with pytest.raises(PreconditionError, match=r"Reshape_1, which makes \[1, 10, 1,"):
-        AblateModules((), edges=(KEYS,)).run(model, context())
-
-
-def test_a_source_that_is_dropped_is_refused() -> None:
-    chosen = AblateModules(("map",), drop_outputs=True, edges=(KEYS,))
-
-    with pytest.raises(PreconditionError, match="map is dropped too"):
-        chosen.run(stack(), context())
-
-
-@pytest.mark.parametrize(
-    ("chosen", "message"),
-    [
-        (
-            AblateModules(("backbone",), fill="zeros"),
-            "without backbone the plan is cut: plan depends on nothing of backbone",
-        ),
-        (AblateModules(("planner",), drop_outputs=True), "cannot be dropped: .* plan"),
-        (AblateModules(("planner",)), "planner cannot be dropped: it makes plan"),
-    ],
-)
-def test_an_ablation_that_cuts_the_planner_is_refused(
-    chosen: AblateModules, message: str
-) -> None:
-    with pytest.raises(PreconditionError, match=message):
-        chosen.run(stack(), context())
-
-
-def test_nothing_to_do_is_refused() -> None:
-    with pytest.raises(RecipeError, match="drop is empty, and there are no edges"):
-        AblateModules(()).run(stack(), context())
-
-
-def test_an_edge_that_replaces_says_what() -> None:
-    with pytest.raises(RecipeError, match="edge a -> b: how=replace needs of=PART"):
-        recipe.parse("ablate-modules{drop=[], edges=[{source=a,reader=b,how=replace}]}")
-
-
-def test_a_substitute_for_a_reader_says_by_what() -> None:
-    with pytest.raises(ModuleMapError, match="a substitute with a reader needs by="):
-        context('substitutes = [{ scope = "motion", reader = "planner" }]')
 
 
 @given(

@@ -12,7 +12,7 @@ from me2e_compress import graph
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.fold_constants.choice import ENTRY_BYTES
 from me2e_compress.passes.work import work
-from tests.passes.small import NO_MODULES, apply, compute, ops, read
+from tests.passes.small import apply, compute, ops, read
 from tests.profiles import scaled
 
 SHAPE_CHAIN = """
@@ -60,54 +60,6 @@ def test_a_weight_is_transposed_ahead_and_not_stored_twice() -> None:
     np.testing.assert_array_equal(
         graph.array_of(model.graph.initializers["turned"]), weight.T
     )
-
-
-TABLE = """
-<ir_version: 9, opset_import: ["" : 17]>
-g (float[1000,64] x) => (float[1000,64] y) {
-    table = Expand(row, shape)
-    shifted = Add(table, one)
-    y = Mul(x, shifted)
-}
-"""
-TABLE_WEIGHTS: dict[str, Any] = {
-    "row": np.arange(64, dtype=np.float32),
-    "shape": np.array([1000, 64]),
-    "one": np.ones(1, np.float32),
-}
-
-
-def test_a_repeated_table_is_not_stored() -> None:
-    model = read(TABLE, **TABLE_WEIGHTS)
-    result = apply(FoldConstants(), model)
-    assert ops(model) == ["Expand", "Add", "Mul"]
-    assert "cheaper than their bytes" in result.notes[0]
-
-
-def test_a_repeated_table_is_stored_when_nodes_are_dear() -> None:
-    model = read(TABLE, **TABLE_WEIGHTS)
-    apply(FoldConstants(bytes_per_node=200_000, growth=1e9), model)
-    assert ops(model) == ["Mul"]
-
-
-def test_the_cut_goes_before_the_table() -> None:
-    text = """
-    <ir_version: 9, opset_import: ["" : 17]>
-    g (float[1000,64] x) => (float[1000,64] y) {
-        doubled = Mul(row, two)
-        table = Expand(doubled, shape)
-        y = Mul(x, table)
-    }
-    """
-    model = read(
-        text,
-        row=np.arange(64, dtype=np.float32),
-        two=np.float32(2),
-        shape=np.array([1000, 64]),
-    )
-    apply(FoldConstants(), model)
-    assert ops(model) == ["Expand", "Mul"]
-    assert "doubled" in model.graph.initializers
 
 
 PRODUCT = """
@@ -305,26 +257,3 @@ def test_random_programs_keep_their_meaning_and_their_price(
 
 def _file_bytes(model: ir.Model) -> int:
     return graph.size(model).weight_bytes + ENTRY_BYTES * len(model.graph.initializers)
-
-
-def test_two_runs_give_the_same_bytes() -> None:
-    protos = []
-    for _ in range(2):
-        model = read(TABLE, **TABLE_WEIGHTS)
-        FoldConstants(10**6).run(model, NO_MODULES)
-        protos.append(ir.to_proto(model).SerializeToString(deterministic=True))
-    assert protos[0] == protos[1]
-
-
-def test_a_weight_that_only_dead_nodes_share_is_free_to_fold() -> None:
-    text = """
-    <ir_version: 9, opset_import: ["" : 17]>
-    g (float[2,3] x) => (float[2,3] y) {
-        dead = Add(weight, x)
-        negated = Neg(weight)
-        y = Add(negated, x)
-    }
-    """
-    model = read(text, weight=np.ones((2, 3), np.float32))
-    apply(FoldConstants(bytes_per_node=0), model)
-    assert ops(model) == ["Add"]

@@ -1,15 +1,12 @@
 import numpy as np
-import numpy.typing as npt
 import onnx
 import onnx_ir as ir
-import onnxruntime as ort
 import pytest
 
-from me2e_compress import graph
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.graph import provenance, rewrite
 from me2e_compress.graph.modules import ModuleMap
-from me2e_compress.passes import Context, PassResult
+from me2e_compress.passes import Context
 from me2e_compress.passes.import_normalize import (
     ORIGINAL_DOMAIN,
     PLUGIN_DOMAIN,
@@ -17,40 +14,12 @@ from me2e_compress.passes.import_normalize import (
     needs_import,
     with_own_domains,
 )
+from tests.passes.small import EVERYTHING, normalise, settled, unstamped
 from tests.plugins import exported
-
-Array = npt.NDArray[np.float32]
-
-EVERYTHING = ModuleMap.parse(
-    '[modules.all]\nrole = "feature"\noptional = ["**"]', "everything"
-)
-
-
-def read(text: str) -> ir.Model:
-    return ir.from_onnx_text(f'<ir_version: 8, opset_import: ["": 17]>\n{text}')
-
-
-def normalise(model: ir.Model) -> PassResult:
-    for node in model.graph.all_nodes():
-        node.name = node.name or f"/part/{node.outputs[0].name}"
-    return ImportNormalize().run(model, Context(EVERYTHING))
-
-
-def run(model: ir.Model, **feeds: Array) -> Array:
-    session = ort.InferenceSession(
-        ir.to_proto(model).SerializeToString(), providers=["CPUExecutionProvider"]
-    )
-    return np.asarray(session.run(None, feeds)[0])
-
-
-def settled(model: ir.Model) -> bool:
-    before = graph.digest(model)
-    again = ImportNormalize().run(model, Context(EVERYTHING))
-    return again.changes == 0 and graph.digest(again.model) == before
 
 
 def test_unnamed_and_doubly_named_nodes_get_names_of_their_own() -> None:
-    model = read("g (float[2] x) => (float[2] y) { a=Relu(x) b=Relu(a) y=Neg(b) }")
+    model = unstamped("g (float[2] x) => (float[2] y) { a=Relu(x) b=Relu(a) y=Neg(b) }")
     for node, name in zip(model.graph, ("", "/part/Relu", "/part/Relu"), strict=True):
         node.name = name
     ImportNormalize().run(model, Context(EVERYTHING))
@@ -59,7 +28,7 @@ def test_unnamed_and_doubly_named_nodes_get_names_of_their_own() -> None:
 
 
 def test_a_new_name_never_takes_that_of_a_later_node() -> None:
-    model = read("g (float[2] x) => (float[2] y) { a=Relu(x) y=Relu(a) }")
+    model = unstamped("g (float[2] x) => (float[2] y) { a=Relu(x) y=Relu(a) }")
     for node, name in zip(model.graph, ("", "Relu_0"), strict=True):
         node.name = name
     ImportNormalize().run(model, Context(_by_parameter(model)))
@@ -75,7 +44,7 @@ def _by_parameter(model: ir.Model) -> ModuleMap:
 
 
 def test_every_node_is_told_its_module_and_origin() -> None:
-    model = read(
+    model = unstamped(
         "g (bool c, float[2] x) => (float[2] y) {"
         " y = If (c) <then_branch = t () => (float[2] a) { a = Relu(x) },"
         " else_branch = e () => (float[2] b) { b = Neg(x) }> }"
@@ -90,7 +59,7 @@ def test_every_node_is_told_its_module_and_origin() -> None:
 
 
 def test_a_past_that_is_known_stays() -> None:
-    model = read("g (float[2] x) => (float[2] y) { a = Relu(x) y = Neg(a) }")
+    model = unstamped("g (float[2] x) => (float[2] y) { a = Relu(x) y = Neg(a) }")
     known = provenance.Provenance("planner", ("before",), ("fuse-basic",))
     provenance.stamp(model.graph[0], known)
     normalise(model)
@@ -101,7 +70,7 @@ def test_a_past_that_is_known_stays() -> None:
     "plugin", ["MultiScaleDeformableAttnTRT", "RotateTRT2", "InverseTRT", "MSDAPlugin"]
 )
 def test_plugins_of_the_default_domain_move_to_a_private_one(plugin: str) -> None:
-    model = read(
+    model = unstamped(
         "g (float[2] x) => (float[2] y) { a = Relu(x) b = "
         + plugin
         + " <mode: int = 1> (a) y = Neg(b) }"
@@ -158,7 +127,7 @@ def test_a_plugin_in_a_branch_and_one_in_a_function_move_too() -> None:
 
 
 def test_custom_operators_of_their_own_domain_are_carried_through() -> None:
-    model = read(
+    model = unstamped(
         "g (float[2] x) => (float[2] y) { a = custom_op.SelectAndPadPlugin(x)"
         " y = Neg(a) }"
     )
@@ -171,119 +140,8 @@ def test_custom_operators_of_their_own_domain_are_carried_through() -> None:
     assert model.opset_imports["custom_op"] == 1
 
 
-def double_grid() -> ir.Model:
-    return read(
-        "g (float[1, 1, 4, 4] x, float[1, 3, 3, 2] p) => (float[1, 1, 3, 3] y) {"
-        " wide = Cast <to: int = 11> (p)"
-        " half = Constant <value: tensor = double {0.5}> ()"
-        " grid = Mul (wide, half)"
-        " y = GridSample (x, grid) }"
-    )
-
-
-def test_a_double_grid_that_onnxruntime_refuses_runs_afterwards() -> None:
-    model = double_grid()
-    rng = np.random.default_rng(0)
-    x = rng.standard_normal((1, 1, 4, 4), np.float32)
-    p = rng.uniform(-1, 1, (1, 3, 3, 2)).astype(np.float32)
-    with pytest.raises(Exception, match="GridSample"):
-        run(model, x=x, p=p)
-    normalise(model)
-    reference = read(
-        "g (float[1, 1, 4, 4] x, float[1, 3, 3, 2] g) => (float[1, 1, 3, 3] y) {"
-        " y = GridSample (x, g) }"
-    )
-    np.testing.assert_allclose(
-        run(model, x=x, p=p),
-        run(reference, x=x, g=p / np.float32(2)),
-        rtol=0,
-        atol=1e-6,
-    )
-    assert settled(model)
-
-
-def test_no_double_is_left_in_types_weights_branches_and_functions() -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 8, opset_import: ["": 17, "f": 1]>'
-        "g (bool c, float[2] x) => (float[2] y)"
-        " <double[2] w = {1.0, 2.0}, double[2] wide, double[2] z> {"
-        " wide = Cast <to: int = 11> (x)"
-        " z = If (c) <then_branch = t () => (double[2] a) <double k = {3.0}> {"
-        " a = Mul(wide, k) },"
-        " else_branch = e () => (double[2] b) { b = Add(wide, w) }>"
-        " v = f.Widen(z)  y = Cast <to: int = 1> (v) }"
-        '<domain: "f", opset_import: ["": 17]>'
-        "Widen (i) => (o) { k = Constant <value: tensor = double {2.0}> ()"
-        " w = Cast <to: int = 11> (i) o = Mul(w, k) }"
-    )
-    normalise(model)
-    assert "DOUBLE" not in str(ir.to_proto(model))
-    assert _doubles_of(ir.to_proto(model)) == 0
-    x = np.array([1, 2], np.float32)
-    session = ort.InferenceSession(ir.to_proto(model).SerializeToString())
-    for chosen, wanted in ((True, [6, 12]), (False, [4, 8])):
-        (y,) = session.run(None, {"c": np.array(chosen), "x": x})
-        np.testing.assert_array_equal(y, wanted)
-    assert settled(model)
-
-
-def _doubles_of(message: onnx.ModelProto) -> int:
-    text = str(message)
-    return text.count("elem_type: 11\n") + text.count("data_type: 11\n")
-
-
-def test_resize_scales_computed_in_double_become_float32() -> None:
-    model = read(
-        "g (float[1, 1, 2, 2] x) => (float[1, 1, 4, 4] y)"
-        " <double[4] factors = {1.0, 1.0, 2.0, 2.0}> {"
-        " s = Identity (factors)"
-        ' y = Resize <mode: string = "nearest"> (x, , s) }'
-    )
-    normalise(model)
-    x = np.arange(4, dtype=np.float32).reshape(1, 1, 2, 2)
-    np.testing.assert_array_equal(
-        run(model, x=x), x.repeat(2, axis=2).repeat(2, axis=3)
-    )
-
-
-def test_numbers_beyond_float32_stay_finite_and_infinities_stay_infinite() -> None:
-    model = read(
-        "g (float[3] x) => (float[3] y)"
-        " <double[3] m = {-1.7976931348623157e308, 1.0, 2.0}> {"
-        " w = Cast <to: int = 11> (x) s = Add(w, m) y = Cast <to: int = 1> (s) }"
-    )
-    lowest = np.array([-np.finfo(np.float64).max, np.inf, 2.0])
-    model.graph.initializers["m"].const_value = ir.tensor(lowest, name="m")
-    normalise(model)
-    kept = graph.array_of(model.graph.initializers["m"])
-    assert kept is not None
-    np.testing.assert_array_equal(
-        kept, np.array([np.finfo(np.float32).min, np.inf, 2.0], np.float32)
-    )
-
-
-@pytest.mark.parametrize(
-    ("text", "culprit"),
-    [
-        ("g (double[2] x) => (float[2] y) { y = Cast<to: int = 1>(x) }", "input x"),
-        ("g (float[2] x) => (double[2] y) { y = Cast<to: int = 11>(x) }", "output y"),
-        (
-            "g (float[2] x) => (float[2] y) <double[2] w = {1.0, 2.0}>"
-            " { y = custom_op.Warp(x, w) }",
-            "w of the custom operator Warp",
-        ),
-    ],
-)
-def test_doubles_that_the_outside_wants_stay(text: str, culprit: str) -> None:
-    model = read(text)
-    result = normalise(model)
-    assert _doubles_of(ir.to_proto(model)) > 0
-    assert result.notes == (f"float64 stays: {culprit} is double",)
-    assert settled(model)
-
-
 def test_constants_become_initializers_in_branches_too() -> None:
-    model = read(
+    model = unstamped(
         "g (bool c, float[2] x) => (float[2] y) {"
         " k = Constant <value_float = 2.0> ()"
         " z = Mul (x, k)"
@@ -300,7 +158,7 @@ def test_constants_become_initializers_in_branches_too() -> None:
 
 
 def test_text_constants_keep_any_letter() -> None:
-    model = read(
+    model = unstamped(
         "g (float[2] x) => (string[2] y) {"
         ' k = Constant <value_strings = ["straße", "道"]> () y = Identity(k) }'
     )
@@ -310,13 +168,13 @@ def test_text_constants_keep_any_letter() -> None:
 
 
 def test_a_constant_that_is_an_output_stays_a_node() -> None:
-    model = read("g () => (float y) { y = Constant <value_float = 2.0> () }")
+    model = unstamped("g () => (float y) { y = Constant <value_float = 2.0> () }")
     normalise(model)
     assert [node.op_type for node in model.graph] == ["Constant"]
     assert settled(model)
 
 
 def test_a_map_of_another_stack_is_refused() -> None:
-    model = read("g (float[2] x) => (float[2] y) { y = Relu(x) }")
+    model = unstamped("g (float[2] x) => (float[2] y) { y = Relu(x) }")
     with pytest.raises(ModuleMapError, match="map vad: none of its patterns"):
         ImportNormalize().run(model, Context(ModuleMap.load("vad")))
