@@ -1,10 +1,15 @@
-"""Files as a Bench2Drive run leaves them, made by hand."""
+"""Files as a Bench2Drive run leaves them, made by hand, and what is read of them."""
 
 import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from me2e_compress.evaluators.bench2drive.real_results import (
+    Bench2DriveResults,
+    CollectedResults,
+)
 
 Json = dict[str, Any]
 
@@ -73,6 +78,9 @@ def record(
     }
 
 
+GOOD = record()
+
+
 def checkpoint(*records: Json) -> Json:
     """A worker's file; without records that of one that was killed."""
     return {
@@ -138,3 +146,7 @@ def write(path: Path, document: object) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(document, indent=4), encoding="utf-8")
     return path
+
+
+def collect(folder: Path) -> CollectedResults:
+    return Bench2DriveResults(folder).collect()

@@ -17,8 +17,8 @@ from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.trajectory import Floats
 from me2e_compress.workflows.check_model import check_model
+from tests.evaluators.highway.asked import observation
 from tests.evaluators.highway.drivers import EXIT, straight_on
-from tests.evaluators.highway.test_onnx_policy import observation
 
 
 def adapted(model: Path, toml: str, stage: HostStage | None = None) -> OnnxDriver:

@@ -1,63 +1,20 @@
-import dataclasses
 import json
-from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from me2e_compress.driving.adapter import (
-    Adapter,
-)
-from me2e_compress.driving.answer import checked
-from me2e_compress.driving.contract import (
-    Answer,
-    Observation,
-    Plan,
-    Policy,
-    RouteInfo,
-    Trajectory,
-)
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.metrics.episode import Ending
-from me2e_compress.simulator.cameras import CameraRig
+from tests.evaluators.highway.asked import observation, planned
 from tests.evaluators.highway.drivers import EXIT, PARKED, straight_on
-from tests.installed import install
 
 NORM = {"input": "img", "mean": [10, 20, 30], "std": [2, 4, 5], "order": "bgr"}
 IMAGE = {"me2e.image": json.dumps(NORM)}
-RIG = CameraRig(16, 24)
-
-
-def observation(seed: int = 0, command: int = 2) -> Observation:
-    rng = np.random.default_rng(seed)
-    return Observation(
-        0,
-        rng.integers(0, 256, (6, 16, 24, 3)).astype(np.uint8),
-        RIG.lidar2img,
-        rng.normal(size=18).astype(np.float32),
-        command,
-        3.0,
-    )
-
-
-def planned(policy: Policy, seen: Observation) -> npt.NDArray[np.floating]:
-    """Ask a policy that answers waypoints."""
-    return checked_plan(policy.plan(seen)).points
-
-
-def checked_plan(answer: Answer) -> Trajectory:
-    found = checked(answer)
-    assert isinstance(found, Trajectory)
-    return found
 
 
 def test_a_model_drives(tmp_path: Path) -> None:
@@ -96,98 +53,6 @@ def test_images_arrive_normalised_in_the_models_order(tmp_path: Path) -> None:
     expected = np.moveaxis(expected, -1, 1).reshape(-1)
     picked = [0, 1, 384, 385, 768, 769, 1152, 1536, 1920, 6900, 6910, 6911]
     assert plan.reshape(-1) == pytest.approx(expected[picked], rel=1e-5)
-
-
-COUNTER = {
-    "inputs": "float[18] can_bus, float[1, 6, 2] steps",
-    "body": "steps_out = Add (steps, one) plan = Identity (steps_out)",
-    "outputs": "float[1, 6, 2] plan, float[1, 6, 2] steps_out",
-    "initializers": ", float one = {1.0}",
-}
-
-
-def test_recurrent_state_is_fed_forward_and_reset(tmp_path: Path) -> None:
-    policy = OnnxPolicy.open(straight_on(tmp_path / "m.onnx", **COUNTER))  # type: ignore[arg-type]
-    counted = []
-    for _ in range(2):
-        policy.reset(EXIT)
-        counted += [planned(policy, observation())[0, 0] for _ in range(3)]
-
-    assert counted == [1.0, 2.0, 3.0, 1.0, 2.0, 3.0]
-
-
-CLOCK = {
-    "inputs": "float[1] timestamp, float[1] last",
-    "body": """
-        since = Sub (timestamp, last)
-        plan = Add (zero, since)
-        last_out = Identity (timestamp)""",
-    "outputs": "float[1, 6, 2] plan, float[1] last_out",
-    "initializers": ", float[1, 6, 2] zero = {" + ", ".join(["0.0"] * 12) + "}",
-}
-
-
-@dataclasses.dataclass
-class Listening:
-    """Stands still, and writes down what the model answers."""
-
-    model: OnnxPolicy
-    heard: list[float] = dataclasses.field(default_factory=list)
-    needs_images: bool = False
-    privileged: bool = False
-
-    def reset(self, route: RouteInfo) -> None:
-        self.model.reset(route)
-
-    def plan(self, observation: Observation) -> Plan:
-        self.heard.append(float(planned(self.model, observation)[0, 0]))
-        return np.zeros((6, 2))
-
-
-@pytest.mark.parametrize("name", ["timestamp", "seconds"])
-def test_a_recurrent_model_knows_how_far_apart_its_frames_are(
-    tmp_path: Path, name: str
-) -> None:
-    renamed = {key: text.replace("timestamp", name) for key, text in CLOCK.items()}
-    path = straight_on(tmp_path / "m.onnx", **renamed)  # type: ignore[arg-type]
-    policy = OnnxPolicy.open(path, Adapter(inputs={"timestamp": name}))
-    elapsed = []
-    for _ in range(2):
-        policy.reset(EXIT)
-        for time_us in (0, 350_000, 400_000):
-            seen = dataclasses.replace(observation(), time_us=time_us)
-            elapsed.append(planned(policy, seen)[0, 0])
-
-    assert elapsed == pytest.approx([0.0, 0.35, 0.05] * 2)
-
-
-def test_the_clock_starts_with_the_route(tmp_path: Path) -> None:
-    """A plan of as many metres as seconds: the first decision is told 0."""
-    body = "plan = Add (zero, timestamp)"
-    clock = {**CLOCK, "inputs": "float[1] timestamp", "body": body}
-    clock["outputs"] = "float[1, 6, 2] plan"
-    model = straight_on(tmp_path / "m.onnx", **clock)  # type: ignore[arg-type]
-    policy = Listening(OnnxPolicy.open(model))
-
-    episode = drive(EXIT, policy, Conditions())
-
-    decided = [decision.time_us / 1e6 for decision in episode.decisions]
-    assert policy.heard == pytest.approx(decided)
-    assert policy.heard[0] == 0.0
-
-
-def test_an_adapter_names_the_recurrent_pair(tmp_path: Path) -> None:
-    named = {key: text.replace("steps_out", "state") for key, text in COUNTER.items()}
-    path = straight_on(tmp_path / "m.onnx", **named)  # type: ignore[arg-type]
-
-    with pytest.raises(EvaluationError, match="input steps is none of img, lidar2img"):
-        OnnxPolicy.open(path)
-    policy = OnnxPolicy.open(
-        path, Adapter.model_validate({"recurrent": {"steps": "state"}})
-    )
-    policy.reset(EXIT)
-
-    assert [planned(policy, observation())[5, 1] for _ in range(2)] == [1.0, 2.0]
 
 
 VAD = """
@@ -319,71 +184,3 @@ def test_not_a_number_at_work_fails_the_route(tmp_path: Path) -> None:
     assert episode.ending is Ending.POLICY_FAILED
     assert episode.failure == "the plan is not finite"
     assert len(episode.decisions) == 9
-
-
-def test_drivers_by_name() -> None:
-    assert driver_named("blind").open() == Blind(8.0)
-    assert driver_named("blind:6.5").open() == Blind(6.5)
-    assert driver_named("onnx:a/m.onnx") == OnnxDriver(Path("a/m.onnx"))
-    assert driver_named("expert.onnx") == OnnxDriver(Path("expert.onnx"))
-
-
-@pytest.mark.parametrize("text", ["expert", "blind", "blind:6.5", "blind:8"])
-def test_results_know_a_driver_by_its_text(text: str) -> None:
-    assert driver_named(text).fingerprint() == text
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("blind:fast", "blind: speed_mps: Input should be a valid number"),
-        ("blind:0", "blind: 0 is not a speed in m/s"),
-        ("blind{speed=3}", "blind has no option 'speed'; it has speed_mps"),
-        ("expert:3", "expert takes no value, found '3'"),
-    ],
-)
-def test_a_wrong_option_of_a_driver_is_named(text: str, message: str) -> None:
-    with pytest.raises(EvaluationError, match=message):
-        driver_named(text)
-
-
-@dataclass(frozen=True)
-class StillDriver(Driver):
-    """Stands still.
-
-    Attributes:
-        weights: Read by nobody.
-    """
-
-    name: ClassVar[str] = "still"
-    weights: Path
-
-    def open(self) -> Policy:
-        return Blind(0.0)
-
-
-def test_a_policy_of_another_package_drives_by_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    entry = {"still": f"{__name__}:StillDriver"}
-    install(monkeypatch, tmp_path, "a-policy", "me2e_compress.policies", entry)
-    weights = tmp_path / "w"
-    weights.write_bytes(b"1")
-    driver = driver_named(f"still:{weights}")
-    before = driver.fingerprint()
-    weights.write_bytes(b"2")
-
-    assert driver == StillDriver(weights)
-    assert before != driver.fingerprint()
-    assert image_size_of(driver.open()) == (96, 160)
-
-
-def test_the_fingerprint_follows_the_files(tmp_path: Path) -> None:
-    path, toml = straight_on(tmp_path / "m.onnx"), tmp_path / "a.toml"
-    toml.write_text("axes = 'forward-left'")
-    plain, adapted = OnnxDriver(path).fingerprint(), OnnxDriver(path, toml)
-
-    assert adapted.fingerprint() != plain
-    before = adapted.fingerprint()
-    toml.write_text("axes = 'right-forward'")
-    assert adapted.fingerprint() != before

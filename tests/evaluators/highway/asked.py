@@ -1,0 +1,29 @@
+"""What a policy is asked: one frame that is drawn."""
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.driving.answer import checked
+from me2e_compress.driving.contract import Observation, Policy, Trajectory
+from me2e_compress.simulator.cameras import CameraRig
+
+RIG = CameraRig(16, 24)
+
+
+def observation(seed: int = 0, command: int = 2) -> Observation:
+    rng = np.random.default_rng(seed)
+    return Observation(
+        0,
+        rng.integers(0, 256, (6, 16, 24, 3)).astype(np.uint8),
+        RIG.lidar2img,
+        rng.normal(size=18).astype(np.float32),
+        command,
+        3.0,
+    )
+
+
+def planned(policy: Policy, seen: Observation) -> npt.NDArray[np.floating]:
+    """Ask a policy that answers waypoints."""
+    found = checked(policy.plan(seen))
+    assert isinstance(found, Trajectory)
+    return found.points

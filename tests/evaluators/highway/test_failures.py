@@ -1,0 +1,123 @@
+"""What fails on the way: a policy, its process, the disk, the whole run."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators.highway.drivers import BlindDriver
+from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator
+from me2e_compress.evaluators.highway.results import ResultsFolder
+from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.metrics.episode import Ending, Episode
+from me2e_compress.simulator.routes import Route, save_routes
+from tests.command import contents
+from tests.evaluators.highway.drivers import CROSSING, EXIT, PARKED, MisbehavingDriver
+from tests.evaluators.highway.evaluations import evaluator, made_by
+
+
+def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> None:
+    manifest, folder = tmp_path / "routes.json", tmp_path / "results"
+    routes = tuple(Route(f"exit_{k}", "HighwayExit", "Merging", k) for k in range(4))
+    save_routes(routes, manifest)
+    program = (
+        "import sys; from pathlib import Path;"
+        "from me2e_compress.simulator.routes import load_routes;"
+        "from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator;"
+        "from me2e_compress.evaluators.highway.engine import LocalEngine;"
+        "from me2e_compress.evaluators.highway.drivers import BlindDriver;"
+        "from me2e_compress.evaluators.highway.conditions import Conditions;"
+        "from me2e_compress.evaluators.highway.worker import Job;"
+        "routes = load_routes(Path(sys.argv[1]));"
+        "job = Job(BlindDriver(5.0), Conditions());"
+        "list(HighwayEvaluator(job, routes, Path(sys.argv[2]), 4).episodes())"
+    )
+    command = [sys.executable, "-c", program, str(manifest), str(folder)]
+    with subprocess.Popen(command, start_new_session=True) as running:
+        written = folder / "routes"
+        while len(list(written.glob("*.json")) if written.exists() else ()) < 1:
+            assert running.poll() is None, "it ended before it could be killed"
+            time.sleep(0.02)
+        os.killpg(running.pid, signal.SIGKILL)
+    finished = {path.name: path.read_bytes() for path in written.glob("*.json")}
+    assert 1 <= len(finished) < len(routes)
+
+    job = Job(BlindDriver(5.0), Conditions())
+    going_on = HighwayEvaluator(job, routes, folder, 4)
+    episodes = tuple(going_on.episodes())
+    log = (tmp_path / "results.log").read_text().splitlines()
+    driven = [json.loads(line)["route"] for line in log]
+
+    assert [episode.route for episode in episodes] == [route.id for route in routes]
+    assert sorted(driven) == sorted(route.id for route in routes)
+    now = contents(folder)
+    assert all(now[f"routes/{name}"] == data for name, data in finished.items())
+    undisturbed = tmp_path / "undisturbed"
+    list(HighwayEvaluator(job, routes, undisturbed, 4).episodes())
+    assert contents(undisturbed) == now
+
+
+def test_a_full_disk_is_one_line_and_nothing_half_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "results"
+    full = evaluator(folder, routes=(CROSSING, PARKED))
+    ResultsFolder.create(folder, made_by(full))
+
+    def no_space(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("me2e_compress.runtime.atomic.os.fsync", no_space)
+        with pytest.raises(EvaluationError, match="the disk is full") as caught:
+            list(full.episodes())
+    assert "\n" not in str(caught.value)
+    assert list(contents(folder)) == ["evaluation.json"]
+
+    assert len(list(full.episodes())) == 2
+
+
+def failed(folder: Path, way: str, limit_s: float = 60.0) -> tuple[Episode, ...]:
+    job = Job(MisbehavingDriver(way), Conditions(), limit_s)
+    return tuple(evaluator(folder, job, (EXIT, PARKED)).episodes())
+
+
+def test_a_policy_that_hangs_fails_and_the_run_goes_on(tmp_path: Path) -> None:
+    episodes = failed(tmp_path / "results", "hang", limit_s=0.5)
+
+    assert [episode.ending for episode in episodes] == [Ending.POLICY_FAILED] * 2
+    assert {episode.failure for episode in episodes} == {"no plan within 0.5 s"}
+    # Nineteen frames at up to 8 m/s of a route of more than 100 m.
+    assert all(0.0 < episode.completion_percent < 10.0 for episode in episodes)
+
+
+def test_a_policy_that_takes_its_process_down_fails(tmp_path: Path) -> None:
+    episodes = failed(tmp_path / "results", "die")
+
+    assert {episode.failure for episode in episodes} == {
+        "the policy ended its process with code 7"
+    }
+
+
+def test_a_process_that_was_killed_is_not_the_policys_fault(tmp_path: Path) -> None:
+    words = r"route \w+: its process was killed \(out of memory\?\)"
+
+    with pytest.raises(EvaluationError, match=words):
+        failed(tmp_path / "results", "killed")
+    assert list(contents(tmp_path / "results")) == ["evaluation.json"]
+
+
+def test_a_failed_route_is_a_result_like_any_other(tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    episodes = failed(folder, "raise")
+
+    assert failed(folder, "raise") == episodes
+    assert len((tmp_path / "results.log").read_text().splitlines()) == 2
