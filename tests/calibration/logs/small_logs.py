@@ -8,6 +8,7 @@ own frames (CARLA's are left-handed), not with the functions under test.
 import gzip
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -259,3 +260,9 @@ def _box(kind: str, at: Car, up: float) -> dict[str, Any]:
         "extent": [2.25, 0.95, 0.8],
         "rotation": [0.0, 0.0, math.degrees(at.heading)],
     }
+
+
+MAKERS: dict[str, Callable[[Path], Path]] = {
+    "nuscenes": write_nuscenes,
+    "bench2drive": write_bench2drive,
+}

@@ -1,8 +1,6 @@
 """What a known drive, written as nuScenes and as Bench2Drive, is read as."""
 
-import json
 import math
-from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -10,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.logs import LOGS, DriveLog
 from me2e_compress.calibration.logs.log_frames import (
     InputForm,
@@ -19,14 +16,13 @@ from me2e_compress.calibration.logs.log_frames import (
 )
 from me2e_compress.calibration.logs.pictures import Picture, read_picture
 from me2e_compress.calibration.pixels import PixelInput
-from me2e_compress.calibration.recording import write_recording
 from me2e_compress.errors import FramesError
-from me2e_compress.runtime.frames import Frame
 from me2e_compress.testing import check_form
+from tests.calibration.logs.read_logs import F32, FORMS, MODEL, PIXELS, frames, to_lidar
 from tests.calibration.logs.small_logs import (
     BEND,
     CLIP,
-    LIDAR_M,
+    MAKERS,
     SPEED,
     WIDTH,
     YAWS,
@@ -36,46 +32,6 @@ from tests.calibration.logs.small_logs import (
     write_bench2drive,
     write_nuscenes,
 )
-
-F32 = np.dtype(np.float32)
-FORMS = {
-    "img": InputForm((1, 6, 3, 64, 80), F32),
-    "lidar2img": InputForm((1, 6, 4, 4), F32),
-    "can_bus": InputForm((18,), F32),
-    "command": InputForm((1,), np.dtype(np.int64)),
-    "timestamp": InputForm((1,), F32),
-    "l2g_r_mat": InputForm((3, 3), F32),
-    "l2g_t": InputForm((3,), F32),
-}
-PIXELS = PixelInput(mean=(0, 0, 0), std=(1, 1, 1), order="rgb", rows=64, columns=80)
-MODEL = LoggedInputs(FORMS, PIXELS)
-"""Half the pictures' 160 x 90, padded to 64 rows."""
-
-MAKERS: dict[str, Callable[[Path], Path]] = {
-    "nuscenes": write_nuscenes,
-    "bench2drive": write_bench2drive,
-}
-
-
-@pytest.fixture(scope="module")
-def roots(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return {name: make(tmp_path_factory.mktemp(name)) for name, make in MAKERS.items()}
-
-
-@pytest.fixture(params=MAKERS)
-def log(request: pytest.FixtureRequest, roots: dict[str, Path]) -> DriveLog:
-    name: str = request.param
-    return LOGS.parse(f"{name}:{roots[name]}")
-
-
-def frames(log: DriveLog, model: LoggedInputs = MODEL, count: int = 99) -> list[Frame]:
-    return list(log_frames(log, model, count))
-
-
-def to_lidar(car: np.ndarray) -> np.ndarray:
-    """From the car (x forward, y left) to its lidar (x right, y forward)."""
-    x, y, z = car[:3] - LIDAR_M
-    return np.array([-y, x, z, 1.0])
 
 
 def bright(planes: np.ndarray) -> tuple[float, float]:
@@ -213,43 +169,6 @@ def test_the_lidar_is_placed_in_the_world(log: DriveLog) -> None:
     np.testing.assert_allclose(turn @ point + arrays["l2g_t"], expected[:3], atol=1e-3)
 
 
-def test_the_future_is_where_the_car_went(log: DriveLog) -> None:
-    future = frames(log)[0].future
-    assert future is not None
-
-    at_lidar = np.array([*LIDAR_M[:2], 0, 1])
-    back = np.linalg.inv(car_at(0).to_world)
-    for step, waypoint in enumerate(future.waypoints[:3], 1):
-        there = back @ car_at(0.5 * step).to_world @ at_lidar
-        assert waypoint == pytest.approx(to_lidar(there)[:2].tolist(), abs=1e-6)
-    assert future.waypoints[3:] == (None, None, None)
-    assert not future.whole
-    assert future.forward == pytest.approx(math.pi / 2)
-
-
-def test_the_others_are_boxes_in_the_frame_of_the_plan(log: DriveLog) -> None:
-    future = frames(log)[0].future
-    assert future is not None
-    assert future.agents is not None
-
-    car = future.agents[1][0]
-    back = np.linalg.inv(car_at(0).to_world)
-    there = car_at(1.0).to_world @ [8.0, 0, 0, 1]
-    assert car[:2] == pytest.approx(to_lidar(back @ there)[:2].tolist(), abs=1e-5)
-    assert car[2] == pytest.approx(math.pi / 2 + SPEED * BEND)
-    assert car[3:] == pytest.approx((4.5, 1.9))
-    names = {"nuscenes": 1, "bench2drive": 2}  # no barrier; a walker, nobody above
-    assert len(future.agents[0]) == names[log.name]
-
-
-def test_the_ego_stands_around_its_centre(roots: dict[str, Path]) -> None:
-    future = frames(LOGS.parse(f"nuscenes:{roots['nuscenes']}"))[0].future
-
-    assert future is not None
-    assert future.ego == (4.084, 1.85)
-    assert future.centre == pytest.approx((0.0, 0.5))
-
-
 @pytest.mark.parametrize(("layout", "left"), [("nuscenes", 1), ("bench2drive", 0)])
 def test_the_command_follows_what_the_car_did(
     tmp_path: Path, layout: str, left: int
@@ -346,34 +265,3 @@ def test_what_a_log_cannot_feed_is_named(
 @pytest.mark.parametrize("name", MAKERS)
 def test_the_text_of_a_log_makes_it_again(name: str) -> None:
     check_form(LOGS.build(name, {"root": "x", "size": [2, 3], "width": 1}), LOGS)
-
-
-def test_a_future_is_written_and_read_again(log: DriveLog, tmp_path: Path) -> None:
-    made = frames(log)
-    pixels = {"img": PIXELS}
-    folder = write_recording(tmp_path / "f", lambda _: iter(made), {}, pixels=pixels)
-
-    assert [each.future for each in CalibrationSet(folder)] == [x.future for x in made]
-    write_recording(folder, lambda _: iter(made[:1]), {}, pixels=pixels)
-    assert not (folder / "000001.future.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"version": 2}, "000000.future.json: not a recorded future: version"),
-        ({"ego": [1]}, "000000.future.json: not a recorded future: ego"),
-    ],
-)
-def test_a_malformed_future_is_named(
-    roots: dict[str, Path], tmp_path: Path, change: dict[str, object], message: str
-) -> None:
-    made = frames(LOGS.parse(f"nuscenes:{roots['nuscenes']}"), count=1)
-    folder = write_recording(
-        tmp_path / "f", lambda _: iter(made), {}, pixels={"img": PIXELS}
-    )
-    path = folder / "000000.future.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-
-    with pytest.raises(FramesError, match=message):
-        _ = CalibrationSet(folder)[0]
