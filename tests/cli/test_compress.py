@@ -12,8 +12,7 @@ from me2e_compress import graph
 from me2e_compress.graph import rewrite
 from tests.command import Cli, write_frames
 from tests.frames import record
-from tests.nets import conv_attention, image, save_text
-from tests.plugins import exported
+from tests.nets import save_text
 
 ABLATE = "compress in.onnx --passes ablate-modules{drop=[occ]} --map map.toml"
 INT8 = "--scheme full --frames frames --map map.toml"
@@ -165,70 +164,6 @@ def test_an_open_batch_gets_one_size_in_every_command(cli: Cli, tmp_path: Path) 
         assert str(sized.graph.inputs[0].shape) == "[1,16,8,8]"
 
 
-FRAME = {
-    "image": np.ones((1, 16, 8, 8), np.float32),
-    "angle": np.full(1, 30, np.float32),
-    "center": np.full(2, 4, np.float32),
-    "lidar": np.tile(2 * np.eye(4, dtype=np.float32), (1, 6, 1, 1)),
-}
-CACHE = "TRT-100700-EntropyCalibration2\n" + "".join(
-    f"{name}: 3c010204\n" for name in ("image", "again", "turned", "y")
-)
-
-
-@pytest.fixture
-def plugins(tmp_path: Path) -> Path:
-    """bare.onnx and shaped.onnx: without and with value_info for the plugins."""
-    graph.save(exported(shapes=False), tmp_path / "bare.onnx")
-    graph.save(exported(shapes=True), tmp_path / "shaped.onnx")
-    record(tmp_path / "frames", [FRAME] * 4)
-    return tmp_path
-
-
-@pytest.mark.usefixtures("plugins")
-@pytest.mark.parametrize("name", ["inspect", "plan", "lint"])
-def test_plugins_without_shapes_are_told_of_and_with_them_are_not(
-    cli: Cli, name: str
-) -> None:
-    assert "value_info" in "".join(cli.done(f"{name} bare.onnx").out.split())
-    if name != "lint":
-        assert "value_info" not in "".join(cli.done(f"{name} shaped.onnx").out.split())
-
-
-@pytest.mark.usefixtures("plugins")
-def test_plugins_run_where_nobody_has_their_library(cli: Cli) -> None:
-    said = cli.done("compress bare.onnx -r exact -o bare-small.onnx --unproven").err
-    assert "2 plugin nodes (RotateTRT2, InverseTRT) tell no shape" in " ".join(
-        said.split()
-    )
-    how = "-r full --frames frames --floor 0"
-    cli.done(f"compress shaped.onnx {how} -o small.onnx")
-    cli.done("compare shaped.onnx small.onnx frames")
-
-
-def test_ranges_of_tensorrt_make_int8_of_a_plugin_that_nobody_runs(
-    cli: Cli, plugins: Path
-) -> None:
-    unknown = graph.load(plugins / "shaped.onnx")
-    unknown.graph[1].op_type = "VendorsOwn"
-    graph.save(unknown, plugins / "unknown.onnx")
-    (plugins / "trt.cache").write_text(CACHE)
-
-    said = cli.refused("calibrate unknown.onnx frames -o r.json")
-    assert "calibrate --import CACHE" in said
-    cli.done("calibrate shaped.onnx --import trt.cache -o r.json")
-    cli.done("compress shaped.onnx -r full --ranges r.json -o int8.onnx")
-    assert "QuantizeLinear" in kinds(plugins / "int8.onnx")
-
-
-def test_what_compress_wrote_can_be_compressed_again(cli: Cli, plugins: Path) -> None:
-    cli.done("compress shaped.onnx -r exact -o small.onnx")
-    nodes = graph.load(plugins / "small.onnx").graph
-    domains = {node.op_type: node.domain for node in nodes}
-    assert (domains["RotateTRT2"], domains["InverseTRT"]) == ("", "")
-    cli.done("compress small.onnx -r exact -o again.onnx")
-
-
 @pytest.mark.opens_apart
 def test_a_graph_that_kills_onnxruntime_is_one_line(cli: Cli, tmp_path: Path) -> None:
     """It divides the least integer by -1 while it opens this graph, and dies."""
@@ -245,58 +180,6 @@ def test_a_graph_that_kills_onnxruntime_is_one_line(cli: Cli, tmp_path: Path) ->
     assert cli("compare deadly.onnx deadly.onnx frames").err.splitlines()[-1] == (
         "me2e-compress: deadly.onnx: onnxruntime dies of it (SIGFPE) at step open"
     )
-
-
-M = "../models/m.onnx"
-FROM_ELSEWHERE = (
-    f"inspect {M}",
-    f"plan {M}",
-    f"lint {M}",
-    f"calibrate {M} ../models/frames -o r.json",
-    f"compare {M} {M} ../models/frames",
-    f"profile {M} ../models/frames -o t.json",
-    f"compress {M} -r full --frames ../models/frames -o small.onnx",
-)
-
-
-@pytest.fixture
-def elsewhere(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cli:
-    """A folder that is not the model's, whose weights lie all apart."""
-    home, away = tmp_path / "models", tmp_path / "elsewhere"
-    home.mkdir()
-    model = conv_attention()
-    for node in model.graph:
-        node.metadata_props.clear()
-    ir.save(
-        *(model, home / "m.onnx", "protobuf"),
-        external_data="weights.bin",
-        size_threshold_bytes=0,
-    )
-    record(home / "frames", [image(0), image(1)])
-    away.mkdir()
-    monkeypatch.chdir(away)
-    return Cli(cli.command, away, cli.capsys)
-
-
-@pytest.mark.parametrize("line", FROM_ELSEWHERE)
-def test_a_model_with_external_weights_works_from_any_folder(
-    elsewhere: Cli, line: str
-) -> None:
-    elsewhere.done(line)
-
-
-@pytest.mark.parametrize("at", [0, 2, 6])
-def test_weights_outside_the_model_s_folder_are_not_read(
-    elsewhere: Cli, tmp_path: Path, at: int
-) -> None:
-    weights = tmp_path / "models" / "weights.bin"
-    weights.rename(tmp_path / "private.bin")
-    weights.symlink_to(tmp_path / "private.bin")
-
-    said = elsewhere.refused(FROM_ELSEWHERE[at])
-
-    assert "the data of tokens lie at 'weights.bin'" in said
-    assert "private.bin, outside the model's folder: not read" in said
 
 
 POOLED = """

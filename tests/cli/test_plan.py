@@ -1,0 +1,132 @@
+"""``plan``: decisions that are explained, compared and overridden."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.quantization.plan import KeptFloat, load_plan, plan_of, save_plan
+from me2e_compress.registry.marks import IN_JSON
+from tests.command import Cli
+from tests.nets import net
+
+MAP = "--map map.toml"
+MADE = f"compress dense.onnx --scheme prediction --frames frames {MAP} -o out.onnx"
+
+
+def test_the_plan_that_is_shown_is_the_one_beside_the_file_and_inside(
+    cli: Cli, dense: Path
+) -> None:
+    cli.done(MADE)
+    saved = load_plan(dense / "out.plan.json")
+    assert saved == plan_of(graph.load(dense / "out.onnx"))
+    assert [each.node for each in saved.chosen] == ["/plan_head/MatMul"]
+
+    shown = cli.document(f"plan dense.onnx --scheme prediction {MAP}")
+
+    written = json.loads((dense / "out.plan.json").read_text())
+    assert written == IN_JSON | {k: shown[k] for k in written if k in shown}
+
+
+def test_plans_are_compared(cli: Cli, dense: Path) -> None:
+    cli.done(MADE)
+    line = f"plan dense.onnx --scheme feature-ext --rules paper {MAP} --against"
+
+    said = cli.done(f"{line} out.onnx").out
+    assert "/plan_head/MatMul: int8 (layer) -> float (module)" in said
+    assert "1 differences" in said
+    (found,) = cli.document(f"{line} out.onnx")["differences"]
+    assert [found[side]["rule"] for side in ("old", "new")] == ["layer", "module"]
+
+
+OVERRIDE = '[[override]]\nop = "MatMul"\ndtype = "float"\n'
+
+
+def test_overrides_are_told_against_the_model_and_reach_the_pass(
+    cli: Cli, dense: Path
+) -> None:
+    (dense / "o.toml").write_text(OVERRIDE)
+
+    said = cli.done(f"plan dense.onnx {MAP} --overrides o.toml --against dense.onnx")
+    assert "/plan_head/MatMul: int8 (layer) -> float (override)" in said.out
+    more = "--overrides o.toml --rules paper --allow-empty"
+    step = cli.document(f"{MADE} {more}")["steps"][-1]
+    assert 'rules="paper"' in step["text"]
+    assert "0 of 2 nodes int8; by rule: override 1" in step["notes"]
+
+
+@pytest.mark.usefixtures("dense")
+@pytest.mark.parametrize("file", ["out.onnx", "out.plan.json"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--scheme full",
+        "--rules paper",
+        "--overrides none.toml",
+        "--overrides none.toml --against dense.onnx",
+        "--scheme full --against out.plan.json",
+    ],
+)
+def test_options_are_not_for_a_plan_that_is_made(
+    cli: Cli, file: str, words: str
+) -> None:
+    cli.done(MADE)
+
+    said = cli.refused(f"plan {file} {words}")
+
+    option = words.split()[0]
+    assert f"{option} is for a plan that is yet to be made, and {file} has" in said
+
+
+@pytest.mark.usefixtures("dense")
+def test_a_plan_is_shown_with_reasons(cli: Cli) -> None:
+    said = cli.done(f"plan dense.onnx --scheme feature-ext {MAP} --nodes").out
+
+    assert "0 of 2 nodes int8; module 1" in said
+    assert "/plan_head/MatMul" in said
+
+
+def test_what_is_decided_together_is_listed(cli: Cli, tmp_path: Path) -> None:
+    model = net(
+        '<ir_version: 9, opset_import: ["" : 17]>'
+        "two (float[4,32] x, float[32,32] v, float[32,32] w)"
+        " => (float[4,32] k, float[4,32] q) { k = MatMul(x, v) q = MatMul(x, w) }",
+        {"v": np.eye(32), "w": np.ones((32, 32))},
+    )
+    graph.save(model, tmp_path / "two.onnx")
+    (tmp_path / "map.toml").write_text(
+        '[modules.head]\nrole = "prediction"\noptional = ["**"]\n'
+    )
+
+    assert "shared-input" in cli.done(f"plan two.onnx {MAP} --nodes").out
+
+
+def test_what_a_target_kept_and_what_is_close_is_told(cli: Cli, dense: Path) -> None:
+    cli.done(MADE)
+    made = load_plan(dense / "out.plan.json")
+    kept = tuple(KeptFloat(each.node, each.output, "slow") for each in made.chosen)
+    close = tuple(
+        dataclasses.replace(each, reason="[8,8]", borderline="near 512")
+        for each in made.decisions
+    )
+    changed = dataclasses.replace(made, kept_float=kept, decisions=close)
+    save_plan(changed, dense / "kept.plan.json")
+
+    said = cli.done("plan kept.plan.json --nodes").words
+
+    assert "1 of them stay float on their target" in said
+    assert "[8,8]" in said
+    assert "(near" in said
+    assert "bold" not in said
+
+
+@pytest.mark.usefixtures("dense")
+@pytest.mark.parametrize("words", ["", "-v", "--nodes", "--nodes -v"])
+def test_nodes_are_listed_once_and_only_when_asked_for(cli: Cli, words: str) -> None:
+    said = cli.done(f"plan dense.onnx {MAP} --scheme full {words}").out
+
+    assert "Decisions by module and rule" in said
+    assert said.count("/plan_head/MatMul") == bool(words)
