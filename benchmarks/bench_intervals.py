@@ -14,6 +14,7 @@ the first scheme under the same condition, or to ``--minus``.
 
 import argparse
 import csv
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,8 +53,14 @@ class KeptDrive:
         return mean_estimate(values, self.types, "%", bounds=self.bounds)
 
     @property
-    def correlation(self) -> float:
-        """Correlation of the driving scores of two routes of a type."""
+    def correlation(self) -> float | None:
+        """Correlation of the driving scores of two routes of a type.
+
+        None where it is not measured: one type alone, or a type of one route.
+        """
+        counts = Counter(self.types)
+        if len(counts) < 2 or min(counts.values()) < 2:
+            return None
         values = [score for score, _ in self.scores.values()]
         return intra_type_correlation([*zip(self.types, values, strict=True)])
 
@@ -112,7 +119,10 @@ def kept_drives(path: Path) -> dict[str, KeptDrive]:
 
 
 def told(drive: KeptDrive) -> str:
-    """Say both means with both intervals, and how alike the scores of a type are."""
+    """Say both means with both intervals, and how alike the scores of a type are.
+
+    The correlation is left out where it is not measured.
+    """
     said = []
     for column, name in enumerate(("DS", "SR")):
         mean = drive.mean(column)
@@ -120,8 +130,9 @@ def told(drive: KeptDrive) -> str:
             f"{name} {mean.value:.1f} ({mean.low:.1f} to {mean.high:.1f}; types anew"
             f" {mean.anew_low:.1f} to {mean.anew_high:.1f})"
         )
-    alike = f"correlation {drive.correlation:.2f}, scatter {drive.scatter:.1f}"
-    return ", ".join((*said, alike))
+    if drive.correlation is not None:
+        said.append(f"correlation {drive.correlation:.2f}")
+    return ", ".join((*said, f"scatter {drive.scatter:.1f}"))
 
 
 def main() -> None:
