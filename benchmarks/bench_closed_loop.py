@@ -108,14 +108,9 @@ def seconds_of(path: Path) -> float:
     """Median time of one plan."""
     policy = OnnxPolicy.open(path)
     policy.reset(None)
-    nothing = Observation(
-        0,
-        np.zeros((6, 96, 160, 3), np.uint8),
-        np.zeros((6, 4, 4), np.float32),
-        np.zeros(18, np.float32),
-        3,
-        5.0,
-    )
+    images = np.zeros((6, 96, 160, 3), np.uint8)
+    lidar2img, can_bus = np.zeros((6, 4, 4), np.float32), np.zeros(18, np.float32)
+    nothing = Observation(0, images, lidar2img, can_bus, 3, 5.0)
     taken = []
     for _ in range(60):
         begun = time.perf_counter()

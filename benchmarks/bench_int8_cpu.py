@@ -123,9 +123,7 @@ def files(
     """Let every tool write its file; name those that did, and why others did not."""
     done, missing = [FLOAT], {}
     left_out = [each.strip() for each in chosen.without.split(";")]
-    for name in [*PEERS, *OURS]:
-        if name in left_out:
-            continue
+    for name in [each for each in (*PEERS, *OURS) if each not in left_out]:
         path, took = path_of(subject, name), "it is there"
         if not path.is_file():
             took = written(subject, name, chosen)
@@ -242,12 +240,11 @@ def weigh(chosen: argparse.Namespace) -> dict[str, object]:
         kernels = Counter(node.op_type for node in graph.load(rewritten).graph)
     found = {}
     if chosen.file != FLOAT:
-        frames = CalibrationSet(subject.held_out)
+        recorded = CalibrationSet(subject.held_out)
+        frames = [recorded[at] for at in range(chosen.held_out)]
         reference = Session(subject.model, threads=chosen.threads, release=True)
         try:
-            fidelity = compare(
-                reference, session, [frames[at] for at in range(chosen.held_out)]
-            )
+            fidelity = compare(reference, session, frames)
         except GraphError as error:
             return {"refused": str(error)}
         found = {each.name: each.sqnr_db for each in fidelity.outputs}

@@ -32,12 +32,7 @@ from me2e_compress.zoo.bev.encoder import (
     CameraAttention,
     TemporalSelfAttention,
 )
-from me2e_compress.zoo.bev.sizes import (
-    ATTENTION_HEADS,
-    CAMERAS,
-    EMBED,
-    PILLAR_POINTS,
-)
+from me2e_compress.zoo.bev.sizes import ATTENTION_HEADS, CAMERAS, EMBED, PILLAR_POINTS
 from me2e_compress.zoo.export import build, save, trace
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.vad.config import MAP_REACH, MAP_SCORE
@@ -253,10 +248,8 @@ class Head(PlanningHead):
     def _agents(self, decoded: Decoded) -> AgentOutputs:
         queries, regressions, references = decoded
         x0, y0, z0, x1, y1, z1 = self.config.grid.pc_range
-        scores = [
-            branch(each)
-            for branch, each in zip(self.cls_branches, queries, strict=True)
-        ]
+        told = zip(self.cls_branches, queries, strict=True)
+        scores = [branch(each) for branch, each in told]
         boxes = []
         for raw, at in zip(regressions, references, strict=True):
             box = raw.clone()
@@ -266,12 +259,8 @@ class Head(PlanningHead):
             box[..., 1:2] = box[..., 1:2] * (y1 - y0) + y0
             box[..., 4:5] = box[..., 4:5] * (z1 - z0) + z0
             boxes.append(box)
-        return AgentOutputs(
-            torch.stack(scores),
-            torch.stack(boxes),
-            queries[-1],
-            references[-1][..., :2],
-        )
+        found = torch.stack(scores), torch.stack(boxes)
+        return AgentOutputs(*found, queries[-1], references[-1][..., :2])
 
     def _read_map(
         self,
