@@ -12,10 +12,6 @@ from tests.fuzz.texts import HUGE, MARKUP
 Fault = Callable[[onnx.ModelProto], object]
 
 
-def _node(*words: Any, **attributes: Any) -> onnx.NodeProto:
-    return helper.make_node(*words, **attributes)
-
-
 def _swap(m: onnx.ModelProto, one: int, other: int) -> None:
     first = onnx.NodeProto()
     first.CopyFrom(m.graph.node[one])
@@ -84,7 +80,8 @@ def _sparse(m: onnx.ModelProto) -> None:
 
 def _recursive(m: onnx.ModelProto) -> None:
     m.functions[0].opset_import.append(helper.make_opsetid("own", 1))
-    m.functions[0].node[0].CopyFrom(_node("twice", ["x"], ["z"], domain="own"))
+    call = helper.make_node("twice", ["x"], ["z"], domain="own")
+    m.functions[0].node[0].CopyFrom(call)
 
 
 def _mutual(m: onnx.ModelProto) -> None:
@@ -159,7 +156,7 @@ FAULTS: dict[str, Fault] = {
     "cycle": lambda m: m.graph.node[1].input.__setitem__(0, "q"),
     "self-loop": lambda m: m.graph.node[1].input.__setitem__(0, "r"),
     "unsorted": lambda m: _swap(m, 0, 6),
-    "reversed": lambda m: _reverse(m),
+    "reversed": _reverse,
     "node-twice": lambda m: m.graph.node.append(m.graph.node[1]),
     "output-twice": lambda m: m.graph.node[2].output.__setitem__(0, "a"),
     "names-twice": _each_node(lambda n: setattr(n, "name", "same")),
