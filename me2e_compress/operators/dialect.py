@@ -201,9 +201,7 @@ class Dialect:
     def attributes_of(self, node: ir.Node) -> dict[str, AttributeValue]:
         """Return a node's attributes with defaults; unknown ones are refused."""
         known = {each.name: each for each in self.attributes}
-        found: dict[str, AttributeValue] = {
-            each.name: each.default for each in self.attributes
-        }
+        found: dict[str, AttributeValue] = {n: e.default for n, e in known.items()}
         # Names and values must be known
         for name, written in node.attributes.items():
             if name in PLUGIN_ATTRIBUTES:
