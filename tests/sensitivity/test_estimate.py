@@ -9,114 +9,13 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.fidelity.compare import Reference
-from me2e_compress.graph import static_shape
-from me2e_compress.passes import Context
-from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.plan import FLOAT, RESIDUAL, QuantPlan
-from me2e_compress.runtime.session import Session
+from me2e_compress.quantization.plan import RESIDUAL
 from me2e_compress.sensitivity import error_sources
 from me2e_compress.sensitivity import estimate as room
-from me2e_compress.sensitivity.error_sources import blamed
-from me2e_compress.sensitivity.estimate import NO_PATH, NodeCost, estimate
+from me2e_compress.sensitivity.estimate import NO_PATH
 from me2e_compress.sensitivity.gradients import tape
-from me2e_compress.targets import TARGETS, Target
-from tests.frames import record
-from tests.nets import MODULES, conv_attention, net
-
-HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
-BLOCK = (
-    HEAD
-    + """
-net (float[1,3,16,16] image, float[16,3,3,3] w0, float[16,16,3,3] w1,
-     float[16,16,1,1] w2, float[16,8] w3) => (float[1,16,4,4] small, float[1,256,8] y)
-    <int64[3] tokens = {1, 16, 256}> {
-    ["/backbone/stem"] a = Conv<pads=[1,1,1,1]>(image, w0)
-    ["/backbone/Relu"] r = Relu(a)
-    ["/backbone/main"] b = Conv<pads=[1,1,1,1]>(r, w1)
-    ["/backbone/shortcut"] s = Conv(r, w2)
-    ["/backbone/Add"] sum = Add(b, s)
-    ["/backbone/Pool"] small = MaxPool<kernel_shape=[4,4], strides=[4,4]>(sum)
-    ["/head/Reshape"] flat = Reshape(sum, tokens)
-    ["/head/Transpose"] rows = Transpose<perm=[0,2,1]>(flat)
-    ["/head/Linear"] l = MatMul(rows, w3)
-    ["/head/Tanh"] y = Tanh(l)
-}"""
-)
-
-
-def block(outlier: float = 0.0) -> ir.Model:
-    """A residual block and a head; the head's weight may have an outlier."""
-    random = np.random.default_rng(0)
-    shapes = ((16, 3, 3, 3), (16, 16, 3, 3), (16, 16, 1, 1), (16, 8))
-    weights = {f"w{at}": random.normal(0, 0.2, each) for at, each in enumerate(shapes)}
-    weights["w3"][0] += outlier
-    weights["w1"][0] *= 1e-3 if outlier else 1
-    weights["w2"][0] *= 1e-3 if outlier else 1
-    return net(BLOCK, weights)
-
-
-@dataclasses.dataclass(frozen=True)
-class Case:
-    """A calibrated graph with its plan."""
-
-    model: ir.Model
-    plan: QuantPlan
-    target: Target
-    frames: CalibrationSet
-
-    @classmethod
-    def of(cls, folder: Path, model: ir.Model, target: str = "tensorrt") -> "Case":
-        random, place = np.random.default_rng(1), TARGETS.parse(target)
-        shapes = {str(v.name): static_shape(v) for v in model.graph.inputs}
-        drawn = [
-            {n: random.standard_normal(s).astype("f") for n, s in shapes.items()}
-            for _ in range(6)
-        ]
-        frames = CalibrationSet(record(folder / "frames", drawn))
-        plan = QuantizeInt8(rules="paper", target=target).plan(model, Context(MODULES))
-        kept = place.kept_float(plan, model)
-        return cls(model, dataclasses.replace(plan, kept_float=kept), place, frames)
-
-    def told(
-        self, seed: int = 0, most_held: int = room.MOST_HELD
-    ) -> dict[str, NodeCost]:
-        """Estimate, by node."""
-        ranges = Calibrator(threads=1).run(
-            self.model, self.target.tensors(self.plan, self.model), self.frames
-        )
-        grids = self.target.grids(self.plan, self.model, ranges)
-        costs = estimate(
-            self.model,
-            self.plan,
-            grids,
-            self.frames,
-            seed=seed,
-            threads=1,
-            most_held=most_held,
-        )
-        return {each.node: each for each in costs}
-
-    def measured(self, node: str) -> dict[str, float]:
-        """Make one node int8, with the residual Add behind it."""
-        ranges = Calibrator(threads=1).run(
-            self.model, self.target.tensors(self.plan, self.model), self.frames
-        )
-        nodes = {str(n.outputs[0].name): n for n in self.model.graph}
-        (output,) = (e.output for e in self.plan.decisions if e.node == node)
-        decisions = tuple(
-            each
-            if blamed(nodes[each.output], each) == output
-            else dataclasses.replace(each, dtype=FLOAT, activations=(), weight=None)
-            for each in self.plan.decisions
-        )
-        plan = dataclasses.replace(self.plan, decisions=decisions, groups=())
-        made = self.target.place(self.model, plan, ranges)
-        reference = Reference.of(Session(self.model, threads=1), self.frames)
-        found = reference.compare(Session(made, threads=1)).outputs
-        return {each.name: 10 ** (-each.sqnr_db / 20) for each in found}
+from tests.nets import conv_attention, net
+from tests.sensitivity.calibrated import HEAD, Case, block
 
 
 @pytest.mark.parametrize(
@@ -229,10 +128,7 @@ def test_waiting_for_a_gradient_changes_nothing(
 
 def test_readers_of_one_tensor_share_its_error(tmp_path: Path) -> None:
     case = Case.of(tmp_path, block())
-    ranges = Calibrator(threads=1).run(
-        case.model, case.target.tensors(case.plan, case.model), case.frames
-    )
-    grids = case.target.grids(case.plan, case.model, ranges)
+    grids = case.target.grids(case.plan, case.model, case.ranges)
 
     made = room._write(case.model, case.plan, grids, None, room.MOST_HELD).model
 
