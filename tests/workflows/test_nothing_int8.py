@@ -1,0 +1,57 @@
+"""``compress`` that makes nothing int8: an error, or said first and last."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress import graph
+from tests.command import Command
+from tests.frames import record
+from tests.nets import net
+
+NO_LAYER = """
+<ir_version: 9, opset_import: ["" : 17]>
+net (float[4,1,32] x, float[1,128,32] w, float[1,128,32] r) => (float[4,1,1,32] y) {
+    ["/head/LSTM"] y = LSTM<hidden_size=32>(x, w, r)
+}
+"""
+
+
+@pytest.fixture
+def lstm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A graph without a layer that anything makes int8; the current folder."""
+    weights = {name: np.ones((1, 128, 32)) for name in "wr"}
+    graph.save(net(NO_LAYER, weights), tmp_path / "in.onnx")
+    frame = {"x": np.ones((4, 1, 32), np.float32)}
+    record(tmp_path / "frames", [frame, frame])
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+EMPTY = ("compress", "in.onnx", "--scheme", "full", "--frames", "frames")
+
+
+def test_nothing_int8_is_an_error_and_writes_nothing(
+    command: Command, lstm: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(lstm.iterdir())
+
+    assert command(*EMPTY, "-o", "out.onnx") == 1
+
+    said = capsys.readouterr().err
+    assert "made nothing int8" in said
+    assert "rule operator: LSTM is not a weighted layer" in said
+    assert "--allow-empty" in said
+    assert sorted(lstm.iterdir()) == before
+
+
+def test_nothing_int8_is_said_first_and_last_where_it_is_allowed(
+    command: Command, lstm: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(*EMPTY, "--allow-empty", "-o", "out.onnx") == 0
+
+    said = capsys.readouterr()
+    assert "made nothing int8" in said.err.splitlines()[0]
+    assert "made nothing int8" in said.out.splitlines()[-1]
+    assert (lstm / "out.onnx").is_file()
