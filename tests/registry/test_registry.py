@@ -1,129 +1,18 @@
-from dataclasses import dataclass, field
-from enum import StrEnum
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar
 
-import pydantic
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.errors import MissingExtraError, StudyError
+from me2e_compress.errors import StudyError
 from me2e_compress.registry import Option, Registry, describe
-from tests.installed import install
-
-GROUP = "me2e_compress.shapes"
-
-
-class Colour(StrEnum):
-    RED = "red"
-    BLUE = "blue, or so"
-
-
-@dataclass(frozen=True)
-class Shape:
-    name: ClassVar[str] = "shape"
-
-
-@dataclass(frozen=True)
-class Square(Shape):
-    """Four sides.
-
-    All of them equal.
-
-    Attributes:
-        side: Metres, above
-            zero.
-        tags: Words.
-    """
-
-    name: ClassVar[str] = "square"
-    side: Annotated[float, pydantic.Field(gt=0)] = 1.0
-    tags: tuple[str, ...] = ()
-    count: int = 3
-    open: bool = False
-    label: str = "none"
-    picture: Path | None = None
-    limit: int | None = 5
-    colour: Colour = Colour.RED
-    kind: Literal["a", "b"] = "a"
-    area: float = field(default=0.0, init=False)
-
-
-@dataclass(frozen=True)
-class Circle(Shape):
-    """Round."""
-
-    name: ClassVar[str] = "circle"
-    radius: float
-
-
-@dataclass(frozen=True)
-class Point(Shape):
-    """Without size."""
-
-    name: ClassVar[str] = "point"
-
-
-class Undecorated(Square):
-    name = "undecorated"
-
-
-@dataclass
-class Thawed:
-    name: ClassVar[str] = "thawed"
-
-
-@dataclass(frozen=True)
-class Misnamed(Shape):
-    name: ClassVar[str] = "other"
-
-
-def __getattr__(name: str) -> object:
-    if name == "Broken":
-        raise RuntimeError("two\nlines")
-    if name == "Lacking":
-        raise MissingExtraError("torch", "zoo")
-    raise AttributeError(name)
-
-
-SHAPES: Registry[Shape] = Registry(
-    "shape",
-    GROUP,
-    StudyError,
-    {
-        "square": f"{__name__}:Square",
-        "circle": f"{__name__}:Circle",
-        "point": f"{__name__}:Point",
-    },
-)
-
-
-@pytest.fixture
-def others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three packages: one works, one is broken, two want the same name."""
-    here = __name__
-    good = {"thawed": f"{here}:Thawed", "misnamed": f"{here}:Misnamed"}
-    install(monkeypatch, tmp_path, "good-shapes", GROUP, good)
-    bad = {"broken": f"{here}:Broken", "circle": f"{here}:Circle"}
-    bad |= {"gone": "no_such_module:Shape", "lacking": f"{here}:Lacking"}
-    install(monkeypatch, tmp_path, "bad-shapes", GROUP, bad)
-    for package in ("one", "two"):
-        entries = {"twice": f"{here}:Point"}
-        install(monkeypatch, tmp_path, f"shapes-{package}", GROUP, entries)
+from tests.registry.shapes import GROUP, SHAPES, Circle, Colour, Point, Shape, Square
 
 
 def test_a_class_is_found_by_its_name() -> None:
     assert SHAPES.get("square") is Square
-
-
-def test_a_class_of_another_package_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ours = Registry[Shape]("shape", GROUP, StudyError, {})
-    install(monkeypatch, tmp_path, "p", GROUP, {"square": f"{__name__}:Square"})
-
-    assert ours.parse("square:2") == Square(2.0)
 
 
 @pytest.mark.parametrize(
@@ -236,56 +125,6 @@ def test_bad_text_names_the_culprit_on_one_line(text: str, message: str) -> None
     with pytest.raises(StudyError, match=message) as caught:
         SHAPES.parse(text)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("broken", r"'broken' of bad-shapes 1.0 .*imported: RuntimeError: two lines"),
-        ("gone", r"'gone' of bad-shapes 1.0 \(no_such_module:Shape\) cannot be impor"),
-        ("thawed", "'thawed' of good-shapes 1.0 .* is not a frozen dataclass"),
-        ("misnamed", "'misnamed' of good-shapes 1.0 .* calls itself 'other'"),
-        ("circle", "'circle' is claimed by me2e-compress and bad-shapes 1.0: uninst"),
-        ("twice", "'twice' is claimed by shapes-(one|two) 1.0 and shapes-"),
-    ],
-)
-@pytest.mark.usefixtures("others")
-def test_an_entry_that_cannot_be_used_is_named(name: str, message: str) -> None:
-    with pytest.raises(StudyError, match=message) as caught:
-        SHAPES.get(name)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.usefixtures("others")
-def test_what_needs_an_extra_says_which() -> None:
-    with pytest.raises(MissingExtraError, match=r"me2e-compress\[zoo\]"):
-        SHAPES.get("lacking")
-
-
-@pytest.mark.usefixtures("others")
-def test_the_rest_works_beside_broken_entries() -> None:
-    assert SHAPES.parse_all("square,point") == (Square(), Point())
-    assert SHAPES.usable() == ("square", "point")
-
-
-@pytest.mark.usefixtures("others")
-def test_every_entry_is_listed_with_its_trouble() -> None:
-    entries = {entry.name: entry for entry in describe(SHAPES)}
-
-    assert list(entries) == [
-        *("square", "circle", "point"),
-        *("broken", "gone", "lacking", "misnamed", "thawed", "twice"),
-    ]
-    assert entries["square"].error == ""
-    assert "RuntimeError" in entries["broken"].error
-    assert entries["circle"].source == "me2e-compress and bad-shapes 1.0"
-
-
-def test_an_undecorated_class_has_no_options_of_its_own() -> None:
-    ours = Registry[Shape]("s", "", StudyError, {"u": f"{__name__}:Undecorated"})
-
-    with pytest.raises(StudyError, match="is not a frozen dataclass"):
-        ours.get("u")
 
 
 def test_an_entry_is_described() -> None:
