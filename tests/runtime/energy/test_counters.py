@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import ClassVar
 
 import pynvml
@@ -16,22 +15,12 @@ from me2e_compress.runtime.energy.energy_counter import (
     open_counter,
 )
 from me2e_compress.runtime.energy.ina3221 import Ina3221, counted
-from me2e_compress.runtime.energy.nvml import Nvml
 from me2e_compress.runtime.energy.rapl import Rapl
-from me2e_compress.runtime.energy.reader import Absent, Reader
+from me2e_compress.runtime.energy.reader import Absent
 from me2e_compress.testing import check_form
+from tests.runtime.energy.opened import Driver, answered, reason
 
 RANGE = 1_000_000
-
-
-def answered(found: object) -> Reader:
-    assert isinstance(found, Reader)
-    return found
-
-
-def reason(found: object) -> str:
-    assert isinstance(found, Absent)
-    return found.reason
 
 
 def zone(root: Path, folder: str, name: str, energy: str = "0") -> Path:
@@ -159,103 +148,6 @@ def test_a_rail_that_says_nothing_is_the_answer(tmp_path: Path) -> None:
     (sensor / "curr1_input").write_text("")
 
     assert "invalid literal" in reason(Ina3221(root=tmp_path).open())
-
-
-class Driver:
-    """What NVML says, call by call; an error code where it does not."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, **says: int) -> None:
-        self.says, self.shut = {"energy": 5_000, "power": 250_000, **says}, 0
-        calls = {
-            "nvmlInit": lambda: self.answer("init"),
-            "nvmlShutdown": self.shutdown,
-            "nvmlDeviceGetHandleByIndex": lambda index: self.answer("gpu", index),
-            "nvmlDeviceGetName": lambda handle: "A GPU",
-            "nvmlDeviceGetTotalEnergyConsumption": lambda handle: self.answer("energy"),
-            "nvmlDeviceGetFieldValues": lambda handle, fields: [self.field()],
-            "nvmlDeviceGetTemperature": lambda handle, sensor: 61,
-            "nvmlDeviceGetClockInfo": lambda handle, kind: self.answer("clock", 1_700),
-            "nvmlDeviceGetCurrentClocksEventReasons": lambda handle: self.answer(
-                "slow"
-            ),
-        }
-        for name, call in calls.items():
-            monkeypatch.setattr(pynvml, name, call)
-
-    def shutdown(self) -> None:
-        self.shut += 1
-
-    def answer(self, what: str, usual: int = 0) -> int:
-        found = self.says.get(what, usual)
-        if found < 0:
-            raise pynvml.NVMLError(-found)
-        return found
-
-    def field(self) -> SimpleNamespace:
-        power = self.says["power"]
-        code, milliwatts = (-power, 0) if power < 0 else (0, power)
-        return SimpleNamespace(nvmlReturn=code, value=SimpleNamespace(uiVal=milliwatts))
-
-
-UNSUPPORTED = -pynvml.NVML_ERROR_NOT_SUPPORTED
-
-
-def test_a_board_counts_and_tells_its_power(monkeypatch: pytest.MonkeyPatch) -> None:
-    driver = Driver(monkeypatch, slow=pynvml.nvmlClocksEventReasonSwPowerCap)
-    reader = answered(Nvml().open())
-
-    assert (reader.counter, reader.device) == ("nvml-total", "A GPU")
-    assert (reader.joules(), reader.watts()) == (5.0, 250.0)
-    assert reader.state().temperature_c == 61
-    assert reader.state().clocks_mhz == {"sm": 1_700, "memory": 1_700}
-    assert reader.state().throttled == ("power cap",)
-    reader.close()
-    assert driver.shut == 1
-
-
-def test_a_card_without_a_counter_has_its_power_integrated(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    Driver(monkeypatch, energy=UNSUPPORTED)
-    reader = answered(Nvml().open())
-
-    assert (reader.counter, reader.counts) == ("nvml-power-integrated", False)
-
-
-def test_a_counter_without_power_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    Driver(monkeypatch, power=UNSUPPORTED, clock=UNSUPPORTED, slow=UNSUPPORTED)
-    reader = answered(Nvml().open())
-
-    assert (reader.counts, reader.tells_power) == (True, False)
-    assert reader.state().clocks_mhz == {}
-
-
-def test_a_driver_that_answers_and_supports_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    driver = Driver(monkeypatch, energy=UNSUPPORTED, power=UNSUPPORTED)
-
-    assert reason(Nvml().open()) == (
-        "A GPU tells no energy: total energy: Not Supported;"
-        " instant power: Not Supported"
-    )
-    assert driver.shut == 1
-
-
-@pytest.mark.parametrize("what", ["init", "gpu"])
-def test_no_driver_or_no_such_gpu(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    Driver(monkeypatch, **{what: -pynvml.NVML_ERROR_NOT_FOUND})
-
-    assert "Not Found" in reason(Nvml(1).open())
-
-
-def test_a_gpu_that_is_lost_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    driver = Driver(monkeypatch)
-    reader = answered(Nvml().open())
-    driver.says["energy"] = -pynvml.NVML_ERROR_GPU_IS_LOST
-
-    with pytest.raises(EnergyError, match="nvml-total of A GPU: GPU is lost"):
-        reader.joules()
 
 
 def test_no_counter_lists_what_each_answered(monkeypatch: pytest.MonkeyPatch) -> None:
