@@ -1,9 +1,9 @@
-"""Rounding weights so that their errors cancel."""
+"""Rounding weights: each to its nearest step, or so that their errors cancel."""
 
 import numpy as np
 import onnx_ir as ir
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress import graph
@@ -19,6 +19,7 @@ from me2e_compress.targets.weights import (
     weights_of,
 )
 from tests.nets import MODULES, net
+from tests.profiles import scaled
 
 NET = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -52,6 +53,28 @@ def nearest(model: ir.Model, output: str) -> np.ndarray:
     assert weight is not None
     wide = weight.astype(np.float32)
     return quantize_weight(wide, 0 if node.op_type == "Conv" else 1)[0]
+
+
+@settings(max_examples=scaled(50))
+@given(seed=st.integers(0, 2**32 - 1), axis=st.integers(0, 2))
+def test_a_weight_is_off_by_half_a_step_at_most(seed: int, axis: int) -> None:
+    weight = np.random.default_rng(seed).standard_normal((3, 4, 5)).astype(np.float32)
+
+    integers, scales = quantize_weight(weight, axis)
+
+    shape = [1, 1, 1]
+    shape[axis] = -1
+    error = np.abs(integers * scales.reshape(shape) - weight)
+    assert (error <= scales.reshape(shape) * 0.5001).all()
+    others = tuple(each for each in range(3) if each != axis)
+    assert (np.abs(integers).max(axis=others) == 127).all()
+
+
+def test_a_channel_of_zeros_stays_zero() -> None:
+    integers, scales = quantize_weight(np.zeros((2, 3), np.float32), 0)
+
+    assert not integers.any()
+    assert scales.tolist() == [1, 1]
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.integers(1, 40))

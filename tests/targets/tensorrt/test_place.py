@@ -15,36 +15,14 @@ from me2e_compress.quantization.rules.safe_rules import SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import run_once
 from me2e_compress.targets.tensorrt import TensorRT
-from me2e_compress.targets.weights import quantize_weight
 from tests.nets import MODULES, PAPER, conv_attention, net
 from tests.profiles import scaled
+from tests.targets.tensorrt.layers import SHAPES, layers
 
 FULL = QuantScheme.named("full", MODULES)
 
-LAYERS = """
-<ir_version: 9, opset_import: ["" : %d]>
-layers (float[2,3,5,5] x, float[2,4] t, float[6,3,3,3] conv, float[6] bias,
-        float[6,2,2,2] up, float[4,7] right, float[7,4] turned)
-    => (float[2,6,3,3] a, float[2,4,6,6] b, float[2,7] c, float[2,7] d) {
-    z = Conv<kernel_shape=[3,3]>(x, conv, bias)
-    a = Relu(z)
-    b = ConvTranspose<kernel_shape=[2,2], strides=[2,2], group=2>(a, up)
-    c = MatMul(t, right)
-    d = Gemm<transB=1>(t, turned)
-}
-"""
-SHAPES = {
-    "conv": (6, 3, 3, 3), "bias": (6,), "up": (6, 2, 2, 2), "right": (4, 7),
-    "turned": (7, 4),
-}  # fmt: skip
 PARTS = ("int8", "scale", "zero")
 AXES = {"conv": 0, "up": 1, "right": 1, "turned": 0}
-
-
-def layers(seed: int = 0, opset: int = 17) -> ir.Model:
-    generator = np.random.default_rng(seed)
-    weights = {name: generator.standard_normal(s) for name, s in SHAPES.items()}
-    return net(LAYERS % opset, weights)
 
 
 def placed(model: ir.Model, reach: float = 3.0) -> ir.Model:
@@ -136,28 +114,6 @@ def test_numbers_are_those_of_rounding_both_operands(seed: int, reach: float) ->
     channels = np.abs(right).max(axis=0) / np.float32(127)
     want = fake_quantized(t, step) @ fake_quantized(right, channels)
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-5)
-
-
-@settings(max_examples=scaled(50))
-@given(seed=st.integers(0, 2**32 - 1), axis=st.integers(0, 2))
-def test_a_weight_is_off_by_half_a_step_at_most(seed: int, axis: int) -> None:
-    weight = np.random.default_rng(seed).standard_normal((3, 4, 5)).astype(np.float32)
-
-    integers, scales = quantize_weight(weight, axis)
-
-    shape = [1, 1, 1]
-    shape[axis] = -1
-    error = np.abs(integers * scales.reshape(shape) - weight)
-    assert (error <= scales.reshape(shape) * 0.5001).all()
-    others = tuple(each for each in range(3) if each != axis)
-    assert (np.abs(integers).max(axis=others) == 127).all()
-
-
-def test_a_channel_of_zeros_stays_zero() -> None:
-    integers, scales = quantize_weight(np.zeros((2, 3), np.float32), 0)
-
-    assert not integers.any()
-    assert scales.tolist() == [1, 1]
 
 
 def test_a_weight_two_layers_share_is_stored_once() -> None:

@@ -13,7 +13,7 @@ from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx import check
 from tests.nets import MODULES, PAPER, conv_attention, net
-from tests.targets.tensorrt.test_place import layers
+from tests.targets.tensorrt.layers import layers
 
 RTX = pytest.mark.skipif(
     importlib.util.find_spec("tensorrt_rtx") is None, reason="extra trt-check"
