@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
@@ -10,10 +9,9 @@ import onnxruntime
 import pytest
 import torch
 
-from me2e_compress.errors import GraphError, RecipeError
-from me2e_compress.workflows.export import ExportOptions, ExportResult, export_stack
-from me2e_compress.zoo import export as exporting
-from me2e_compress.zoo.export import build, trace
+from me2e_compress.errors import GraphError
+from me2e_compress.workflows.export import ExportResult
+from me2e_compress.zoo.export import trace
 from me2e_compress.zoo.published_names import PUBLISHED, NameMatch
 from me2e_compress.zoo.published_weights import (
     PublishedWeights,
@@ -21,21 +19,10 @@ from me2e_compress.zoo.published_weights import (
     published_weights,
     taken,
 )
-from me2e_compress.zoo.stacks import VAD_TINY, Stack
 from me2e_compress.zoo.state_dict import read_state_dict
-from me2e_compress.zoo.synthetic_frames import frames
 from me2e_compress.zoo.tcp.stack import Tcp
-from me2e_compress.zoo.vad.stack import VadTiny
 from me2e_compress.zoo.weights_record import WeightsRecord, named_weights
-from tests.zoo.published_files import (
-    Tensors,
-    averaged,
-    lightning,
-    mmcv,
-    parallel,
-    saved,
-    thin,
-)
+from tests.zoo.published_files import Tensors, averaged, lightning, mmcv, saved, thin
 from tests.zoo.published_layouts import published
 from tests.zoo.tcp.small import SMALL, small_spec
 
@@ -244,82 +231,3 @@ def test_anchors_of_uniad_are_asked_for(tmp_path: Path) -> None:
 def test_a_stack_without_an_original(tmp_path: Path) -> None:
     with pytest.raises(GraphError, match="highway has no original"):
         published_weights("highway", tmp_path / "a.pth")
-
-
-def test_nothing_is_written_of_what_does_not_fit(
-    tmp_path: Path, tensors: Tensors
-) -> None:
-    del tensors[BIAS]
-    path = saved(tmp_path / "a.pth", tensors)
-    with pytest.raises(GraphError, match="names missing"):
-        export_stack("tcp", tmp_path / "out.onnx", ExportOptions(weights=path))
-    assert not (tmp_path / "out.onnx").exists()
-
-
-def test_a_checkpoint_is_not_overwritten(tmp_path: Path, tensors: Tensors) -> None:
-    path = saved(tmp_path / "a.pth", tensors)
-    with pytest.raises(GraphError, match=r"a\.pth"):
-        export_stack("tcp", path, ExportOptions(weights=path, force=True))
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"seed": 0, "weights": Path("a.pth")}, "--seed draws weights, --weights bri"),
-        ({"ema": True}, "--ema needs --weights"),
-    ],
-)
-def test_options_that_contradict_the_weights(
-    options: dict[str, Any], words: str
-) -> None:
-    with pytest.raises(RecipeError, match=words):
-        ExportOptions(**options)
-
-
-@pytest.mark.parametrize("dialect", [None, "me2e"])
-def test_an_export_is_of_the_checkpoint_and_names_it(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    dialect: str | None,
-) -> None:
-    """As far as the trace, which takes minutes at full size."""
-    path = saved(tmp_path / "a.pth", mmcv(thin(published("vad-tiny"))))
-    traced: list[torch.nn.Module] = []
-
-    def trace(spec: Stack, model: torch.nn.Module, opset: int) -> onnx.ModelProto:
-        traced.append(model)
-        return onnx.parser.parse_model(
-            '<ir_version: 8, opset_import: ["" : 17]>'
-            "m (float[1] img) => (float[1] plan) { plan = Relu(img) }"
-        )
-
-    monkeypatch.setattr(exporting, "trace", trace)
-    options = ExportOptions(weights=path, dialect=dialect)
-    found = export_stack("vad-tiny", tmp_path / "out.onnx", options)
-
-    (model,) = traced
-    assert all(bool((each == 0.5).all()) for each in model.parameters())
-    entries = onnx.load(found.output).metadata_props
-    said = {entry.key: entry.value for entry in entries}
-    assert json.loads(said["me2e.weights"])["epoch"] == 60
-    assert found.weights is not None
-    assert found.lines()[1] == found.weights.lines()[0]
-
-
-@pytest.mark.slow
-def test_vad_of_a_checkpoint_answers_as_in_torch(tmp_path: Path) -> None:
-    """Names that the original has otherwise, at full size: the plan reads them all."""
-    drawn = build("vad-tiny", seed=3)
-    assert isinstance(drawn, VadTiny)
-    names = PUBLISHED["vad-tiny"]
-    state = {names.published(name): each for name, each in drawn.state_dict().items()}
-    path = saved(tmp_path / "vad.pth", mmcv(parallel(state)))
-    options = ExportOptions(weights=path)
-    found = export_stack("vad-tiny", tmp_path / "vad.onnx", options).output
-
-    (frame,) = frames(VAD_TINY, 1, seed=7)
-    feed = {**frame, "prev_bev": np.zeros(VAD_TINY.inputs["prev_bev"], np.float32)}
-    session = onnxruntime.InferenceSession(found)
-    wanted = drawn(*(torch.from_numpy(feed[name]) for name in VAD_TINY.inputs))
-    for got, want in zip(session.run(None, feed), wanted, strict=True):
-        assert np.abs(got - want.numpy()).max() <= 1e-4 * want.abs().max()
