@@ -121,15 +121,16 @@ def kept_drives(path: Path) -> dict[str, KeptDrive]:
 def told(drive: KeptDrive) -> str:
     """Say both means with both intervals, and how alike the scores of a type are.
 
-    The correlation is left out where it is not measured.
+    The interval over types drawn anew and the correlation are left out where they are
+    not measured.
     """
     said = []
     for column, name in enumerate(("DS", "SR")):
         mean = drive.mean(column)
-        said.append(
-            f"{name} {mean.value:.1f} ({mean.low:.1f} to {mean.high:.1f}; types anew"
-            f" {mean.anew_low:.1f} to {mean.anew_high:.1f})"
-        )
+        bounds = f"{mean.low:.1f} to {mean.high:.1f}"
+        if mean.anew_low is not None:
+            bounds += f"; types anew {mean.anew_low:.1f} to {mean.anew_high:.1f}"
+        said.append(f"{name} {mean.value:.1f} ({bounds})")
     if drive.correlation is not None:
         said.append(f"correlation {drive.correlation:.2f}")
     return ", ".join((*said, f"scatter {drive.scatter:.1f}"))

@@ -7,10 +7,25 @@ import pytest
 from benchmarks.files_entered import CALLS
 from benchmarks.house import House, budget, entered, measure
 
+ROOT = Path(__file__).parents[1]
+MOST_LINES = 300
+
 
 @pytest.fixture(scope="module")
 def house() -> House:
     return measure()
+
+
+@pytest.mark.parametrize(
+    "room", ["me2e_compress", "driver", "benchmarks", "tests", "docs", ".ci"]
+)
+def test_no_file_has_more_lines_than_a_reader_takes_in(room: str) -> None:
+    lines = {
+        str(file.relative_to(ROOT)): len(file.read_text("utf-8").splitlines())
+        for file in (ROOT / room).rglob("*.py")
+    }
+    assert lines
+    assert {name: n for name, n in lines.items() if n > MOST_LINES} == {}
 
 
 def test_no_room_holds_more_lines_than_it_may(house: House) -> None:

@@ -29,10 +29,11 @@ def test_a_correlation_that_is_not_measured_is_left_out(
     assert "nan" not in told(drive)
 
 
-def test_one_type_alone_has_no_correlation() -> None:
+def test_one_type_alone_has_no_correlation_and_no_types_anew() -> None:
     drive = KeptDrive({"Merge_0": (10.0, 0.0), "Merge_1": (20.0, 0.0)})
 
     assert drive.correlation is None
+    assert told(drive).startswith("DS 15.0 (10.0 to 20.0), SR 0.0 (")
 
 
 def test_a_few_sets_are_counted() -> None:
