@@ -9,6 +9,7 @@ import numpy as np
 import onnx
 from onnx import numpy_helper
 
+from me2e_compress.zoo.shipped import SHIPPED
 from tests.frames import record
 
 WIDTH = 8
@@ -87,23 +88,26 @@ def write_model(
     return path
 
 
-def write_shipped(folder: Path, name: str = "highway") -> Path:
-    """Write the model and a card that fits it, as the package has them."""
+def write_shipped(folder: Path) -> None:
+    """Write a model and a card that fits it for all that ship, as the package does."""
     folder.mkdir(exist_ok=True)
-    model = write_model(folder / f"{name}.onnx")
-    content = model.read_bytes()
-    card = {
+    for seed, name in enumerate(SHIPPED):
+        model = write_model(folder / f"{name}.onnx", seed=seed)
+        card = _card(model.read_bytes(), seed)
+        (folder / f"{name}.json").write_text(json.dumps(card))
+
+
+def _card(content: bytes, seed: int) -> dict[str, object]:
+    return {
         "sha256": hashlib.sha256(content).hexdigest(),
         "bytes": len(content),
         "parameters": sum(value.size for value in _weights(0).values()),
-        "seed": 0,
+        "seed": seed,
         "data": {"seeds": [100], "frames": 1},
         "command": "none: drawn at random",
         "hours": None,
         "scores": None,
     }
-    (folder / f"{name}.json").write_text(json.dumps(card))
-    return model
 
 
 def record_driver(folder: Path, count: int) -> Path:

@@ -73,6 +73,7 @@ class Driver(abc.ABC):
 
 
 _HIGHWAY = "me2e_compress.evaluators.highway.drivers"
+_SHIPPED = "me2e_compress.workflows.shipped_driver"
 
 POLICIES: Registry[Driver] = Registry(
     "policy",
@@ -82,7 +83,8 @@ POLICIES: Registry[Driver] = Registry(
         "expert": f"{_HIGHWAY}:ExpertDriver",
         "blind": f"{_HIGHWAY}:BlindDriver",
         "onnx": f"{_HIGHWAY}:OnnxDriver",
-        "highway": "me2e_compress.workflows.shipped_driver:ShippedDriver",
+        "highway": f"{_SHIPPED}:ShippedDriver",
+        "highway-2": f"{_SHIPPED}:SecondRoadDriver",
         "python": "me2e_compress.driving.policies:PythonDriver",
     },
 )

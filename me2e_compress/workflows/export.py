@@ -114,8 +114,8 @@ def export_stack(
 ) -> ExportResult:
     """Write a reference stack: random weights, a checkpoint's, or our driver.
 
-    The stack is ``vad-tiny``, ``uniad-tiny``, ``uniad-trt``, ``tcp`` or ``highway``;
-    the folder of the output is made if needed.
+    The stack is ``vad-tiny``, ``uniad-tiny``, ``uniad-trt``, ``tcp``, ``highway`` or
+    ``highway-2``; the folder of the output is made if needed.
 
     Raises:
         GraphError: The stack, an option or the output is not usable.

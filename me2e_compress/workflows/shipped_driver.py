@@ -1,4 +1,4 @@
-"""The driver that ships, as a policy by its name."""
+"""The drivers that ship, as policies by their names."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -33,3 +33,9 @@ class ShippedDriver(Driver):
     def fingerprint(self) -> str:
         """Return the digest of the file: results under either name are the same."""
         return self.resolved().fingerprint()
+
+
+class SecondRoadDriver(ShippedDriver):
+    """The driver that comes with the package and was trained on the second road."""
+
+    name: ClassVar[str] = "highway-2"

@@ -183,6 +183,9 @@ HIGHWAY = Stack(
 """The toolkit's own driver: the policy contract of highway-env, 32 x 24 cells of 64
 channels and how well each is known, and two numbers of memory about the ego."""
 
+HIGHWAY_2 = replace(HIGHWAY, name="highway-2")
+"""The same network, trained on the second road."""
+
 TCP = Stack(
     name="tcp",
     inputs={"img": (1, 3, 256, 900), "state": (1, 9), "target_point": (1, 2)},
@@ -285,7 +288,8 @@ UNIAD_TRT = uniad_stack("uniad-trt", CONFIGS["uniad-trt"], 0.25, 2)
 """NVIDIA/DL4AGX, uniad-trt: the tiny model of its TensorRT export, for nuScenes."""
 
 STACKS: dict[str, Stack] = {
-    stack.name: stack for stack in (VAD_TINY, UNIAD_TINY, UNIAD_TRT, TCP, HIGHWAY)
+    stack.name: stack
+    for stack in (VAD_TINY, UNIAD_TINY, UNIAD_TRT, TCP, HIGHWAY, HIGHWAY_2)
 }
 
 

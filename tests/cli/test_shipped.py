@@ -30,16 +30,19 @@ def frames(tmp_path: Path) -> Path:
     return record_driver(tmp_path / "frames", 2)
 
 
+@pytest.mark.parametrize("name", shipped.SHIPPED)
 def test_a_name_is_the_shipped_file_unless_there_is_a_file_of_that_name(
-    cli: Cli, weights: Path
+    cli: Cli, weights: Path, name: str
 ) -> None:
-    assert model_path("highway") == weights / "highway.onnx"
-    write_model(cli.folder / "highway", seed=1)
-    assert model_path("highway") == Path("highway")
+    assert model_path(name) == weights / f"{name}.onnx"
+    write_model(cli.folder / name, seed=1)
+    assert model_path(name) == Path(name)
 
 
 def test_neither_a_file_nor_a_name() -> None:
-    with pytest.raises(GraphError, match=r"^uniad: no such file; .*ship: highway$"):
+    with pytest.raises(
+        GraphError, match=r"^uniad: no such file; .*ship: highway, highway-2$"
+    ):
         model_path("uniad")
 
 
@@ -79,23 +82,25 @@ def test_a_module_is_taken_out(cli: Cli) -> None:
     assert "occupancy reads as its mean over 1 frame" in notes
 
 
+@pytest.mark.parametrize("name", shipped.SHIPPED)
 def test_evaluate_drives_it_and_names_everything_that_could_drive(
-    cli: Cli, tmp_path: Path
+    cli: Cli, tmp_path: Path, name: str
 ) -> None:
     save_routes((EXIT,), tmp_path / "routes.json")
 
-    found = cli.document("evaluate highway --routes routes.json -o results")
+    found = cli.document(f"evaluate {name} --routes routes.json -o results")
     assert found["routes"]["driven"] == 1
     said = cli.refused("evaluate nobody -o others")
-    could = "models that ship: highway; policies: expert, blind"
+    could = "models that ship: highway, highway-2; policies: expert, blind"
     assert f"nobody: no such file; {could}" in said
 
 
-def test_export_copies_it(cli: Cli, weights: Path) -> None:
-    cli.done("export highway -o mine.onnx")
+@pytest.mark.parametrize("name", shipped.SHIPPED)
+def test_export_copies_it(cli: Cli, weights: Path, name: str) -> None:
+    cli.done(f"export {name} -o mine.onnx")
 
     mine = (cli.folder / "mine.onnx").read_bytes()
-    assert mine == (weights / "highway.onnx").read_bytes()
+    assert mine == (weights / f"{name}.onnx").read_bytes()
 
 
 @pytest.mark.parametrize("line", ["inspect highway", "evaluate highway -o results"])

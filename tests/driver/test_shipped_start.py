@@ -17,17 +17,21 @@ from driver.network.stack import Highway
 from driver.process import StageTask, Training, TrainingProcess
 from driver.process_group import ProcessGroup
 from me2e_compress.errors import TrainingError
-from me2e_compress.zoo.shipped import checkpoint, shipped
+from me2e_compress.zoo.shipped import SHIPPED, checkpoint, shipped
 from tests.driver.made import LITTLE, arrays_of, write
 
+TRAINED = Path(__file__).parents[2] / "benchmarks/road_2/training"
+LAST = TRAINED / "seed-0/round-2/training-1/last.pt"
 ONE_STEP = Training(
     steps=1, batch=1, workers=1, check_count=1, sequences=Sequences(length=2)
 )
 
 
-def test_its_weights_are_those_of_the_onnx_file() -> None:
-    graph = onnx.load(shipped("highway")).graph
-    mean = load(checkpoint("highway"), HighwayConfig()).state_dict()
+@pytest.mark.parametrize("name", SHIPPED)
+def test_its_weights_are_those_of_the_onnx_file(name: str) -> None:
+    graph = onnx.load(shipped(name)).graph
+    start = LAST if name == "highway-2" else checkpoint(name)
+    mean = load(start, HighwayConfig()).state_dict()
     other = [
         tensor.name
         for tensor in graph.initializer

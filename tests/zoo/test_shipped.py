@@ -10,6 +10,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import GraphError
 from me2e_compress.zoo import shipped as room
 from me2e_compress.zoo.shipped import (
+    SHIPPED,
     card,
     checkpoint,
     copy,
@@ -156,13 +157,26 @@ def test_the_card_says_where_its_training_is_told() -> None:
     assert len(stages) == 8
 
 
+def test_the_second_card_says_what_trained_it() -> None:
+    root = Path(__file__).parents[2]
+    command, page = card("highway-2").command.split(": ")
+    kept = root / Path(page).parent / "seed-0/course.json"
+
+    assert command.replace("--seed 0", "--seed N") in (root / page).read_text("utf-8")
+    seeds = [each["seed"] for each in json.loads(kept.read_text())["rounds"]]
+    assert [*card("highway-2").data.seeds] == seeds
+
+
 def test_a_card_without_a_checkpoint_says_so(weights: Path) -> None:
     with pytest.raises(GraphError, match="highway: its card names no checkpoint"):
         checkpoint("highway")
 
 
-def test_a_copy_of_the_driver_has_frames_to_verify_it_on(tmp_path: Path) -> None:
-    copied = copy("highway", tmp_path / "mine.onnx")
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_copy_of_the_driver_has_frames_to_verify_it_on(
+    tmp_path: Path, name: str
+) -> None:
+    copied = copy(name, tmp_path / "mine.onnx")
     other = tmp_path / "other.onnx"
     other.write_bytes(copied.read_bytes()[:-1] + b"?")
 

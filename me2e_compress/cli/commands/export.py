@@ -44,7 +44,10 @@ Ema = Annotated[
 
 def export(
     stack: Annotated[
-        str, typer.Argument(help="vad-tiny, uniad-tiny, uniad-trt, tcp or highway")
+        str,
+        typer.Argument(
+            help="vad-tiny, uniad-tiny, uniad-trt, tcp, highway or highway-2"
+        ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="the ONNX file")],
     opset: Opset = workflow.OPSET,

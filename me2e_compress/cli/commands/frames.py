@@ -28,7 +28,8 @@ def frames(
     stack: Annotated[
         str,
         typer.Argument(
-            help="vad-tiny, uniad-tiny, uniad-trt, tcp, highway, M.onnx or STACK.toml"
+            help="vad-tiny, uniad-tiny, uniad-trt, tcp, highway, highway-2, M.onnx or"
+            " STACK.toml"
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="the folder")],
