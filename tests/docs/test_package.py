@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from me2e_compress.zoo.shipped import SHIPPED
 from tests.docs.pages import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-MOST_BYTES = 10_000_000
-"""Of the wheel."""
+MOST_BYTES = 15_000_000
+"""Of the wheel: two drivers of 6.7 MB are most of it."""
 
 
 def test_the_page_of_the_index_needs_no_checkout() -> None:
@@ -31,7 +32,8 @@ def test_the_project_says_who_and_for_whom() -> None:
 @pytest.mark.xdist_group("installed")
 def test_the_wheel_is_small_and_leaves_the_checkpoint_out(site: Path) -> None:
     weights = {file.name for file in (site / "me2e_compress/zoo/weights").iterdir()}
-    assert weights == {"highway.json", "highway.onnx", "highway-frames"}
+    forms = (".json", ".onnx", "-frames")
+    assert weights == {f"{name}{form}" for name in SHIPPED for form in forms}
     (wheel,) = site.parent.glob("wheels[0-9]*/me2e_compress-*.whl")
     assert wheel.stat().st_size < MOST_BYTES
 
