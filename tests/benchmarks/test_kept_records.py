@@ -66,6 +66,12 @@ def rounded(found: Estimate) -> Iterator[Triple]:
         yield round(-value, 1), round(-high, 1), round(-low, 1)
 
 
+def only(path: Path) -> KeptDrive:
+    """The one drive of a file."""
+    (drive,) = drives_of([path]).values()
+    return KeptDrive({name: (own.score, own.success) for name, own in drive.items()})
+
+
 def compared(drives: dict[str, KeptDrive]) -> Iterator[KeptDrive]:
     """Every drive, and it minus the first scheme, minus the first condition."""
     first, _, free = next(iter(drives)).partition(".")
@@ -96,8 +102,13 @@ def asked() -> Iterator[KeptDrive]:
     blocks = (RECORDS / "road_2" / "study" / name for name in ("ideal", "int8"))
     float_, full = (kept_drives(block / "routes.csv") for block in blocks)
     yield full["full.ideal"] - float_["float.ideal"]
-    # drivers trained there, and the one that ships
+    # drivers trained there, beside the one of the first road, on both
     yield from compared(kept_drives(TRIAL))
+    road_2 = RECORDS / "road_2"
+    trained = only(road_2 / "trained" / "four" / "routes.csv")
+    yield trained - only(road_2 / "study" / "four" / "routes.csv")
+    first = only(road_2 / "trained_on_first" / "four" / "routes.csv")
+    yield first - only(RECORDS / "paper" / "float.fps-4.jsonl")
 
 
 @cache
@@ -112,7 +123,7 @@ def known() -> frozenset[Triple]:
     for drive in asked():
         found.update(rounded(drive.mean()))
     # both roads: driving score, success and room kept
-    roads = [*(RECORDS / "road_2" / "study").glob("*/routes.csv"), TRIAL]
+    roads = [*(RECORDS / "road_2").glob("*/*/routes.csv"), TRIAL]
     roads += [RECORDS / "paper" / f"float.{name}.jsonl" for name in ("ideal", "fps-4")]
     for own in (each for path in roads for each in drives_of([path]).values()):
         for mean in means_of(own).values():
