@@ -35,6 +35,7 @@ class ShippedDriver(Driver):
         return self.resolved().fingerprint()
 
 
+@dataclass(frozen=True)
 class SecondRoadDriver(ShippedDriver):
     """The driver that comes with the package and was trained on the second road."""
 
