@@ -105,8 +105,9 @@ def asked() -> Iterator[KeptDrive]:
     # drivers trained there, beside the one of the first road, on both
     yield from compared(kept_drives(TRIAL))
     road_2 = RECORDS / "road_2"
-    trained = only(road_2 / "trained" / "four" / "routes.csv")
-    yield trained - only(road_2 / "study" / "four" / "routes.csv")
+    parts = kept_drives(road_2 / "trained" / "four-occ-motion" / "routes.csv")
+    yield parts["trained.four"] - only(road_2 / "study" / "four" / "routes.csv")
+    yield from compared(parts)
     first = only(road_2 / "trained_on_first" / "four" / "routes.csv")
     yield first - only(RECORDS / "paper" / "float.fps-4.jsonl")
 
