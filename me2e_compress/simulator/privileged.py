@@ -80,9 +80,8 @@ def _way(car: Car) -> Floats:
     pieces = [np.array([[car.pose.x, car.pose.y]])]
     skip, found = car.lane_s + car.speed * 0.5 + 1.0, 0.0
     for index in car.lanes[car.leg :]:
-        centre = car.network.centre(index)
+        stations, centre = car.network.samples(index)
         length = car.network.length(index)
-        stations = np.linspace(0.0, length, len(centre))
         ahead = centre[stations > skip]
         if car.offset_m and len(ahead) > 1:
             ahead = ahead + car.offset_m * _normals(ahead)

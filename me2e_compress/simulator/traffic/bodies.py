@@ -170,7 +170,7 @@ class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
     def rest(self) -> Floats:
         """Return [M, 2], the rest of its line from its position on."""
         ahead = self.line[self._arc > self.walked_m]
-        return np.vstack([flip(*self.position), ahead])
+        return np.concatenate([flip(*self.position)[None], ahead])
 
 
 class StaticObject(Obstacle):  # type: ignore[misc]  # highway-env is untyped

@@ -99,7 +99,7 @@ class Network:
         """Lanes inside junctions; those of a lower rank have priority."""
         self.closed: list[LaneIndex] = []
         """Lanes that end, or begin, in the middle of a road."""
-        self._centres: dict[LaneIndex, Floats] = {}
+        self._sampled: dict[LaneIndex, tuple[Floats, Floats]] = {}
 
     def straight(
         self, start: str, end: str, pose: Pose, length_m: float, section: Section
@@ -182,15 +182,18 @@ class Network:
 
     def centre(self, index: LaneIndex) -> Floats:
         """Return the [N, 2] centre line, at most `CHORD_M` apart, cached."""
-        if index not in self._centres:
-            self._centres[index] = self._sampled(index)
-        return self._centres[index]
+        return self.samples(index)[1]
 
-    def _sampled(self, index: LaneIndex) -> Floats:
-        length = self.length(index)
-        stations = np.linspace(0.0, length, max(2, math.ceil(length / CHORD_M) + 1))
-        poses = [self.pose(index, float(s)) for s in stations]
-        return np.array([(pose.x, pose.y) for pose in poses])
+    def samples(self, index: LaneIndex) -> tuple[Floats, Floats]:
+        """Return the [N] arc lengths of the centre line's points, and these."""
+        if index not in self._sampled:
+            length = self.length(index)
+            count = max(2, math.ceil(length / CHORD_M) + 1)
+            stations = np.linspace(0.0, length, count)
+            poses = [self.pose(index, float(s)) for s in stations]
+            line = np.array([(pose.x, pose.y) for pose in poses])
+            self._sampled[index] = stations, line
+        return self._sampled[index]
 
     def roadmap(
         self,

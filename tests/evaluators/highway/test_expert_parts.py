@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from me2e_compress.evaluators.highway.expert.forecast import NOW_S, Forecast, forecast
+from me2e_compress.evaluators.highway.expert.future_costs import BESIDE_M, headway_cost
+from me2e_compress.evaluators.highway.expert.futures import sample
 from me2e_compress.evaluators.highway.expert.lateral_targets import (
+    Options,
     Place,
     blocked_stretch,
     lateral_targets,
@@ -47,6 +50,16 @@ def test_an_intent_is_followed_around_the_corner() -> None:
     assert seen.yields[0]
 
 
+def test_a_heading_passes_half_a_turn_the_short_way() -> None:
+    turned = np.array([3.0, 3.1, 3.2, 3.3])
+    steps = 10.0 * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+    line = np.array([60.0, 0.0]) + np.cumsum(np.vstack([[0.0, 0.0], steps]), axis=0)
+    intent = Intent(1, line, 8.0, 0.0, True)
+    seen = look(straight(), actor(60.0, 0.0, 8.0, 3.0), intents=(intent,))
+    assert seen.heading[0].min() >= 3.0 - 1e-9
+    assert seen.heading[0].max() <= 3.3 + 1e-9
+
+
 def test_a_braking_actor_stops_and_stays() -> None:
     line = np.array([[20.0, 0.0], [90.0, 0.0]])
     intent = Intent(1, line, 0.0, -4.0, True)
@@ -81,6 +94,18 @@ def test_the_ceiling_is_low_in_the_bend_and_reached_by_easy_braking() -> None:
     assert top[75] == pytest.approx(math.sqrt(LATERAL_MPS2 * 20.0), rel=0.05)
     assert top[10] == 12.0
     assert (np.diff(top**2) / 2 > -1.81).all()
+
+
+@pytest.mark.parametrize("aside_m", [-0.05, 0.05])
+def test_who_is_passed_with_too_little_room_is_a_leader(aside_m: float) -> None:
+    path, ego = straight(), ego_at()
+    leader = actor(20.0, 0.0, 8.0)
+    reach_m = leader.width / 2 + ego.width / 2 + BESIDE_M
+    seen = look(path, actor(20.0, reach_m + aside_m, 8.0))
+    kept = Options(np.zeros(1), np.zeros(1, bool), False)
+    future = sample(path, ceiling(path), ego, place(), kept, None)
+    paid = headway_cost(future, seen, ego, place(), False)
+    assert (paid > 0).any() == (aside_m < 0)
 
 
 def test_neighbours_in_a_row_are_one_block() -> None:

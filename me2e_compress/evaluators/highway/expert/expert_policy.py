@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from me2e_compress.driving.contract import Observation, Plan, RouteInfo
-from me2e_compress.evaluators.highway.expert.forecast import TIMES_S, forecast
+from me2e_compress.evaluators.highway.expert.forecast import TIMES_S, forecast, near
 from me2e_compress.evaluators.highway.expert.future_costs import (
     collision_cost,
     drive_cost,
@@ -133,6 +133,6 @@ class Expert:
         memory = Memory() if self.last is None else self.last.memory
         if self.cameras_only:
             scene = seen(scene)
-        known = world.privileged([actor.id for actor in scene.actors])
+        known = world.privileged({actor.id for actor in near(scene)})
         self.last = decide(scene, known, world.path, self._top, memory)
         return self.last.waypoints

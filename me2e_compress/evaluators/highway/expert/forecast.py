@@ -1,7 +1,7 @@
 """Forecasts of all actors for the next six seconds, from their intents."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,88 +67,97 @@ ON_FOOT = (ActorKind.PEDESTRIAN, ActorKind.BICYCLE)
 FIXED = (ActorKind.PARKED, ActorKind.DOOR, ActorKind.CONE, ActorKind.BARRIER)
 
 
-def forecast(
-    scene: Scene, intents: Mapping[int, Intent], path: RoutePath, ego_s_m: float
-) -> Forecast:
-    """Roll out all actors near the ego; without intent they keep course and speed."""
+def near(scene: Scene) -> list[Actor]:
+    """Return the actors that can matter to the ego."""
     ego = scene.ego
-    # poses of the actors that can matter, [A, 4, T]
-    near = [
+    return [
         actor
         for actor in scene.actors
         if math.hypot(actor.x - ego.x, actor.y - ego.y) < REACH_M
     ]
-    rolled = [_roll_out(actor, intents.get(actor.id)) for actor in near]
-    poses = np.array(rolled).reshape(len(near), 4, len(NOW_S))
-    x, y, heading, speed = poses.transpose(1, 0, 2)
+
+
+def forecast(
+    scene: Scene, intents: Mapping[int, Intent], path: RoutePath, ego_s_m: float
+) -> Forecast:
+    """Roll out all actors near the ego; without intent they keep course and speed."""
+    actors = near(scene)
+    plans = [intents.get(actor.id) for actor in actors]
+    # speeds and distances of all, then where these take each, [A, 3, T]
+    goal = np.array([_goal(a, p) for a, p in zip(actors, plans, strict=True)])
+    speed, travel = _speeds(actors, plans, goal)
+    ways = [_moved(*each) for each in zip(actors, plans, travel, strict=True)]
+    poses = np.array(ways).reshape(len(actors), 3, len(NOW_S))
+    x, y, heading = poses.transpose(1, 0, 2)
     # their places relative to the route
     along, lateral, away = _on_route(path, x, y, heading, ego_s_m)
     return Forecast(
         *(x, y, heading, speed),
-        goal_mps=np.array([_goal(a, intents.get(a.id)) for a in near]),
-        length=np.array([actor.length for actor in near]),
-        width=np.array([actor.width for actor in near]),
-        moves=np.array([actor.kind not in FIXED for actor in near], bool),
-        yields=np.array([_yields(intents.get(actor.id)) for actor in near], bool),
-        emergency=np.array([a.kind is ActorKind.EMERGENCY for a in near], bool),
-        walks=np.array([a.kind is ActorKind.PEDESTRIAN for a in near], bool),
+        goal_mps=goal,
+        length=np.array([actor.length for actor in actors]),
+        width=np.array([actor.width for actor in actors]),
+        moves=np.array([actor.kind not in FIXED for actor in actors], bool),
+        yields=np.array([plan is not None and plan.sees_ego for plan in plans], bool),
+        emergency=np.array([a.kind is ActorKind.EMERGENCY for a in actors], bool),
+        walks=np.array([a.kind is ActorKind.PEDESTRIAN for a in actors], bool),
         along_m=along,
         lateral_m=lateral,
         away=away,
     )
 
 
-def _yields(intent: Intent | None) -> bool:
-    return intent is not None and intent.sees_ego
-
-
-def _roll_out(actor: Actor, intent: Intent | None) -> Floats:
-    """Return [4, T]: x, y, heading, speed at `NOW_S`."""
-    first = 0.0 if intent is None else intent.acceleration_mps2
-    briskest = max(first, EASY_MPS2)
-    goal = _goal(actor, intent)
-    # pedestrians and cyclists reach their speed at once
-    if actor.kind in ON_FOOT:
-        first = briskest = 4.0 if goal > actor.speed_mps else 0.0
-    speed, travel = _speeds(actor.speed_mps, goal, first, briskest)
-    # without a path an actor goes straight on
-    if intent is None or len(intent.path) < 2:
-        x = actor.x + travel * np.cos(actor.heading)
-        y = actor.y + travel * np.sin(actor.heading)
-        return np.stack([x, y, np.full_like(x, actor.heading), speed])
-    return np.vstack([_along(actor, intent.path, travel), speed])
-
-
-def _goal(actor: Actor, intent: Intent | None) -> float:
-    return actor.speed_mps if intent is None else intent.target_mps
+def _goal(actor: Actor, plan: Intent | None) -> float:
+    return actor.speed_mps if plan is None else plan.target_mps
 
 
 def _speeds(
-    now: float, goal: float, first: float, briskest: float
+    actors: Sequence[Actor], plans: Sequence[Intent | None], goal: Floats
 ) -> tuple[Floats, Floats]:
-    """Return speeds and distances at `NOW_S`: hold for 1 s, then move to the goal.
+    """Return speeds and distances at `NOW_S`, both [A, T].
 
-    ``first`` is the acceleration of the first second, ``briskest`` the strongest one
-    later: an actor that crawls behind another will not leap ahead.
+    Each holds its acceleration for 1 s, then moves to its goal, and an actor that
+    crawls behind another does not leap ahead.
     """
-    hardest = min(first, -2.0)
-    speed, travel = [now], [0.0]
+    now = np.array([actor.speed_mps for actor in actors])
+    first = np.array(
+        [0.0 if plan is None else plan.acceleration_mps2 for plan in plans]
+    )
+    briskest = np.maximum(first, EASY_MPS2)
+    # pedestrians and cyclists reach their speed at once
+    on_foot = np.array([actor.kind in ON_FOOT for actor in actors], bool)
+    at_once = np.where(goal > now, 4.0, 0.0)
+    first = np.where(on_foot, at_once, first)
+    briskest = np.where(on_foot, at_once, briskest)
+    hardest = np.minimum(first, -2.0)
+    speed, travel = [now], [np.zeros_like(now)]
     for begin, step in STEPS_S:
-        wish = min(max((goal - speed[-1]) / step, hardest), briskest)
-        rate = wish
+        wish = np.minimum(np.maximum((goal - speed[-1]) / step, hardest), briskest)
         if begin < 1.0:
-            rate = min(first, max(wish, 0.0)) if first > 0 else first
-        after = max(speed[-1] + rate * step, 0.0)
+            gentle = np.minimum(first, np.maximum(wish, 0.0))
+            wish = np.where(first > 0, gentle, first)
+        after = np.maximum(speed[-1] + wish * step, 0.0)
         travel.append(travel[-1] + (speed[-1] + after) / 2 * step)
         speed.append(after)
-    return np.array(speed), np.array(travel)
+    return np.stack(speed, axis=1), np.stack(travel, axis=1)
+
+
+def _moved(actor: Actor, plan: Intent | None, travel: Floats) -> Floats:
+    """Return [3, T] x, y and heading: on its way, or straight on without one."""
+    if plan is not None and len(plan.path) > 1:
+        return _along(actor, plan.path, travel)
+    x = actor.x + travel * np.cos(actor.heading)
+    y = actor.y + travel * np.sin(actor.heading)
+    return np.stack([x, y, np.full_like(x, actor.heading)])
 
 
 def _along(actor: Actor, line: Floats, travel: Floats) -> Floats:
     """Return [3, T] x, y and heading on a line that begins at the actor."""
     steps = line[1:] - line[:-1]
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
-    headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    headings = np.arctan2(steps[:, 1], steps[:, 0])
+    # numpy's unwrap takes as long as all the rest, and few ways pass half a turn
+    if np.any(np.abs(headings[1:] - headings[:-1]) >= np.pi):
+        headings = np.unwrap(headings)
     heading = np.interp(travel, (arc[:-1] + arc[1:]) / 2, headings)
     over = np.maximum(travel - arc[-1], 0.0)
     x = np.interp(travel, arc, line[:, 0]) + over * np.cos(heading)
@@ -166,7 +175,9 @@ def _on_route(
     points, headings = path.points[low:high], path.headings[low:high]
     # nearest point of the route, one per metre
     gap_x, gap_y = x[..., None] - points[:, 0], y[..., None] - points[:, 1]
-    nearest = np.argmin(gap_x * gap_x + gap_y * gap_y, axis=-1)
+    np.multiply(gap_x, gap_x, out=gap_x)
+    gap_x += np.multiply(gap_y, gap_y, out=gap_y)
+    nearest = np.argmin(gap_x, axis=-1)
     at, course = points[nearest], headings[nearest]
     # offsets along and across the route there
     dx, dy = x - at[..., 0], y - at[..., 1]

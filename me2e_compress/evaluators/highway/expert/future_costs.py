@@ -88,19 +88,31 @@ def _clearances(
     # squared distances from each disc, the smallest counts
     shift = reach * np.stack([np.cos(future.heading), np.sin(future.heading)])
     apart = np.full((len(x), *future.x.shape), np.inf)
-    cut = apart
+    cut = apart.copy()
     for disc in (-1.0, -1 / 3, 1 / 3, 1.0):
         dx = (future.x + disc * shift[0])[None] - x
         dy = (future.y + disc * shift[1])[None] - y
-        ahead = cos * dx + sin * dy
-        side = np.maximum(np.abs(cos * dy - sin * dx) - half_width, 0.0)
-        side *= side
-        end = np.maximum(np.abs(ahead) - half_length, 0.0)
-        way = np.maximum(np.maximum(ahead - front, -half_length - ahead), 0.0)
-        end, way = end * end + side, way * way + side
-        apart = np.minimum(apart, end)
-        cut = np.minimum(cut, way)
+        ahead, side = cos * dx, cos * dy
+        ahead += sin * dy
+        side -= sin * dx
+        side = _squared_beyond(np.abs(side, out=side), half_width)
+        # in place: these arrays are most of what a decision takes
+        way = np.maximum(ahead - front, -half_length - ahead)
+        way = _squared_beyond(way, 0.0)
+        end = _squared_beyond(np.abs(ahead, out=ahead), half_length)
+        end += side
+        way += side
+        np.minimum(apart, end, out=apart)
+        np.minimum(cut, way, out=cut)
     return np.sqrt(apart) - radius, np.sqrt(cut) - radius
+
+
+def _squared_beyond(away: Floats, half: Floats | float) -> Floats:
+    """Return the squares of what exceeds a half extent, in place."""
+    away -= half
+    np.maximum(away, 0.0, out=away)
+    away *= away
+    return away
 
 
 OFF_ROAD, RUN_LINE, WRONG_SIDE, HEADWAY = 120.0, 500.0, 1.5, 24.0
@@ -159,20 +171,30 @@ def headway_cost(
 
     On a passable road a slow leader is followed with room to swing out.
     """
-    # leaders: actors ahead in the ego's way
-    along, lateral = seen.along_m[:, None, 1:], seen.lateral_m[:, None, 1:]
+    # leaders: actors ahead in the ego's way, among those that can be
+    room = seen.half_breadth[:, 1:] + ego.width / 2 + BESIDE_M
+    may = _may_lead(future, seen, room) & ~followers(seen, ego, place)
+    along, lateral = (part[may, None, 1:] for part in (seen.along_m, seen.lateral_m))
     ahead = along - future.along_m[None]
-    room = seen.half_breadth[:, None, 1:] + ego.width / 2 + BESIDE_M
-    leads = (np.abs(lateral - future.lateral_m[None]) < room) & (ahead > 0)
-    leads &= (~followers(seen, ego, place))[:, None, None]
-    gap = ahead - seen.half_span[:, None, 1:] - ego.length / 2
+    leads = np.abs(lateral - future.lateral_m[None]) < room[may, None]
+    leads &= ahead > 0
+    gap = ahead - seen.half_span[may, None, 1:] - ego.length / 2
     # the gap that is missing, of the worst leader
-    slow = (np.max(seen.speed_mps, axis=1) < SLOW_MPS)[:, None, None]
+    slow = (np.max(seen.speed_mps[may], axis=1) < SLOW_MPS)[:, None, None]
     standing = np.where(slow & passable, SWING_OUT_M, STANDOFF_M)
     wanted = standing + GAP_S * future.speed_mps[None]
     short = np.where(leads, np.clip((wanted - gap) / wanted, 0.0, 1.2), 0.0)
     closest = np.max(short, axis=0, initial=0.0)
     return np.asarray(HEADWAY * np.mean(closest, axis=1))
+
+
+def _may_lead(future: SampledFutures, seen: Forecast, room: Floats) -> Flags:
+    """Return [A] whether an actor is ever ahead of, and as far aside as, a future."""
+    lateral = seen.lateral_m[:, 1:]
+    inside = lateral + room > np.min(future.lateral_m)
+    inside &= lateral - room < np.max(future.lateral_m)
+    inside &= seen.along_m[:, 1:] > np.min(future.along_m)
+    return np.asarray(inside.any(axis=1))
 
 
 def emergency_cost(

@@ -1,5 +1,6 @@
 """Sampled futures of the ego: accelerations times lateral targets."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,11 @@ from me2e_compress.simulator.scene import Ego
 from me2e_compress.simulator.traffic.bodies import ACCELERATION_LAG_S
 
 ACCELERATIONS_MPS2 = (-7.5, -5.5, -4.0, -2.8, -1.8, -1.0, -0.4, 0.0, 0.6, 1.2, 2.0)
+STEPS = tuple(
+    (step, math.exp(-step / ACCELERATION_LAG_S))
+    for step in np.diff(TIMES_S, prepend=0.0).tolist()
+)
+"""Seconds of every step, and what is left of a missing acceleration after it."""
 HARDEST_EASE_MPS2 = 3.0
 """Strongest braking for the speed ceiling."""
 CHANGE_S = 2.6
@@ -85,13 +91,12 @@ def _speeds(top: Floats, place: Place, rates: Floats) -> tuple[Floats, Floats]:
     speed = np.full_like(rates, place.speed_mps)
     alongs, speeds = [], []
     missing = place.acceleration_mps2 - rates
-    for step in np.diff(TIMES_S, prepend=0.0):
-        left = np.exp(-step / ACCELERATION_LAG_S)
+    for step, left in STEPS:
         mean = rates + missing * (1 - left) * ACCELERATION_LAG_S / step
         missing = missing * left
         limit = top[np.minimum(along.astype(np.int64), len(top) - 1)]
         allowed = np.maximum(limit, speed - HARDEST_EASE_MPS2 * step)
-        after = np.clip(speed + mean * step, 0.0, allowed)
+        after = np.minimum(np.maximum(speed + mean * step, 0.0), allowed)
         along = along + (speed + after) / 2 * step
         speed = after
         alongs.append(along)
