@@ -5,13 +5,15 @@
     python -m benchmarks.bench_paper                 # writes the page of what is kept
 
 Nothing is driven. What is kept, ``benchmarks/paper/``, is a line a route, and the
-latencies that were charged (``traces/``).
+latencies that were charged (``traces/``). With ``--road 2`` it is
+``benchmarks/road_2/paper/``, of the study ``benchmarks/road_2/paper.toml``.
 """
 
 import argparse
 import shutil
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 from me2e_compress.errors import Me2eError
@@ -24,8 +26,7 @@ from me2e_compress.study.paper.questions import SHIPPED
 from me2e_compress.study.workspace import Workspace
 
 ROOT = Path(__file__).parents[1]
-KEPT, PAGE = ROOT / "benchmarks" / "paper", ROOT / "docs" / "paper.md"
-TRACES = KEPT / "traces"
+TRACES = "traces"
 HEAD = """\
 # The paper, re-tested
 
@@ -44,7 +45,56 @@ Energy is measured where the machine has a counter; what is modelled from MACs a
     done
 
 """  # noqa: E501 - a paragraph of the page is one line
+HEAD_2 = """\
+# The paper, re-tested on the second road
+
+    me2e-compress study benchmarks/road_2/paper.toml -o paper-2 --workers 2
+
+asks the [same questions](../me2e_compress/study/paper/questions.toml) of `highway-2` on the 220 routes of [the second road](closed-loop.md#the-second-road), where others come and go without minding it: how a finding is put, tested and read is told in [paper.md](paper.md).
+
+"""  # noqa: E501 - a paragraph of the page is one line
 NOTHING = "Not driven yet. Its answers will stand here.\n"
+
+
+@dataclass(frozen=True)
+class Page:
+    """The page of a study with the paper's questions, and the drives kept for it."""
+
+    study: str
+    kept: Path
+    path: Path
+    head: str
+    command: str
+
+    def text(self, asked_at: str, records: Path | None = None) -> str:
+        """Write the page of a folder of finished drives; of none it says so.
+
+        ``asked_at`` is when the questions were committed; empty if nobody knows.
+
+        Raises:
+            StudyError: A file cannot be read.
+        """
+        records = records or self.kept
+        if not (records / FILE).is_file():
+            return self.head + NOTHING
+        found = read_paper(load_study(self.study), records)
+        verdicts = [each.verdict for each in found.findings]
+        counts = ", ".join(
+            f"{verdicts.count(each)} {each.value}"
+            for each in Verdict
+            if each in verdicts
+        )
+        since = f"committed {asked_at}" if asked_at else "not committed"
+        kept = self.kept.relative_to(ROOT)
+        answer = (
+            f"Of its {len(verdicts)} findings {counts}. {found.headline}; driven on"
+            f" {found.machine}; questions {since}. All of this is written by"
+            f" `{self.command}` from [every route](../{kept}), and"
+            f" `study {self.study} --records {kept} -o OUT` draws the figures.\n\n"
+        )
+        return (
+            self.head + answer + "\n".join(each.markdown() for each in found.tables())
+        )
 
 
 def committed(path: Path) -> str:
@@ -56,46 +106,39 @@ def committed(path: Path) -> str:
         return ""
     return found.stdout.strip()
 
-
-def page(records: Path, asked_at: str) -> str:
-    """Write the page of a folder of finished drives; of none it says so.
-
-    ``asked_at`` is when the questions were committed; empty if nobody knows.
-
-    Raises:
-        StudyError: A file cannot be read.
-    """
-    if not (records / FILE).is_file():
-        return HEAD + NOTHING
-    found = read_paper(load_study("paper"), records)
-    verdicts = [each.verdict for each in found.findings]
-    counts = ", ".join(
-        f"{verdicts.count(each)} {each.value}" for each in Verdict if each in verdicts
-    )
-    since = f"committed {asked_at}" if asked_at else "not committed"
-    answer = (
-        f"Of its {len(verdicts)} findings {counts}. {found.headline}; driven on"
-        f" {found.machine}; questions {since}. All of this is written by `python -m"
-        " benchmarks.bench_paper` from [every route](../benchmarks/paper), and `study"
-        " paper --records benchmarks/paper -o OUT` draws the figures.\n\n"
-    )
-    return HEAD + answer + "\n".join(each.markdown() for each in found.tables())
+    def keep(self, records: Path) -> None:
+        """Copy the finished drives, and the latencies of their models."""
+        (self.kept / TRACES).mkdir(parents=True, exist_ok=True)
+        study = load_study(self.study)
+        asked = {
+            f"{Workspace.drive(variant, each)}.jsonl"
+            for each in study.conditions
+            for variant in study.driven_under(each)
+        }
+        for path in sorted(records.iterdir()):
+            if path.suffix in (".json", ".toml") or path.name in asked:
+                shutil.copyfile(path, self.kept / path.name)
+        for path in sorted((records.parent / TRACES).glob("*.json")):
+            shutil.copyfile(path, self.kept / TRACES / path.name)
 
 
-def keep(records: Path) -> None:
-    """Copy the paper's finished drives, and the latencies of its models."""
-    TRACES.mkdir(parents=True, exist_ok=True)
-    study = load_study("paper")
-    asked = {
-        f"{Workspace.drive(variant, each)}.jsonl"
-        for each in study.conditions
-        for variant in study.driven_under(each)
-    }
-    for path in sorted(records.iterdir()):
-        if path.suffix in (".json", ".toml") or path.name in asked:
-            shutil.copyfile(path, KEPT / path.name)
-    for path in sorted((records.parent / TRACES.name).glob("*.json")):
-        shutil.copyfile(path, TRACES / path.name)
+PAGES = {
+    1: Page(
+        "paper",
+        ROOT / "benchmarks" / "paper",
+        ROOT / "docs" / "paper.md",
+        HEAD,
+        "python -m benchmarks.bench_paper",
+    ),
+    2: Page(
+        "benchmarks/road_2/paper.toml",
+        ROOT / "benchmarks" / "road_2" / "paper",
+        ROOT / "docs" / "paper-2.md",
+        HEAD_2,
+        "python -m benchmarks.bench_paper --road 2",
+    ),
+}
+"""By road."""
 
 
 def main() -> None:
@@ -103,12 +146,14 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("records", type=Path, nargs="?", help="of a run: OUT/records")
+    parser.add_argument("--road", type=int, default=1, choices=PAGES)
     given = parser.parse_args()
+    page = PAGES[given.road]
     try:
         if given.records is not None:
-            page(given.records, "")  # what cannot be read is not kept
-            keep(given.records)
-        write_bytes(PAGE, page(KEPT, committed(SHIPPED)).encode())
+            page.text("", given.records)  # what cannot be read is not kept
+            page.keep(given.records)
+        write_bytes(page.path, page.text(committed(SHIPPED)).encode())
     except Me2eError as error:
         sys.exit(f"bench_paper: {error}")
 

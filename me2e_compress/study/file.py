@@ -48,7 +48,8 @@ def load_study(
     """Read a study.
 
     Files are looked up next to the study's own file; a policy that is not a file there
-    is a shipped model. Nothing that it names is run here.
+    is a shipped model. Nothing that it names is run here. With ``like = "paper"`` it is
+    the shipped study of that name, but for the keys of the file.
 
     Args:
         path: The TOML file, or the name of a shipped study.
@@ -68,22 +69,22 @@ def load_study(
         ProviderError: A provider or library is missing.
     """
     path = study_path(path)
-    # read the file and check its form
-    try:
-        content = documents.from_toml(documents.content(path))
-    except FileNotFoundError as error:
-        ours = ", ".join(sorted(each.stem for each in STUDIES.glob("*.toml")))
-        raise StudyError(f"no study {path}: no such file; we ship {ours}") from error
-    except OSError as error:
-        raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
-    except documents.MalformedError as error:
-        raise StudyError(f"{path}: not TOML: {error}") from error
+    # read the file, over the study that it is like, and check its form
+    content = _content(path)
+    if "like" in content:
+        content = _content(_shipped(content.pop("like"), path)) | content
     try:
         # JSON has tables and lists for dataclasses and tuples, but no dates
         text = json.dumps(content, default=lambda date: {"date": str(date)})
         table = _Study.model_validate_json(text)
     except ValidationError as error:
         raise StudyError(f"{path}: {_complaint(error)}") from error
+    for each in table.variant:
+        each.policy = each.policy or table.policy
+        if not each.policy:
+            raise StudyError(
+                f"{path}: variant {each.name}: neither it nor the study names a policy"
+            )
     # options of the caller take precedence
     if provider is not None:
         table.provider = provider
@@ -99,13 +100,37 @@ def load_study(
     return study
 
 
+def _content(path: Path) -> dict[str, object]:
+    """Return the tables of a file."""
+    try:
+        return documents.from_toml(documents.content(path))
+    except FileNotFoundError as error:
+        raise StudyError(f"no study {path}: no such file; we ship {_ours()}") from error
+    except OSError as error:
+        raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
+    except documents.MalformedError as error:
+        raise StudyError(f"{path}: not TOML: {error}") from error
+
+
+def _shipped(name: object, path: Path) -> Path:
+    """Return the file of the shipped study that another's ``like`` names."""
+    found = STUDIES / f"{name}.toml"
+    if not isinstance(name, str) or Path(name).name != name or not found.is_file():
+        raise StudyError(f"{path}: like {name}: no such study; we ship {_ours()}")
+    return found
+
+
+def _ours() -> str:
+    return ", ".join(sorted(each.stem for each in STUDIES.glob("*.toml")))
+
+
 class _Table(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid")
 
 
 class _Variant(_Table):
     name: str
-    policy: str
+    policy: str = ""
     recipe: str | None = None
     passes: str | None = None
     map: str | None = None
@@ -122,6 +147,8 @@ class _Pair(_Table):
 class _Study(_Table):
     title: str
     baseline: str
+    policy: str = ""
+    """Of the variants that name none."""
     evaluator: str = HIGHWAY
     routes: str | int | None = None
     road: int | None = None

@@ -27,6 +27,9 @@ FRAME_S, DECISION_S = 0.0024, 0.021
 """CPU seconds of a frame of the world, and of a decision: six pictures and one
 inference of the driver that ships on one core of a Xeon (two routes, at every frame
 and at every eighth)."""
+SECOND_ROAD_LONGER = 1.5
+"""Frames of a route there, by those of its type on the first road (608 and 411 with
+the expert; `benchmarks/bench_closed_loop.py`, parts slow-2 and slow)."""
 ENOUGH = 20
 """Fewest logged routes from which the machine's speed is fitted."""
 
@@ -115,7 +118,7 @@ def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
         for variant in study.driven_under(condition):
             # frames and decisions of the missing routes
             left = _left(study, place, variant, condition)
-            driven_s = sum(EXPERT_S[route.scenario] for route in left)
+            driven_s = sum(map(_expected_s, left))
             frames = 1e6 * driven_s / condition.settings.dt_us
             hours = frames * (frame_s + decision_s / period) / 3600 / workers
             total = len(study.routes)
@@ -137,6 +140,11 @@ def _left(
     return [
         route for route in study.routes if not (folder / f"{route.id}.json").is_file()
     ]
+
+
+def _expected_s(route: Route) -> float:
+    longer = SECOND_ROAD_LONGER if route.road == 2 else 1.0
+    return EXPERT_S[route.scenario] * longer
 
 
 def held_frames(study: Study, condition: Condition) -> int:

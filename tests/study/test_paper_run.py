@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.errors import StudyError
+from me2e_compress.simulator.routes import SETS, load_routes
 from me2e_compress.study import Condition, Listener, Study, StudyResult, Timing, Variant
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.paper.accident import Accident, plans_before
@@ -160,6 +161,18 @@ def test_a_dry_run_counts_what_is_left(driven: Path, tmp_path: Path) -> None:
     assert ahead.headline.startswith("Asked again: 4 drives, 8 routes, 0 of them driv")
     assert ahead.drives[0].hours > ahead.drives[-1].hours > 0.0
     assert [each.done for each in after.drives] == [2, 2, 0, 2]
+
+
+def test_a_route_of_the_second_road_is_expected_to_take_longer(tmp_path: Path) -> None:
+    there = load_routes(SETS[2])[:2]
+    here = tuple(replace(each, road=1) for each in there)
+
+    hours = [
+        workload(replace(ASKED, routes=routes), tmp_path).hours
+        for routes in (here, there)
+    ]
+
+    assert hours[1] == pytest.approx(1.5 * hours[0])
 
 
 def test_what_a_block_or_a_recording_cannot_be() -> None:
