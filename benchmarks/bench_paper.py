@@ -96,16 +96,6 @@ class Page:
             self.head + answer + "\n".join(each.markdown() for each in found.tables())
         )
 
-
-def committed(path: Path) -> str:
-    """Return when a file was last committed; empty where git does not know it."""
-    command = ("git", "log", "-1", "--format=%cI", "--", path)
-    try:
-        found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    except OSError:
-        return ""
-    return found.stdout.strip()
-
     def keep(self, records: Path) -> None:
         """Copy the finished drives, and the latencies of their models."""
         (self.kept / TRACES).mkdir(parents=True, exist_ok=True)
@@ -120,6 +110,16 @@ def committed(path: Path) -> str:
                 shutil.copyfile(path, self.kept / path.name)
         for path in sorted((records.parent / TRACES).glob("*.json")):
             shutil.copyfile(path, self.kept / TRACES / path.name)
+
+
+def committed(path: Path) -> str:
+    """Return when a file was last committed; empty where git does not know it."""
+    command = ("git", "log", "-1", "--format=%cI", "--", path)
+    try:
+        found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    except OSError:
+        return ""
+    return found.stdout.strip()
 
 
 PAGES = {

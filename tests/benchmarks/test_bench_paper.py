@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -34,3 +35,16 @@ def test_the_page_of_finished_drives(tmp_path: Path) -> None:
 
 def test_the_page_before_anything_was_driven(tmp_path: Path) -> None:
     assert PAGES[1].text("", tmp_path).endswith(NOTHING)
+
+
+def test_drives_that_are_kept_make_the_same_tables(tmp_path: Path) -> None:
+    records, kept = tmp_path / "run" / "records", tmp_path / "kept"
+    write_records(load_study("paper", "5").of_blocks(["6"]), records)
+    text = PAGES[1].text("", records)
+    names = {path.name for path in records.iterdir()}
+    (records / "of.another-study.jsonl").touch()
+
+    replace(PAGES[1], kept=kept).keep(records)
+
+    assert {path.name for path in kept.iterdir()} == {*names, "traces"}
+    assert PAGES[1].text("", kept) == text
