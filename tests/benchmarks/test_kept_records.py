@@ -105,11 +105,21 @@ def asked() -> Iterator[KeptDrive]:
     # drivers trained there, beside the one of the first road, on both
     yield from compared(kept_drives(TRIAL))
     road_2 = RECORDS / "road_2"
-    parts = kept_drives(road_2 / "trained" / "four-occ-motion" / "routes.csv")
-    yield parts["trained.four"] - only(road_2 / "study" / "four" / "routes.csv")
+    four = only(road_2 / "study" / "four" / "routes.csv")
+    on_first = only(RECORDS / "paper" / "float.fps-4.jsonl")
+    parts = kept_drives(road_2 / "seed_0" / "four-occ-motion" / "routes.csv")
     yield from compared(parts)
-    first = only(road_2 / "trained_on_first" / "four" / "routes.csv")
-    yield first - only(RECORDS / "paper" / "float.fps-4.jsonl")
+    shipped = kept_drives(road_2 / "trained" / "four" / "routes.csv")
+    for drives in (parts, shipped):
+        yield drives["trained.four"] - four
+    yield shipped["trained.four"] - parts["trained.four"]
+    firsts = [
+        only(road_2 / name / "four" / "routes.csv")
+        for name in ("seed_0_on_first", "trained_on_first")
+    ]
+    for first in firsts:
+        yield first - on_first
+    yield firsts[1] - firsts[0]
 
 
 @cache

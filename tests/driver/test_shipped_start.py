@@ -21,7 +21,7 @@ from me2e_compress.zoo.shipped import SHIPPED, checkpoint, shipped
 from tests.driver.made import LITTLE, arrays_of, write
 
 TRAINED = Path(__file__).parents[2] / "benchmarks/road_2/training"
-LAST = TRAINED / "seed-0/round-2/training-1/last.pt"
+LAST = TRAINED / "seed-1/round-2/training-1/last.pt"
 ONE_STEP = Training(
     steps=1, batch=1, workers=1, check_count=1, sequences=Sequences(length=2)
 )
