@@ -113,6 +113,8 @@ def asked() -> Iterator[KeptDrive]:
     for drives in (parts, shipped):
         yield drives["trained.four"] - four
     yield shipped["trained.four"] - parts["trained.four"]
+    away = kept_drives(road_2 / "trained" / "occ" / "routes.csv")
+    yield shipped["trained.four"] - away["minus-occ.four"]
     firsts = [
         only(road_2 / name / "four" / "routes.csv")
         for name in ("seed_0_on_first", "trained_on_first")
