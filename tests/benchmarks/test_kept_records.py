@@ -112,6 +112,7 @@ def asked() -> Iterator[KeptDrive]:
     shipped = kept_drives(road_2 / "trained" / "four" / "routes.csv")
     for drives in (parts, shipped):
         yield drives["trained.four"] - four
+    yield only(road_2 / "paper" / "float.ideal.jsonl") - float_["float.ideal"]
     yield shipped["trained.four"] - parts["trained.four"]
     away = kept_drives(road_2 / "trained" / "occ" / "routes.csv")
     yield shipped["trained.four"] - away["minus-occ.four"]
@@ -138,6 +139,7 @@ def known() -> frozenset[Triple]:
     # both roads: driving score, success and room kept
     roads = [*(RECORDS / "road_2").glob("*/*/routes.csv"), TRIAL]
     roads += [RECORDS / "paper" / f"float.{name}.jsonl" for name in ("ideal", "fps-4")]
+    roads.append(RECORDS / "road_2" / "paper" / "float.ideal.jsonl")
     for own in (each for path in roads for each in drives_of([path]).values()):
         for mean in means_of(own).values():
             found.update(rounded(mean))
