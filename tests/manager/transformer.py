@@ -42,9 +42,8 @@ _LAYER = """
 def transformer(layers: int = 2, seed: int = 0) -> ir.Model:
     """Layer norms, attention of 64 tokens in two heads, ReLU layers; random weights."""
     draws, c = np.random.default_rng(seed), WIDTH
-    shapes: dict[str, tuple[int, ...]] = {
-        name: (c, c) for name in ("wq", "wk", "wv", "wo")
-    }
+    shapes: dict[str, tuple[int, ...]]
+    shapes = {name: (c, c) for name in ("wq", "wk", "wv", "wo")}
     shapes |= {"wu": (c, 4 * c), "wd": (4 * c, c), "g": (c,), "b": (c,), "bu": (4 * c,)}
     weights = {
         f"{name}{i}": draws.normal(name == "g", shape[0] ** -0.5, shape).astype("f")

@@ -229,3 +229,14 @@ def test_memory_is_kept_and_what_lies_behind_the_limit_is_not_estimated(
     assert told["/head/Linear"].noise is not None
     assert told["/backbone/stem"].noise is None
     assert "held already" in told["/backbone/stem"].reason
+
+
+def test_what_a_fused_operator_samples_has_the_grid_in_front_of_its_reshapes() -> None:
+    text = """<ir_version: 9, opset_import: ["" : 17]>
+    net (float[4,6] x) => (float[2,12] y) <int64[2] s = {6, 4}, int64[2] t = {2, 12}> {
+        ["/head/a"] a = Reshape(x, s)
+        ["/head/b"] y = Reshape(a, t)
+    }"""
+    grid = np.float32(0.5), 128
+    (value,) = net(text, {}).graph.outputs
+    assert error_sources._grid(value, {"x": grid}) == grid
