@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import islice
 
 import numpy as np
 import onnx_ir as ir
@@ -30,15 +31,12 @@ def first_difference_of_engine(
 ) -> FirstDifference:
     """Find where what an engine computed begins to differ from its graph.
 
-    Every dumped tensor of the graph is held against it, intermediate ones too; the
-    graph is fed as the engine was, with the faults of the host that are known.
+    Every dumped tensor of the graph is held against it, intermediate ones too.
     ``floor_db`` is the SQNR below which a value counts as another.
     """
-    count, fed = min(FRAMES, len(run)), dataclasses.replace(run.fed, own={})
-    after = zip(range(count), fed.follow(run.causes, run.names), strict=False)
-    feeds = [fed.feeds(at, run.causes) for at, _ in after]
-    outputs = [{**run.raw(at), **run.engine(at)} for at in range(count)]
-    shown = tuple(run.fed.frames[at] for at in range(count))
+    feeds = [each for each, _ in islice(run.follow(run.session, run.names), FRAMES)]
+    outputs = [run.dump[at] for at in range(len(feeds))]
+    shown = tuple(run.frames[at] for at in range(len(feeds)))
     a = Values(model, shown)
     a.measure_shapes(shown, provider, a.unshaped())
     a.run(shown, provider, feeds)

@@ -1,7 +1,7 @@
 """Hold what an engine answered elsewhere against its graph, and split what was lost."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,17 +9,13 @@ import numpy as np
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
-from me2e_compress.driving.adapter.image_inputs import IMAGE, ImageNormalization
 from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.fidelity.dump_readings import HIGHEST_DB
 from me2e_compress.fidelity.engine_loss import OutputLoss, losses
 from me2e_compress.fidelity.engine_run import EngineRun
 from me2e_compress.fidelity.engine_values import first_difference_of_engine
-from me2e_compress.fidelity.feed_faults import Pixels
 from me2e_compress.fidelity.first_difference import FirstDifference
 from me2e_compress.fidelity.floor import ALIVE
-from me2e_compress.fidelity.host_faults import HostFault, explain
 from me2e_compress.graph import LoadedModel
 from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
@@ -34,21 +30,20 @@ from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, counted, number, table
 from me2e_compress.zoo.shipped import SHIPPED, shipped
 
-STAGE = "inferences"
+SAME_DB = 60.0
+"""Above, two float32 programs differ by the order of their sums (60 dB: 0.1 %)."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class DumpResult(Result):
-    """What an engine lost, split into quantization, compilation and host.
+    """What an engine lost, split into quantization and compilation.
 
     Attributes:
         graph: The graph that the engine was built from.
         dump: What it answered.
         float_graph: The float source; None if none is known, for `float_reason`.
         state: Whose state the graph was fed: the engine's, our own run's, or none.
-        faults: Of the host.
         notes: What is no fault and worth knowing.
-        inferences: Of the graph, to find faults.
         inner: Where the engine's own tensors begin to differ from the graph's; None if
             the dump has outputs alone.
     """
@@ -60,24 +55,20 @@ class DumpResult(Result):
     frames: int
     state: str
     outputs: tuple[OutputLoss, ...]
-    faults: tuple[HostFault, ...]
     notes: tuple[str, ...]
-    inferences: int
     inner: FirstDifference | None
 
     @property
     def headline(self) -> str:
-        """What is to blame."""
-        if self.faults:
-            return f"{counted(len(self.faults), 'fault')} of the host named"
+        """Whether compilation lost anything."""
         worst = min(self.outputs, key=lambda each: each.compilation_db)
-        if worst.compilation_db >= HIGHEST_DB:
+        if worst.compilation_db >= SAME_DB:
             return (
                 "the engine answers as its graph does"
                 f" (least: {worst.name}, {worst.compilation_db:.1f} dB)"
             )
         return (
-            "compilation: no fault of the host that was tried explains what is left"
+            "compilation: the engine, or its host, does not answer as its graph does"
             f" (least: {worst.name}, {worst.compilation_db:.1f} dB)"
         )
 
@@ -87,23 +78,18 @@ class DumpResult(Result):
         return (self.headline, *inside, *self.notes)
 
     def alerts(self) -> tuple[str, ...]:
-        """Return the faults of the host, and outputs that are dead."""
-        return (*(each.line for each in self.faults), *self.dead)
-
-    @property
-    def dead(self) -> tuple[str, ...]:
-        """The outputs that hardly move, where they should, in words."""
+        """Return the outputs that hardly move, where they should, in words."""
         return tuple(each.dead for each in self.outputs if each.dead)
 
     @property
     def status(self) -> Status:
         """``refused`` if an output of the engine is dead."""
-        return "refused" if self.dead else super().status
+        return "refused" if self.alerts() else "ok"
 
     def check(self) -> None:
         """Raise EvaluationError if an output of the engine is dead."""
-        if self.dead:
-            raise EvaluationError(f"{self.dump}: {'; '.join(self.dead)}")
+        if dead := self.alerts():
+            raise EvaluationError(f"{self.dump}: {'; '.join(dead)}")
 
     def tables(self) -> tuple[Table, ...]:
         """Return one row per output."""
@@ -112,7 +98,6 @@ class DumpResult(Result):
                 each.name,
                 number(each.quantization_db, ".1f"),
                 number(each.compilation_db, ".1f"),
-                number(each.host_db, ".1f"),
                 number(each.all_db, ".1f"),
                 number(each.moves, ".2f"),
             )
@@ -124,7 +109,7 @@ class DumpResult(Result):
             else f"Float source: {self.float_graph}."
         )
         note = f"SQNR in dB; moves: a share of what it should; state: {self.state}. "
-        columns = ("output", "quantization", "compilation", "host", "all", "moves")
+        columns = ("output", "quantization", "compilation", "all", "moves")
         title = f"What the engine lost over {counted(self.frames, 'frame')}"
         return (table(title, columns, rows, note + source),)
 
@@ -159,7 +144,7 @@ def compare_dump(
             other frames.
         ProviderError: The provider is not available.
         EvaluationError: The dump is of another graph, or an output is not finite or has
-            another shape, and nothing explains it.
+            another shape.
     """
     path = model_path(model)
     recording, answered = CalibrationSet(Path(frames)), EngineDump(dump)
@@ -172,27 +157,24 @@ def compare_dump(
     session = open_session(
         path, optimize=False, release=True, provider=provider, said=said
     )
-
-    def told(count: int) -> None:
-        listener.on_progress(STAGE, count, 0, "")
-
-    # faults of the host first: what is left is the compiler's
-    run = EngineRun(session, recording, answered, told)
-    try:
-        faults = explain(run, _pixels(session.metadata))
-    except EvaluationError as error:
-        raise EvaluationError(f"{answered.path}: {error}") from error
+    run = EngineRun(session, recording, answered)
     source, why = _float_source(path, loaded, float_graph)
     opened = None
     if source is not None:
         opened = open_session(source, release=True, provider=provider, said=said)
-    outputs = losses(run, opened, alive)
+    total = len(recording)
+    try:
+        outputs = losses(
+            run, opened, alive, lambda at: listener.on_progress("frames", at, total, "")
+        )
+    except EvaluationError as error:
+        raise EvaluationError(f"{answered.path}: {error}") from error
     if set(answered.names) - set(session.outputs):
         named = with_modules(loaded.model)
         inner = first_difference_of_engine(named, run, provider=provider)
     return DumpResult(
-        path, answered.path, source, why, len(recording), _state(run), outputs, faults,
-        (*notes, *_rounded(run)), run.inferences, inner,
+        path, answered.path, source, why, total, _state(run), outputs,
+        (*notes, *_rounded(run)), inner,
     )  # fmt: skip
 
 
@@ -213,14 +195,6 @@ def _checked_names(dump: EngineDump, loaded: LoadedModel) -> tuple[str, ...]:
         )
     lacking = [each for each in outputs if each not in dump.names]
     return (f"not dumped: {', '.join(lacking)}",) if lacking else ()
-
-
-def _pixels(metadata: Mapping[str, str]) -> dict[str, Pixels]:
-    """Return how pixels become the image input, where the metadata say it."""
-    if IMAGE not in metadata:
-        return {}
-    found = ImageNormalization.of(metadata)
-    return {found.input: Pixels(found.mean, found.std)}
 
 
 def _float_source(
@@ -247,7 +221,7 @@ def _float_source(
 
 
 def _state(run: EngineRun) -> str:
-    pairs = run.fed.session.recurrent
+    pairs = run.session.recurrent
     own = [name for name, output in pairs.items() if output not in run.names]
     if not pairs:
         return "none"
@@ -261,7 +235,8 @@ def _state(run: EngineRun) -> str:
 def _rounded(run: EngineRun) -> Iterator[str]:
     """Say which outputs were rounded to fewer bits: no fault, but worth knowing."""
     found = dict[str, list[str]]()
-    for name, value in run.engine(0).items():
+    for name in run.names:
+        value = run.dump[0][name]
         if value.dtype == np.float16:
             found.setdefault("float16", []).append(name)
         elif value.dtype == np.float32 and value.any():

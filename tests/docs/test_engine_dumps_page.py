@@ -99,5 +99,5 @@ def test_two_graphs_or_one_and_its_engine(words: str, cli: Cli) -> None:
 def test_the_command_of_the_page_reads_it(dumped: Path, cli: Cli) -> None:
     frames = dumped.with_name("frames")
     found = cli.document(f"compare highway {frames} --outputs {dumped}")
-    assert found["faults"] == []
+    assert found["verdict"][0].startswith("the engine answers as its graph does")
     assert found["state"].startswith("the engine's own")

@@ -1,6 +1,6 @@
-"""A small stack with state and pictures, an engine of it, and hosts that go wrong."""
+"""A small stack with state and pictures, and an engine of it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -10,11 +10,8 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
 
 Arrays: TypeAlias = dict[str, Any]
-Feed: TypeAlias = Callable[[Sequence[Frame], int], Arrays]
-State: TypeAlias = Callable[[Arrays, bool, list[Arrays]], Arrays]
 SCENES = (0, 4)
 COUNT = 8
-MEAN, STD = (100.0, 110.0, 120.0), (50.0, 60.0, 70.0)
 
 _TEXT = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -68,25 +65,17 @@ def frames() -> list[Frame]:
     ]  # fmt: skip
 
 
-def rightly(shown: Sequence[Frame], at: int) -> Arrays:
-    return shown[at].arrays
-
-
-def reset(first: Arrays, starts: bool, before: list[Arrays]) -> Arrays:
-    return first if starts else before[-1]
-
-
 def drive(
-    session: Session, shown: Sequence[Frame], feed: Feed = rightly, state: State = reset
+    session: Session, shown: Sequence[Frame], before: Sequence[Arrays] = ()
 ) -> list[Arrays]:
-    """Return what an engine answers that a host feeds."""
-    given, before = list[Arrays](), list[Arrays]()
-    first = session.first_state({})
-    for at, frame in enumerate(shown):
-        fed = {**feed(shown, at), **state(first, frame.starts_scene, before)}
-        found = {name: np.array(each) for name, each in session.run(fed).items()}
-        before.append({"prev": found["prev_out"]})
-        given.append(found)
+    """Return the answers before, and what an engine answers then, reset by scene."""
+    given = list(before)
+    for frame in shown:
+        state = {"prev": given[-1]["prev_out"]} if given else {}
+        if frame.starts_scene:
+            state = session.first_state({})
+        answers = session.run({**frame.arrays, **state})
+        given.append({name: np.array(value) for name, value in answers.items()})
     return given
 
 
