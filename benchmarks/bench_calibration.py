@@ -41,7 +41,6 @@ OURS = {
     "plain": ("", True),
     "max-min": ("max-min", True),
     "mse": ("mse", True),
-    "entropy": ("entropy", True),
     "plain, not optimized": ("", False),
     "max-min, not optimized": ("max-min", False),
 }
@@ -56,7 +55,6 @@ LEFT_GB = 2.0
 LEVEL = {
     "max-min": "plain",
     "mse": "plain",
-    "entropy": "plain",
     "max-min, not optimized": "plain, not optimized",
 }
 """What each of our rows is divided by; peers are divided by ``plain``."""

@@ -35,7 +35,7 @@ from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.session import Session
 
 FloatArray: TypeAlias = npt.NDArray[np.float32]
-METHODS = ("max-min", "moving-average", "percentile", "mse", "entropy")
+METHODS = ("max-min", "percentile", "mse")
 SIZE = np.float32(32)
 """How much larger an outlier channel is: position embeddings of PETR reach 130 where
 the image features that they are added to reach 4 (Q-PETR, arXiv 2502.15488), channels

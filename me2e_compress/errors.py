@@ -21,6 +21,15 @@ __all__ = [
     "VerificationError",
 ]
 
+_NOW = "is gone since 0.3.0: use"
+FORMER = {
+    "calibration method entropy": f"entropy {_NOW} mse",
+    "calibration method moving-average": f"moving-average {_NOW} max-min",
+    "quantize-int8 weight_only_gemv": f"weight_only_gemv {_NOW} without=[gemv]",
+    "--weight-only-gemv": f"--weight-only-gemv {_NOW} --rules 'safe{{without=[gemv]}}'",
+}
+"""Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""
+
 
 class Me2eError(Exception):
     """Base class: the command line prints these on one line, without a traceback."""

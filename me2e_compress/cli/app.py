@@ -9,6 +9,7 @@ from typer.core import TyperGroup
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.verbosity import Verbosity, set_verbosity
+from me2e_compress.errors import FORMER
 from me2e_compress.extras import missing_module
 from me2e_compress.version import __version__
 
@@ -139,6 +140,9 @@ class LazyGroup(TyperGroup):
         name, known, rest = super().resolve_command(ctx, args)
         if name is None:
             return name, known, rest
+        for word in rest:
+            if gone := FORMER.get(word.partition("=")[0]):
+                ctx.fail(gone)
         # only the command that is called is imported
         loaded = COMMANDS[name].load()
         common = [each for each in self.params if each.name in COMMON]

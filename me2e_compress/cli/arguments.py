@@ -25,10 +25,6 @@ Rules = Annotated[
 Target = Annotated[
     str | None, typer.Option(help="runtime of the graph: tensorrt or onnxruntime")
 ]
-WeightOnlyGemv = Annotated[
-    bool,
-    typer.Option("--weight-only-gemv", help="int8 weights of matrix-vector products"),
-]
 Overrides = Annotated[
     Path | None, typer.Option(help="TOML file of exceptions to the int8 plan")
 ]

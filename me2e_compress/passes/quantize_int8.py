@@ -11,24 +11,19 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.review import review
 from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph import provenance, rewrite
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.quantization.plan import (
     INT8,
     Overrides,
     QuantPlan,
     make_plan,
-    savable_bytes,
     sharing_costs,
     stamp_plan,
-    with_weight_only,
 )
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS, Target
 from me2e_compress.targets.quantized import describe_quantized
-from me2e_compress.targets.weights import QuantizedWeight, weights_of
-from me2e_compress.targets.writer import BY, Writer
 
 _SHOWN = 5
 """Number of items of a kind that a note lists."""
@@ -58,12 +53,10 @@ class QuantizeInt8(Pass):
         attention_limit: longest attention that becomes int8, in tokens; None leaves it
             to the rules (512).
         overrides: TOML file of exceptions to the plan.
-        method: how ranges are read from the frames: ``max-min``,
-            ``moving-average:W``, ``percentile:P``, ``mse`` or ``entropy``; None leaves
-            it to the rules (``safe``: ``mse``, ``paper``: ``max-min``).
+        method: how ranges are read from the frames: ``max-min``, ``percentile:P`` or
+            ``mse``; None leaves it to the rules (``safe``: ``mse``, ``paper``:
+            ``max-min``).
         ranges: file of saved ranges instead of frames.
-        weight_only_gemv: store the weights of matrix-vector products, which rule
-            ``gemv`` keeps in float, as int8; no range is needed for it.
     """
 
     name: ClassVar[str] = "quantize-int8"
@@ -79,7 +72,6 @@ class QuantizeInt8(Pass):
     overrides: Path | None = None
     method: str | None = None
     ranges: Path | None = None
-    weight_only_gemv: bool = False
 
     @property
     def needs_frames(self) -> bool:
@@ -104,41 +96,17 @@ class QuantizeInt8(Pass):
         target, plan = self._runtime, self._placeable(model, context)
         target.check_types(plan, model)
         tensors = target.tensors(plan, model)
-        advice = self._advice(plan, model)
-        if not tensors and not plan.weight_only:
-            notes = ("nothing to quantize", *_notes(plan, self.target), *advice)
+        if not tensors:
+            notes = ("nothing to quantize", *_notes(plan, self.target))
             return PassResult(model, 0, notes)
         # Calibrate
-        ranges = Ranges({}, self.method_of_ranges, 0, "", "")
-        if tensors:
-            ranges = context.ranges(
-                self.name,
-                model,
-                tensors,
-                method=self.method_of_ranges,
-                saved=self.ranges,
-            )
+        method, saved = self.method_of_ranges, self.ranges
+        ranges = context.ranges(self.name, model, tensors, method=method, saved=saved)
         # Place the quantizers and record the plan
         placed = target.place(model, plan, ranges)
-        store_weights(placed, plan)
         stamp_plan(placed, plan)
-        notes = (
-            *_notes(plan, self.target),
-            *_findings(plan, ranges),
-            *advice,
-        )
-        return PassResult(placed, len(plan.placed) + len(plan.weight_only), notes)
-
-    def _advice(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
-        if self.weight_only_gemv:
-            return ()
-        count, saved = savable_bytes(plan, model)
-        if not count:
-            return ()
-        return (
-            f"weight_only_gemv=true would save {saved / 1e6:.1f} MB:"
-            f" {count} weights of matrix-vector products are float",
-        )
+        notes = (*_notes(plan, self.target), *_findings(plan, ranges))
+        return PassResult(placed, len(plan.placed), notes)
 
     def plan(self, model: ir.Model, context: Context) -> QuantPlan:
         """Choose for every node; shapes must be inferred."""
@@ -147,8 +115,7 @@ class QuantizeInt8(Pass):
             overrides = Overrides.load(self.overrides)
         rules, scheme = self._rules(), self._scheme(context)
         costs, objection = self._runtime.costs, self._runtime.fused_objection
-        plan = make_plan(model, scheme, rules, overrides, costs, objection)
-        return with_weight_only(plan, model) if self.weight_only_gemv else plan
+        return make_plan(model, scheme, rules, overrides, costs, objection)
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
         """Return the names of the tensors that its target reads in int8."""
@@ -188,8 +155,6 @@ class QuantizeInt8(Pass):
 def _notes(plan: QuantPlan, target: str) -> tuple[str, ...]:
     counts = ", ".join(f"{rule} {count}" for rule, count in plan.counts().items())
     found = f"{len(plan.placed)} of {len(plan.decisions)} nodes {INT8}"
-    if plan.weight_only:
-        found += f", the weights alone of {len(plan.weight_only)} more"
     if plan.kept_float:
         found += f"; {len(plan.chosen)} by the plan"
     scheme = plan.scheme
@@ -242,39 +207,3 @@ def _first(found: list[str], what: str) -> tuple[str, ...]:
     more = len(found) - _SHOWN
     listed = "; ".join(found[:_SHOWN])
     return (f"{what}: {listed}" + (f"; and {more} more" if more > 0 else ""),)
-
-
-def store_weights(model: ir.Model, plan: QuantPlan) -> None:
-    """Replace weights by int8 and a DequantizeLinear where layers stay float.
-
-    Given:   y = Gemm<transB = 1>(x, w, b)                      w [N, K]
-    Result:  y = Gemm(x, DequantizeLinear<axis = 1>(w_int8), b)    w_int8 [K, N]
-
-    The weight is stored as [K, N] with one scale a column: so onnxruntime (1.31) reads
-    the integers directly, in one kernel (MatMulNBits); it would dequantize a transposed
-    weight again for every frame. The graph, in which the plan's other nodes are placed,
-    is changed in place.
-
-    Raises:
-        PreconditionError: the graph is older than opset 13.
-    """
-    chosen = plan.weight_only
-    if not chosen:
-        return
-    weights = weights_of(model, chosen, balanced=plan.balanced)
-    nodes = {str(node.outputs[0].name): node for node in model.graph}
-    writer = Writer(model.graph)
-    for decision in chosen:
-        _store(writer, nodes[decision.output], weights[decision.output])
-    rewrite.sweep(model)
-
-
-def _store(writer: Writer, node: ir.Node, weight: QuantizedWeight) -> None:
-    integers = weight.integers
-    transposed = node.attributes.get_int("transB", 0) == 1
-    if node.op_type == "Gemm" and transposed:
-        integers = integers.T.copy()
-        node.attributes["transB"] = ir.AttrInt64("transB", 0)
-        provenance.inherit(node, [node], by=BY)
-    fresh = writer.dequantized(weight.name, integers, weight.scales, 1, node)
-    node.replace_input_with(1, fresh)

@@ -13,7 +13,7 @@ import pydantic
 from pydantic_core import CoreSchema, core_schema
 
 from me2e_compress.display import prefixed
-from me2e_compress.errors import Me2eError
+from me2e_compress.errors import FORMER, Me2eError
 from me2e_compress.registry.text import (
     ParsedItem,
     TextError,
@@ -99,10 +99,9 @@ class Registry(Generic[T]):
         """Make an item of a class that need not be registered; see :meth:`build`."""
         name, known = cls.name, [field.name for field in fields_of(cls)]
         if unknown := [option for option in options if option not in known]:
-            raise self.error(
-                f"{name} has no option {unknown[0]!r}; it has"
-                f" {', '.join(known) or 'none'}"
-            )
+            there = ", ".join(known) or "none"
+            line = f"{name} has no option {unknown[0]!r}; it has {there}"
+            raise self.error(FORMER.get(f"{name} {unknown[0]}", line))
         try:
             made: T = _adapter(cls).validate_python(dict(options))
         except pydantic.ValidationError as error:
@@ -192,7 +191,8 @@ class Registry(Generic[T]):
 
     def _unknown(self, name: str) -> Me2eError:
         there = ", ".join(self.names()) or "none"
-        return self.error(f"no {self.kind} {name!r}; there are {there}")
+        line = f"no {self.kind} {name!r}; there are {there}"
+        return self.error(FORMER.get(f"{self.kind} {name}", line))
 
     def _built(
         self, item: ParsedItem, cls: type[T], more: Mapping[str, object] | None = None

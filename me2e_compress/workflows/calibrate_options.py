@@ -17,8 +17,8 @@ class CalibrateOptions:
 
     Attributes:
         recipe: a shipped recipe or a TOML file; its passes before int8 are run.
-        method: ``mse``, ``max-min``, ``moving-average:W``, ``percentile:P`` or
-            ``entropy``; None takes that of the recipe's int8, else ``mse``.
+        method: ``mse``, ``max-min`` or ``percentile:P``; None takes that of the
+            recipe's int8, else ``mse``.
         count: number of frames, drawn in whole scenes.
         seed: seed of that draw.
         module_map: preset or TOML file; None finds the preset.

@@ -60,7 +60,6 @@ class CompressOptions:
         rules: rules of the int8 plan: ``safe``, ``paper``, or a set of yours.
         target: runtime of the int8 graph: ``tensorrt`` or ``onnxruntime``.
         overrides: TOML file of exceptions to the int8 plan.
-        weight_only_gemv: store the weights of matrix-vector products as int8.
         ranges: file of saved ranges, instead of frames.
         method: how ranges are read from frames, or were for ``ranges``.
         module_map: preset or TOML file; None finds the preset.
@@ -84,7 +83,6 @@ class CompressOptions:
     rules: str | RuleSet | None = None
     target: str | None = None
     overrides: str | Path | None = None
-    weight_only_gemv: bool = False
     ranges: str | Path | None = None
     method: str | None = None
     module_map: str | Path | None = None
@@ -141,7 +139,7 @@ class CompressOptions:
 
     def _with_int8(self, passes: tuple[Pass, ...]) -> tuple[Pass, ...]:
         """Set options of the passes that quantize, else of those that read ranges."""
-        named = ("rules", "target", "method", "weight_only_gemv")
+        named = ("rules", "target", "method")
         given: dict[str, object] = {n: v for n in named if (v := getattr(self, n))}
         files = {"overrides": self.overrides, "ranges": self.ranges}
         given |= {name: Path(file) for name, file in files.items() if file is not None}

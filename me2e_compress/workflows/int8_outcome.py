@@ -12,13 +12,7 @@ from me2e_compress.manager import Report
 from me2e_compress.manager.report import LossyPass
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.plan import (
-    FLOAT,
-    Decision,
-    QuantPlan,
-    plan_of,
-    savable_bytes,
-)
+from me2e_compress.quantization.plan import FLOAT, Decision, QuantPlan, plan_of
 from me2e_compress.workflows.result import Table, counted, megabytes, table
 
 LEAST_BYTES = 1024
@@ -110,8 +104,6 @@ class Int8Outcome:
         kept: layers left float, by rule and reason; most first.
         weights: the largest that stayed float; at most `LISTED`.
         float_bytes: weights that stayed float, by rule; most first.
-        weight_only_bytes: bytes that ``weight_only_gemv`` would save; 0 where it is on,
-            or where they are few.
     """
 
     by: str
@@ -120,7 +112,6 @@ class Int8Outcome:
     kept: Mapping[str, int] = dataclasses.field(default_factory=dict)
     weights: tuple[FloatWeight, ...] = ()
     float_bytes: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    weight_only_bytes: int = 0
 
     @classmethod
     def of(cls, report: Report, context: Context) -> Self | None:
@@ -133,9 +124,8 @@ class Int8Outcome:
         plan = _plan(report, quantizer, context)
         if plan is None:
             return cls(name, changes)
-        # a layer is left if it is neither int8 nor has int8 weights
         layers = [each for each in plan.decisions if each.op in WEIGHTED]
-        placed = {each.output for each in (*plan.placed, *plan.weight_only)}
+        placed = {each.output for each in plan.placed}
         left = [each for each in layers if each.output not in placed]
         weights = float_weights(quantizer.before, plan)
         return cls(
@@ -145,7 +135,6 @@ class Int8Outcome:
             dict(Counter(f"{e.rule}: {e.reason}" for e in left).most_common()),
             weights[:LISTED],
             _by_rule(weights),
-            savable_bytes(plan, quantizer.before)[1],
         )
 
     @property
@@ -161,9 +150,6 @@ class Int8Outcome:
             total = megabytes(sum(self.float_bytes.values()))
             said += f"; {total} MB of weights stay float"
             said += f", by rule: {rules}" if rules else ""
-        if self.weight_only_bytes:
-            saved = megabytes(self.weight_only_bytes)
-            said += f"; --weight-only-gemv would save {saved} MB"
         return said
 
     def table(self) -> Table | None:

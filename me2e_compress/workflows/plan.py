@@ -39,7 +39,6 @@ class PlanOptions:
         overrides: TOML file of exceptions.
         module_map: preset or TOML file; None finds the preset.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
-        weight_only_gemv: store the weights of matrix-vector products as int8.
         force: replace outputs that we did not write, too.
     """
 
@@ -48,7 +47,6 @@ class PlanOptions:
     overrides: str | Path | None = None
     module_map: str | Path | None = None
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    weight_only_gemv: bool = False
     force: bool = False
 
 
@@ -153,7 +151,6 @@ def _planned(
     plain = QuantizeInt8(
         scheme=options.scheme or "full",
         rules=options.rules or DEFAULT_RULES,
-        weight_only_gemv=options.weight_only_gemv,
     )
     overrides = None if options.overrides is None else Path(options.overrides)
     chosen = dataclasses.replace(plain, overrides=overrides)
@@ -188,7 +185,7 @@ def _check_options(
     read: Sequence[QuantPlan | ir.Model],
 ) -> None:
     """Refuse options that would change nothing, because all plans are made already."""
-    names = ("scheme", "rules", "weight_only_gemv", "overrides")
+    names = ("scheme", "rules", "overrides")
     given = [name for name in names if getattr(options, name)]
     only = read[:1] if "overrides" in given else read
     if given and all(isinstance(each, QuantPlan) for each in only):

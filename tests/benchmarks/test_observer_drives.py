@@ -1,8 +1,7 @@
 import pytest
 
 from benchmarks.bench_intervals import KeptDrive
-from benchmarks.bench_observers import METHODS
-from benchmarks.observers.drives import differences, sign_flip
+from benchmarks.observers.drives import METHODS, differences, sign_flip
 
 TYPES = "abcdefgh"
 

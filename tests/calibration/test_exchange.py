@@ -122,10 +122,10 @@ def test_imported_ranges_fit_any_method_but_one_graph(tmp_path: Path) -> None:
     write_tensorrt_cache(ranges(), tmp_path / "c")
     found = dataclasses.replace(read_cache(tmp_path / "c"), model="digest")
 
-    found.check(model="digest", tensors=NAMES, method="entropy", source="others")
+    found.check(model="digest", tensors=NAMES, method="percentile", source="others")
     found.check(model="digest", tensors=NAMES, method=found.method)
     with pytest.raises(FramesError, match="of graph digest, not elsewhere"):
-        found.check(model="elsewhere", tensors=NAMES, method="entropy")
+        found.check(model="elsewhere", tensors=NAMES, method="percentile")
     with pytest.raises(RecipeError, match="no calibration method 'fp8'"):
         found.check(model="digest", tensors=NAMES, method="fp8")
     with pytest.raises(RecipeError, match="no calibration method 'imported'"):

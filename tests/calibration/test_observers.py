@@ -1,4 +1,3 @@
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -10,12 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.calibration.observers import OBSERVERS, Bounds, Observer, scale_of
-from me2e_compress.calibration.observers.base import MaxMin, MovingAverage, within
-from me2e_compress.calibration.observers.histogram import (
-    Entropy,
-    MeanSquaredError,
-    Percentile,
-)
+from me2e_compress.calibration.observers.base import MaxMin, within
+from me2e_compress.calibration.observers.histogram import MeanSquaredError, Percentile
 from me2e_compress.calibration.statistics import BINS, Statistics
 from me2e_compress.errors import FramesError, RecipeError
 from tests.installed import install
@@ -72,12 +67,6 @@ def test_max_min_is_static() -> None:
     assert (lows.tolist(), highs.tolist()) == ([-3], [2])
 
 
-def test_the_moving_average_forgets_slowly_and_in_order() -> None:
-    lows, highs = MovingAverage(0.5).ranges(extremes((-1, 2), (-3, 1), (0, 0)))
-
-    assert (lows.tolist(), highs.tolist()) == ([-1], [0.75])
-
-
 @settings(max_examples=scaled(25))
 @given(st.floats(0.5, 100), st.integers(0, 9))
 def test_a_percentile_leaves_out_no_more_than_it_may(percent: float, seed: int) -> None:
@@ -106,52 +95,7 @@ def test_the_mse_threshold_is_the_best_of_a_search_over_the_elements() -> None:
     assert found == pytest.approx(best, rel=0.03)
 
 
-def divergence_written_out(counts: npt.NDArray[np.int64], edge: int) -> float:
-    """TensorRT's cost of a threshold, bin by bin; the first bin is as the second."""
-    p = counts[:edge].astype(float)
-    p[0] = p[1]
-    levels = [j * 128 // edge for j in range(edge)]
-    reference = p.copy()
-    reference[-1] += counts[edge:].sum()
-    held, used = np.zeros(128), np.zeros(128)
-    for j, level in enumerate(levels):
-        held[level] += p[j]
-        used[level] += reference[j] > 0
-    q = np.array(
-        [held[levels[j]] / used[levels[j]] if reference[j] else 0 for j in range(edge)]
-    )
-    on = reference > 0
-    if not q[on].all() or not on.any():
-        return math.inf
-    p, q = reference / reference.sum(), q / q.sum()
-    return float(np.sum(p[on] * np.log(p[on] / q[on])))
-
-
-DRAWN = np.random.default_rng(5)
-
-
-@pytest.mark.parametrize(
-    "x",
-    [
-        DRAWN.standard_t(3, size=40_000),
-        np.concatenate([np.zeros(20_000), np.abs(DRAWN.standard_t(3, size=20_000))]),
-        np.round(DRAWN.laplace(size=20_000) * 30) / 30,
-        np.concatenate([np.zeros(5_000), DRAWN.uniform(3, 4, 200)]),
-    ],
-    ids=["heavy tails", "many zeros", "few values", "nothing near zero"],
-)
-def test_entropy_agrees_with_the_algorithm_written_out(x: Values) -> None:
-    counts = seen(x).counted()[0]
-    top = int(np.flatnonzero(counts)[-1]) + 1
-    edges = [top, *range(128, top, BINS // 256)]
-    expected = min(edges, key=lambda edge: divergence_written_out(counts, edge))
-
-    width = 2.0 ** np.frexp(np.abs(x).max())[1] / BINS
-    reached = min(expected * width, np.abs(x).max())
-    assert reach(Entropy(), x) == pytest.approx(reached)
-
-
-@pytest.mark.parametrize("method", [Percentile(), MeanSquaredError(), Entropy()])
+@pytest.mark.parametrize("method", [Percentile(), MeanSquaredError()])
 def test_no_method_reaches_beyond_what_was_seen(method: object) -> None:
     x = np.random.default_rng(1).uniform(0, 3, 500)
     lows, highs = method.ranges(seen(x, np.zeros(4)))  # type: ignore[attr-defined]
@@ -172,8 +116,7 @@ def test_histogram_methods_say_that_they_lack_histograms() -> None:
         ("max-min", "max-min"),
         ("percentile", "percentile:99.99"),
         ("percentile:99.9", "percentile:99.9"),
-        ("moving-average:0.1", "moving-average:0.1"),
-        ("entropy", "entropy"),
+        ("mse", "mse"),
     ],
 )
 def test_methods_are_read_from_text(text: str, canonical: str) -> None:
@@ -185,12 +128,13 @@ def test_methods_are_read_from_text(text: str, canonical: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("fp8", "no calibration method 'fp8'; there are max-min, .*entropy"),
+        ("fp8", "no calibration method 'fp8'; there are max-min, percentile, mse"),
         ("mse:3", "mse takes no value, found '3'"),
         ("percentile:x", "percentile: percent: Input should be a valid number"),
         ("percentile:nan", "percentile: percent must be above 0"),
         ("percentile:0", "must be above 0 and at most 100, found 0"),
-        ("moving-average:2", "weight must be above 0 and at most 1, found 2"),
+        ("entropy", "^entropy is gone since 0.3.0: use mse$"),
+        ("moving-average:0.1", "^moving-average is gone since 0.3.0: use max-min$"),
     ],
 )
 def test_what_is_no_method_is_refused(text: str, message: str) -> None:

@@ -39,7 +39,7 @@ def same(a: Statistics, b: Statistics) -> bool:
 def test_merged_shards_are_one_calibration_to_the_bit(
     frames: CalibrationSet, count: int
 ) -> None:
-    calibrator = Calibrator("entropy", threads=1)
+    calibrator = Calibrator("percentile", threads=1)
     model = conv_attention()
     whole = draw(frames, 7, 0)
     parts = [shard(whole, number, count) for number in range(1, count + 1)]

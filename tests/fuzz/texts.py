@@ -131,7 +131,6 @@ PIPELINES = (
     "quantize-int8{ranges=../../..}", 'quantize-int8{ranges="a\\u0000b"}',
     "quantize-int8{method=percentile:nan}", "quantize-int8{method=percentile:1e308}",
     "quantize-int8{method=percentile:" + HUGE + "}",
-    "quantize-int8{method=moving-average:" + HUGE + "}",
     "quantize-int8{overrides=/dev/null}", "lower-int8", "lower-int8,lower-int8",
     "surgeon-function{function=os:system}", "surgeon-function", "\x1b[31m[/red]",
     "fold-with-onnxsim{timeout_s=-1}", "fold-with-onnxsim{timeout_s=nan}",

@@ -74,7 +74,7 @@ def test_a_graph_that_never_runs_has_no_frames(tmp_path: Path) -> None:
         fed(tmp_path, THREE_FILES, (0, 1, 2, 3, 4))
 
 
-@pytest.mark.parametrize("method", ["max-min", "entropy"])
+@pytest.mark.parametrize("method", ["max-min", "percentile"])
 def test_compress_takes_the_ranges(
     tmp_path: Path, command: Command, capsys: pytest.CaptureFixture[str], method: str
 ) -> None:

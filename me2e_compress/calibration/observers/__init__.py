@@ -26,9 +26,7 @@ OBSERVERS: Registry[Observer] = Registry(
     RecipeError,
     {
         "max-min": f"{_HERE}.base:MaxMin",
-        "moving-average": f"{_HERE}.base:MovingAverage",
         "percentile": f"{_HERE}.histogram:Percentile",
         "mse": f"{_HERE}.histogram:MeanSquaredError",
-        "entropy": f"{_HERE}.histogram:Entropy",
     },
 )

@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable
 from typing import ClassVar, TypeAlias
 
 import numpy as np
@@ -21,8 +20,7 @@ Counts: TypeAlias = npt.NDArray[np.int64]
 """Number of magnitudes in each of the bins: int64 [bins]."""
 
 LEVELS = 128
-"""Magnitudes of the int8 grid, 0 to 127; TensorRT's entropy method uses as many (S.
-Migacz, 8-bit inference with TensorRT, GTC 2017)."""
+"""Magnitudes of the int8 grid, 0 to 127: no tried threshold has fewer bins."""
 
 _STRIDE = BINS // 256
 """Bins between tried thresholds: 240 of them instead of 1,920."""
@@ -75,32 +73,14 @@ class MeanSquaredError(HistogramObserver):
     name: ClassVar[str] = "mse"
 
     def edge(self, counts: Counts) -> int:
-        """Return the edge at which rounding and clipping cost least."""
-        return _best(counts, _noise)
+        """Return the edge at which rounding and clipping cost least.
 
-
-@dataclasses.dataclass(frozen=True)
-class Entropy(HistogramObserver):
-    """The threshold whose int8 grid keeps the distribution best: least KL divergence.
-
-    Migacz's method. Zero is on every grid, so the bin of zeros is set to its
-    neighbour's count: otherwise the zeros after a ReLU would dominate.
-    """
-
-    name: ClassVar[str] = "entropy"
-
-    def edge(self, counts: Counts) -> int:
-        """Return the edge at which the KL divergence is least."""
-        return _best(counts, _divergence)
-
-
-def _best(counts: Counts, cost: Callable[[Counts, int], float]) -> int:
-    """Return the cheapest threshold; in a tie, the last bin in use."""
-    top = int(np.flatnonzero(counts)[-1]) + 1
-    tried = [top, *range(LEVELS, top, _STRIDE)]
-    costs = [cost(counts, edge) for edge in tried]
-    best: int = tried[int(np.argmin(costs))]
-    return best
+        In a tie it is the last bin in use.
+        """
+        top = int(np.flatnonzero(counts)[-1]) + 1
+        tried = [top, *range(LEVELS, top, _STRIDE)]
+        best: int = tried[int(np.argmin([_noise(counts, edge) for edge in tried]))]
+        return best
 
 
 def _noise(counts: Counts, edge: int) -> float:
@@ -109,31 +89,3 @@ def _noise(counts: Counts, edge: int) -> float:
     step = edge / QUANT_MAX
     rounded = np.minimum(np.rint(centres / step), QUANT_MAX) * step
     return float(counts @ np.square(centres - rounded))
-
-
-def _divergence(counts: Counts, edge: int) -> float:
-    """Return the KL divergence between the bins below an edge and their grid of levels.
-
-    Elements beyond the edge count in the last bin before it. A level spreads its
-    elements evenly over those of its bins that are not empty.
-    """
-    # Zero is on every grid: its bin must not dominate.
-    kept = counts[:edge].astype(np.float64)
-    kept[0] = kept[1] if edge > 1 else kept[0]
-    clipped = kept.copy()
-    clipped[-1] += counts[edge:].sum()
-    if not kept.any():
-        return np.inf
-    # Spread each level's elements over its bins in use.
-    level = np.arange(edge) * LEVELS // edge
-    filled = clipped > 0
-    held = np.bincount(level, kept, LEVELS)
-    bins = np.bincount(level, filled, LEVELS)
-    spread = np.where(filled, (held / np.maximum(bins, 1))[level], 0)
-    p, q = clipped / clipped.sum(), spread / spread.sum()
-    # A bin without any mass left makes the divergence infinite.
-    lost = (p > 0) & (q == 0)
-    if lost.any():
-        return np.inf
-    used = p > 0
-    return float(np.sum(p[used] * np.log(p[used] / q[used])))

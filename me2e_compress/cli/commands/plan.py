@@ -25,7 +25,6 @@ def plan(
     scheme: given.Scheme = None,
     rules: given.Rules = None,
     overrides: given.Overrides = None,
-    weight_only_gemv: given.WeightOnlyGemv = False,
     module_map: given.ModuleMap = None,
     set_dim: given.SetDim = None,
     against: Against = None,
@@ -40,7 +39,6 @@ def plan(
         overrides,
         module_map,
         sizes(set_dim or ()),
-        weight_only_gemv,
         force,
     )
     found = workflow.plan(model, output, against, options)

@@ -4,7 +4,6 @@ from me2e_compress.quantization.plan.decision import (
     FLOAT,
     INT8,
     RESIDUAL,
-    WEIGHT_ONLY,
     Decision,
     KeptFloat,
     PlanDifference,
@@ -24,13 +23,11 @@ from me2e_compress.quantization.plan.groups import (
 )
 from me2e_compress.quantization.plan.make import make_plan, tensors_of
 from me2e_compress.quantization.plan.overrides import Overrides
-from me2e_compress.quantization.plan.weight_only import savable_bytes, with_weight_only
 
 __all__ = [
     "FLOAT",
     "INT8",
     "RESIDUAL",
-    "WEIGHT_ONLY",
     "Decision",
     "KeptFloat",
     "Overrides",
@@ -43,11 +40,9 @@ __all__ = [
     "make_plan",
     "plan_of",
     "record",
-    "savable_bytes",
     "save_plan",
     "share_scales",
     "sharing_costs",
     "stamp_plan",
     "tensors_of",
-    "with_weight_only",
 ]

@@ -22,7 +22,6 @@ METADATA = "me2e.quant_plan"
 
 INT8 = "int8"
 FLOAT = "float"
-WEIGHT_ONLY = "weight-only"
 RESIDUAL = "residual"
 Shape = tuple[int, ...] | None
 
@@ -36,8 +35,7 @@ class Decision:
         output: name of its first output, which is unique.
         op: its operator.
         module: its ME2E module; empty if unknown.
-        dtype: ``int8``, ``float``, or ``weight-only``: computed in float, its weight
-            stored as int8.
+        dtype: ``int8`` or ``float``.
         rule: id of the rule that decided; for int8 ``layer``, ``attention``,
             ``sampled`` or ``residual``; ``override`` if the user did.
         reason: the same in words.
@@ -126,11 +124,6 @@ class QuantPlan(Displayed):
         return tuple(each for each in self.decisions if each.dtype == INT8)
 
     @property
-    def weight_only(self) -> tuple[Decision, ...]:
-        """The nodes that are computed in float, their weight stored as int8."""
-        return tuple(each for each in self.decisions if each.dtype == WEIGHT_ONLY)
-
-    @property
     def placed(self) -> tuple[Decision, ...]:
         """Those of the chosen nodes that are int8 in the graph for the target."""
         left = {each.output for each in self.kept_float}
@@ -145,12 +138,11 @@ class QuantPlan(Displayed):
     def headline(self) -> str:
         """Count int8, by rule."""
         counts = ", ".join(f"{rule} {count}" for rule, count in self.counts().items())
-        kept, weights = len(self.kept_float), len(self.weight_only)
+        kept = len(self.kept_float)
         return (
             f"scheme {self.scheme.name}, rules {self.rules}: {len(self.chosen)} of"
             f" {len(self.decisions)} nodes int8; {counts}"
             + (f"; {kept} of them stay float on their target" if kept else "")
-            + (f"; the weights alone of {weights} more" if weights else "")
         )
 
     def tables(self) -> tuple[Table, ...]:

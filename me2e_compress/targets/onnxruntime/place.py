@@ -11,7 +11,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import GraphError
 from me2e_compress.operators import int8_inputs, int8_op_types
 from me2e_compress.quantization.costs import Costs
-from me2e_compress.quantization.plan import Decision, KeptFloat, QuantPlan, plan_of
+from me2e_compress.quantization.plan import Decision, KeptFloat, QuantPlan
 from me2e_compress.runtime.optimized import optimized, origins, with_unique_names
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets.base import (
@@ -144,14 +144,10 @@ def _read_back(model: ir.Model, provider: Provider = CPU) -> Iterator[LintFindin
     except GraphError as refusal:
         yield error("refused", None, str(refusal))
         return
-    # Layers with only int8 weights are meant to run in float.
-    plan = plan_of(model)
-    meant = set() if plan is None else {each.output for each in plan.weight_only}
     known = origins(source, found)
     for node in int8_layers(found, _FLOAT_KERNELS):
         layer = _layer_of(known.get(str(node.name), node))
-        if layer.outputs[0].name not in meant:
-            yield warning("float-kernel", layer, _what(layer, node.op_type))
+        yield warning("float-kernel", layer, _what(layer, node.op_type))
 
 
 def _layer_of(node: ir.Node) -> ir.Node:

@@ -30,7 +30,7 @@ from tests.frames import record
 from tests.fuzz.exact.judging import MODULES, Case, Verdict, modules_of
 from tests.fuzz.exact.running import RefusedError, Runner, drawn_inputs
 
-METHODS = ("max-min", "moving-average:0.5", "percentile:99.9", "mse", "entropy")
+METHODS = ("max-min", "percentile:99.9", "mse")
 SCHEMES = ("full", "full", "feature-ext", "prediction")
 RULES = ("paper", "paper", "safe")
 EACH = 2
@@ -53,7 +53,6 @@ def ways(seed: int, *, named: bool) -> Iterator[str]:
                 "scheme": draw.choice(SCHEMES) if named else "full",
                 "method": draw.choice(METHODS),
                 "rules": draw.choice(RULES),
-                "weight_only_gemv": draw.choice(("true", "false")),
                 "target": "onnxruntime" if target == "onnxruntime" else "tensorrt",
             }
             given = ", ".join(f"{key}={value}" for key, value in options.items())

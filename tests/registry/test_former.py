@@ -1,0 +1,75 @@
+"""A name of 0.2 that is gone is refused in one line, which says what replaces it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+
+from me2e_compress.calibration.observers import OBSERVERS
+from me2e_compress.calibration.observers.base import MaxMin
+from me2e_compress.errors import FORMER, RecipeError
+from me2e_compress.manager import recipe
+from me2e_compress.quantization.rules import RULE_SETS
+from me2e_compress.registry import Registry
+from tests.command import Cli, cli, command
+from tests.installed import install
+
+__all__ = ["cli", "command"]
+
+
+@pytest.mark.parametrize("line", ["plan highway", "compress highway -o m.onnx"])
+@pytest.mark.parametrize("flag", ["--weight-only-gemv", "--weight-only-gemv=1"])
+def test_an_option_that_is_gone_is_a_usage_error(
+    line: str, flag: str, cli: Cli
+) -> None:
+    refused = cli(f"{line} {flag}")
+
+    assert refused.code == 2
+    assert (
+        "--weight-only-gemv is gone since 0.3.0: use --rules 'safe{without=[gemv]}'"
+        in refused.err
+    )
+
+
+def test_what_is_named_instead_is_taken() -> None:
+    assert RULE_SETS.parse("safe{without=[gemv]}").without == ("gemv",)
+    assert recipe.parse("quantize-int8{without=[gemv]}")
+    for method in ("mse", "max-min", "percentile"):
+        assert OBSERVERS.parse(method).name == method
+
+
+def test_a_method_that_is_gone_is_one_line(cli: Cli) -> None:
+    line = cli.refused("calibrate highway frames -o r.json --method moving-average:0.1")
+    assert line == ("me2e-compress: moving-average is gone since 0.3.0: use max-min")
+
+
+def test_an_option_of_a_pass_that_is_gone() -> None:
+    with pytest.raises(RecipeError) as refused:
+        recipe.parse("quantize-int8{weight_only_gemv=true}")
+    assert str(refused.value) == (
+        "weight_only_gemv is gone since 0.3.0: use without=[gemv]"
+    )
+
+
+@dataclass(frozen=True)
+class Entropy(MaxMin):
+    """Of another package, by a name that was ours."""
+
+    name: ClassVar[str] = "entropy"
+
+
+def test_another_package_may_bring_a_name_that_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = {"entropy": f"{__name__}:Entropy"}
+    install(monkeypatch, tmp_path, "an-entropy", "me2e_compress.observers", entry)
+
+    assert OBSERVERS.parse("entropy") == Entropy()
+
+
+def test_a_name_is_gone_of_its_own_kind_alone() -> None:
+    assert "calibration method entropy" in FORMER
+    others = Registry[MaxMin]("policy", "none.of.these", RecipeError, {})
+    with pytest.raises(RecipeError, match="no policy 'entropy'; there are none"):
+        others.get("entropy")
