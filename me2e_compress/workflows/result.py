@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of the documents that ``--json`` prints; docs/json.md tells their keys. It
 grows where a key goes or changes its meaning, not where one is added."""
 

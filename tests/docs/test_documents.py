@@ -10,7 +10,7 @@ from me2e_compress.cli.app import COMMANDS
 from tests.docs.documents import EVERY, PAGE, faults, sections
 
 GOOD = {
-    "schema": 1,
+    "schema": 2,
     "status": "ok",
     "verdict": ["done"],
     "stack": "highway",
