@@ -69,7 +69,7 @@ def test_a_seed_gives_the_same_bytes() -> None:
         assert draw(seed).SerializeToString() == draw(seed).SerializeToString()
 
 
-@pytest.mark.parametrize("seed", [21, 58, 122, 149])
+@pytest.mark.parametrize("seed", [21, 58, 128, 169])
 def test_int8_keeps_the_graph(seed: int) -> None:
     """Of graphs that have something to quantize, each way."""
     for found in int8.judged(seed, draw(seed)):
