@@ -7,17 +7,27 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import bias_of, is_standard, rank_of
+from me2e_compress.graph.nodes import scalar_of
 from me2e_compress.graph.rewrite import sole_reader
-from me2e_compress.graph.shapes import extent, is_one_matrix
+from me2e_compress.graph.shapes import (
+    extent,
+    is_one_matrix,
+    open_shape,
+    static_shape,
+)
 
 MOVES = frozenset(
     {
-        "AveragePool", "Flatten", "GlobalAveragePool", "MaxPool", "Reshape", "Resize",
-        "Slice", "SpaceToDepth", "Squeeze", "Transpose", "Unsqueeze",
+        "Flatten", "MaxPool", "Reshape", "Resize", "Slice", "SpaceToDepth", "Squeeze",
+        "Transpose", "Unsqueeze",
     }
 )  # fmt: skip
-"""Operators that choose, move or average elements: their output lies on the input's
-grid, or at least in its range."""
+"""Operators that pick or move elements: before quantization or behind it, on one grid,
+they give the same integers. A grid of their own would gain nothing."""
+
+AVERAGES = frozenset({"AveragePool", "GlobalAveragePool"})
+"""Operators whose output may be a small part of the input's range: it has a grid of
+its own."""
 
 LAYERS = ("Conv", "Gemm", "MatMul")
 """Operators with a weight that have an int8 kernel."""
@@ -61,6 +71,22 @@ def _is_plain_gemm(node: ir.Node) -> bool:
     )
 
 
+def reads_one_pixel(node: ir.Node) -> bool:
+    """Return whether a convolution is a Gemm: kernels of 1 over images of one pixel.
+
+    So it is behind a global average. A Gemm may write float; a QLinearConv may not.
+    """
+    image, weight = open_shape(node.inputs[0]), static_shape(node.inputs[1])
+    return (
+        node.op_type == "Conv"
+        and image is not None
+        and weight is not None
+        and set(image[2:]) == set(weight[2:]) == {1}
+        and node.attributes.get_int("group", 1) == 1
+        and not any(node.attributes.get_ints("pads", []))
+    )
+
+
 def is_bias(value: ir.Value | None, rank: int, columns: int | None) -> bool:
     """Return whether a value is a constant that adds one number to every column."""
     # A higher rank or more columns would change the product's shape.
@@ -89,12 +115,35 @@ def biased_end(product: ir.Node) -> ir.Node | None:
 
 
 def is_move(node: ir.Node) -> bool:
-    """Return whether a node only moves, picks or averages its first input."""
+    """Return whether a node only moves or picks elements of its first input."""
     if not is_standard(node) or node.op_type not in MOVES:
         return False
     if node.op_type == "Resize":
-        return node.attributes.get_string("mode", "nearest") == "nearest"
+        mode = node.attributes.get_string("mode", "nearest")
+        places = node.attributes.get_string("coordinate_transformation_mode")
+        # Outside the crop there is a value of the attributes, not of the input.
+        return mode == "nearest" and places != "tf_crop_and_resize"
     return len(node.outputs) == 1
+
+
+def is_average(node: ir.Node) -> bool:
+    """Return whether a node averages its input over windows, or over all places."""
+    return is_standard(node) and node.op_type in AVERAGES
+
+
+def has_average_kernel(node: ir.Node) -> bool:
+    """Return whether the int8 kernel of an average computes what ONNX defines.
+
+    onnxruntime 1.31 refuses a QLinearAveragePool with dilations. With
+    ``count_include_pad`` and ``ceil_mode``, windows that reach beyond the padding are
+    divided by all their places; ONNX leaves those out that are beyond.
+    """
+    options = node.attributes
+    dilated = set(options.get_ints("dilations", [1])) != {1}
+    counted = options.get_int("count_include_pad", 0) and options.get_int(
+        "ceil_mode", 0
+    )
+    return is_average(node) and not dilated and not counted
 
 
 def end_of(node: ir.Node) -> ir.Value:
@@ -110,7 +159,6 @@ def end_of(node: ir.Node) -> ir.Value:
 
 def is_clip_at_zero(node: ir.Node) -> bool:
     """Return whether a node is a ReLU, or a Clip that begins at zero."""
-    if node.op_type == "Clip" and len(node.inputs) > 1:
-        low = graph.array_of(node.inputs[1])
-        return low is not None and float(low) == 0.0
-    return node.op_type == "Relu"
+    if node.op_type == "Clip":
+        return is_standard(node) and scalar_of(graph.input_at(node, 1)) == 0.0
+    return is_standard(node) and node.op_type == "Relu"

@@ -5,6 +5,7 @@ onnxruntime 1.31 computes [10000, 256] x [256, 512] at 200 GMAC/s as a QGemm, an
 to 470 as a QLinearConv over pixels (``benchmarks/bench_int8_shapes.py``).
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -16,7 +17,11 @@ from me2e_compress import graph
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import rewrite
 from me2e_compress.targets.onnxruntime.insertion import Place
-from me2e_compress.targets.onnxruntime.kernels import biased_end, end_of
+from me2e_compress.targets.onnxruntime.kernels import (
+    biased_end,
+    end_of,
+    reads_one_pixel,
+)
 from me2e_compress.targets.quantized import QUANTIZE
 from me2e_compress.targets.weights import QuantizedWeight
 from me2e_compress.targets.writer import Writer
@@ -37,6 +42,7 @@ def write_layer(
 
     ==================  ==============================================================
     Conv                remains: QLinearConv
+    Conv of one pixel   becomes a Gemm, unless it is read as uint8 only
     read as uint8 only  becomes a Conv: QLinearConv
     Gemm                remains: QGemm
     MatMul, then Add    becomes a Gemm of two dimensions: QGemm. onnxruntime fuses the
@@ -52,7 +58,11 @@ def write_layer(
         weight, integers = with_bias(weight, bias, step)
     # Choose the form.
     quantize = _quantize_of(node)
-    if quantize is not None:
+    if node.op_type == "Conv":
+        if quantize is None and reads_one_pixel(node):
+            weight = _matrix_of(weight)
+            node = _write_row(writer, node, weight.integers.shape)
+    elif quantize is not None:
         weight = _filter_of(node, weight)
         columns, depth = weight.integers.shape[:2]
         node = _write_convolution(writer, node, quantize, (columns, depth))
@@ -146,9 +156,39 @@ def _write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Nod
     return gemm
 
 
+def _matrix_of(weight: QuantizedWeight) -> QuantizedWeight:
+    """Return a filter [N, K, 1, 1] as the weight [N, K] of a Gemm."""
+    matrix = weight.integers.reshape(weight.integers.shape[:2])
+    return dataclasses.replace(weight, name=f"{weight.name}_matrix", integers=matrix)
+
+
+def _write_row(writer: Writer, node: ir.Node, size: Sequence[int]) -> ir.Node:
+    """Replace a convolution of one pixel by a Gemm.
+
+    Given:   y = Conv(x, w, b)                      x [B, K, 1, 1], w [N, K, 1, 1]
+    Result:  y = Reshape(Gemm<transB=1>(Reshape(x, [-1, K]), w', b), [-1, N, 1, 1])
+
+    ``size`` is (N, K). The weight and bias of the returned Gemm are still to be
+    written.
+    """
+    old, (image, weight) = node.outputs[0], node.inputs[:2]
+    if image is None or weight is None:
+        raise PreconditionError(f"{node.name} is not a convolution")
+    name, ones = str(old.name), [1] * (graph.rank_of(image) or 4)
+    place = Place(writer, node, [node])
+    row = place.reshaped(image, [-1, size[1]], f"{name}_row")
+    inputs = [row, weight, weight]
+    gemm = place.node("Gemm", inputs, f"{name}_gemm", {"transB": 1})
+    shape = [-1, size[0], *ones[2:]]
+    answer = place.reshaped(gemm.outputs[0], shape, f"{name}_pixel")
+    answer.shape, answer.type = old.shape, old.type
+    rewrite.replace_value(old, answer)
+    return gemm
+
+
 def _quantize_of(product: ir.Node) -> ir.Node | None:
     """Return the QuantizeLinear that alone reads a product, behind bias and ReLU."""
-    if product.op_type == "Conv" or product.inputs[0] is None:
+    if product.inputs[0] is None:
         return None
     reader = rewrite.sole_reader(end_of(_last_of(product)))
     known = product.inputs[0].shape is not None

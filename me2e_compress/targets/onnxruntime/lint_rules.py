@@ -27,11 +27,8 @@ from me2e_compress.targets.base import (
     valid,
     warning,
 )
+from me2e_compress.targets.onnxruntime.region import never_negative
 from me2e_compress.targets.quantized import QUANTIZE, is_dequantized
-
-_NEVER_NEGATIVE = frozenset(
-    {"Abs", "Exp", "HardSigmoid", "Relu", "Sigmoid", "Softmax", "Softplus", "Sqrt"}
-)
 
 
 def opset(model: ir.Model) -> Iterator[LintFinding]:
@@ -110,8 +107,8 @@ def padded_pools(model: ir.Model) -> Iterator[LintFinding]:
         if pad is None or not is_standard(pad) or not _pads_with_zeros(pad):
             continue
         # Without negative values the result is the same.
-        before = producer_of(pad.inputs[0])
-        if before is None or before.op_type not in _NEVER_NEGATIVE:
+        image = pad.inputs[0]
+        if image is None or not never_negative(image):
             yield LintFinding(
                 "wrong",
                 "padded-pool",

@@ -14,6 +14,7 @@ from me2e_compress.targets.onnxruntime.image_blocks import (
     filter_of_blocks,
     read_blocks,
 )
+from me2e_compress.targets.onnxruntime.kernels import has_average_kernel, is_average
 from me2e_compress.targets.onnxruntime.layer_forms import write_layer
 from me2e_compress.targets.onnxruntime.region import Grid, Region, find_region
 from me2e_compress.targets.quantized import QUANTIZE, is_dequantized
@@ -55,12 +56,13 @@ def lower(draft: Draft) -> ir.Model:
         (layer, draft.weights[str(layer.outputs[0].name)], grids[value].scale)
         for layer, value in region.layers.items()
     ]
-    # Write pairs, then layers; then keep products from fusing.
+    # Write pairs, then layers; then keep what is float from fusing.
     writer = Writer(main)
     _write_pairs(writer, region, grids)
     for layer, weight, step in jobs:
         write_layer(writer, layer, weight, step)
     _screen_products(writer)
+    _screen_averages(writer)
     rewrite.sweep(draft.model)
     return draft.model
 
@@ -140,6 +142,31 @@ def _screen_products(writer: Writer) -> None:
     for node in products:
         if _would_run_in_float(node):
             _screen(writer, node)
+
+
+def _screen_averages(writer: Writer) -> None:
+    """Insert a Max of one tensor after averages that int8 would compute otherwise.
+
+    Given:   y = QuantizeLinear(AveragePool(DequantizeLinear(x)))
+    Result:  y = QuantizeLinear(Max(AveragePool(DequantizeLinear(x))))
+
+    onnxruntime (1.31) fuses the three whatever the pool's attributes are, and moves a
+    QuantizeLinear through Reshape, Identity and Clip for it.
+    """
+    averages = [
+        node
+        for node in writer.graph
+        if is_average(node)
+        and is_dequantized(node.inputs[0])
+        and not has_average_kernel(node)
+    ]
+    for node in averages:
+        value = node.outputs[0]
+        screen = writer.node("Max", [value], f"{value.name}_screened", [node])
+        writer.graph.insert_after(node, screen)
+        screen.outputs[0].shape, screen.outputs[0].type = value.shape, value.type
+        rewrite.replace_value(value, screen.outputs[0])
+        screen.replace_input_with(0, value)
 
 
 def _would_run_in_float(product: ir.Node) -> bool:

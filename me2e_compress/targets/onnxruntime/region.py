@@ -1,25 +1,30 @@
 """Find the int8 part of a graph: its uint8 tensors and their grids."""
 
 import dataclasses
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Self
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.calibration.observers import scale_of
-from me2e_compress.graph import producer_of
+from me2e_compress.graph import is_standard, producer_of
 from me2e_compress.operators import int8_inputs
 from me2e_compress.targets.base import MIDDLE
 from me2e_compress.targets.onnxruntime.kernels import (
     JOINS,
     end_of,
+    has_average_kernel,
     has_kernel,
+    is_average,
     is_clip_at_zero,
     is_move,
+    reads_one_pixel,
 )
 
-_UNSIGNED = frozenset({"Abs", "Exp", "HardSigmoid", "Relu", "Sigmoid", "Softmax"})
+_UNSIGNED = frozenset(
+    {"Abs", "Exp", "HardSigmoid", "Sigmoid", "Softmax", "Softplus", "Sqrt"}
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,8 +61,10 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
     """Grow the int8 part of a graph from its layers, in one walk.
 
     * A layer reads uint8. A convolution also writes it, because QLinearConv cannot
-      write anything else; a matrix product may write float (QGemm does).
-    * Nodes that only move elements (pooling, nearest Resize, layout) stay in uint8.
+      write anything else; a matrix product may write float (QGemm does), and so may a
+      convolution of one pixel, which becomes one.
+    * Nodes that only move elements (MaxPool, nearest Resize, layout) stay in uint8.
+    * An average stays, on its own grid, if nothing but int8 kernels reads it.
     * An Add or Concat of uint8 tensors stays if a convolution wrote one of them and a
       layer reads the result: the residual branches and merges of a backbone or neck.
       The sums around a LayerNorm join two float tensors and stay float.
@@ -82,7 +89,12 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
     sampled: dict[ir.Node, ir.Node] = {}
     sampling = {n for n in graph if n.outputs[0].name in chosen and int8_inputs(n)}
     wanted = {_sampled(node, ())[0] for node in sampling}
-    convolutions = {layer for layer in layers if layer.op_type == "Conv"}
+    averages = _averages(graph, layers, wanted)
+    convolutions = {
+        layer
+        for layer in layers
+        if layer.op_type == "Conv" and not reads_one_pixel(layer)
+    }
     # One walk in topological order: inputs are decided first.
     for node in graph:
         first = node.inputs[0] if node.inputs else None
@@ -90,9 +102,10 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
         if node in convolutions:
             grids[end] = end
             written.add(end)
-        elif first is not None and first in written and is_move(node):
-            grids[node.outputs[0]] = grids[first]
-            written.add(node.outputs[0])
+        elif first in written and (node in averages or is_move(node)):
+            value = node.outputs[0]
+            grids[value] = value if node in averages else grids[first]
+            written.add(value)
             readers.add(node)
         elif (
             node.op_type in JOINS
@@ -107,6 +120,34 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
             grids.setdefault(value, value)
             sampled[reader] = node
     return Region(layers, grids, frozenset(written), frozenset(readers), sampled)
+
+
+def _averages(
+    graph: ir.Graph,
+    layers: Mapping[ir.Node, ir.Value],
+    sampled: Collection[ir.Value],
+) -> set[ir.Node]:
+    """Find the averages that nothing but int8 kernels reads, directly or moved.
+
+    Other readers get the float average: rounding it would cost them more than the time
+    that it saves.
+    """
+    inputs = {*layers.values(), *sampled}
+    only: set[ir.Node] = set()
+    # Readers are decided before what they read.
+    for node in reversed(graph):
+        value = node.outputs[0] if node.outputs else None
+        if value is None or not (has_average_kernel(node) or is_move(node)):
+            continue
+        others = [
+            use
+            for use in value.uses()
+            if not (use.idx == 0 and (use.node in layers or use.node in only))
+            and not (use.node.op_type in JOINS and end_of(use.node) in inputs)
+        ]
+        if value in sampled or not (others or value.is_graph_output()):
+            only.add(node)
+    return {node for node in only if is_average(node)}
 
 
 def _sampled(node: ir.Node, written: Collection[ir.Value]) -> tuple[ir.Value, ir.Node]:
@@ -164,12 +205,13 @@ def never_negative(value: ir.Value) -> bool:
         node = producer_of(pending.pop())
         if node is None:
             return False
-        # Moves and joins pass the question on to their inputs.
-        if node.op_type in _UNSIGNED or is_clip_at_zero(node):
+        if is_clip_at_zero(node) or (is_standard(node) and node.op_type in _UNSIGNED):
             continue
-        if node.op_type != "Concat" and not is_move(node):
+        # Moves, averages and joins pass the question on to their inputs.
+        joins = is_standard(node) and node.op_type == "Concat"
+        if not (joins or is_move(node) or is_average(node)):
             return False
-        sources = node.inputs if node.op_type == "Concat" else node.inputs[:1]
+        sources = node.inputs if joins else node.inputs[:1]
         pending += [each for each in sources if each not in seen]
         seen.update(each for each in sources if each is not None)
     return True
