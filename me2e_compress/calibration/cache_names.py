@@ -16,9 +16,7 @@ from me2e_compress.calibration.review import RangeFinding
 from me2e_compress.display import counted
 from me2e_compress.errors import FramesError
 from me2e_compress.graph import digest, provenance, static_shape
-
-_MOVES = ("Identity", "Reshape", "Flatten", "Squeeze", "Unsqueeze", "Transpose")
-"""Operators whose output has the elements of their first input, all and no more."""
+from me2e_compress.graph.nodes import LAYOUT_OPERATORS, maker
 
 _LEAST = 0.5
 """Least share of the needed tensors that a cache of this graph has."""
@@ -114,13 +112,12 @@ def _found(value: ir.Value, known: Container[str], source: SourceNames) -> str |
 
 def _moved(value: ir.Value) -> list[ir.Value]:
     """Return the tensors that differ from it by one operator that moves elements."""
-    maker = value.producer()
-    near = []
-    if maker is not None and maker.op_type in _MOVES and maker.inputs[0] is not None:
-        near.append(maker.inputs[0])
-    for node, index in value.uses():
-        if node.op_type in _MOVES and index == 0:
-            near.append(node.outputs[0])
+    node = maker(value, *LAYOUT_OPERATORS)
+    near = [] if node is None or node.inputs[0] is None else [node.inputs[0]]
+    for use in value.uses():
+        moved = use.node.outputs[0]
+        if use.idx == 0 and maker(moved, *LAYOUT_OPERATORS) is not None:
+            near.append(moved)
     return near
 
 
@@ -135,8 +132,8 @@ def _source_name(value: ir.Value, source: SourceNames) -> str | None:
     if node is None or past is None:
         return own
     before = source.values.get(own)
-    maker = None if before is None else before.producer()
-    if maker is not None and past.origins == (str(maker.name),):
+    first = None if before is None else before.producer()
+    if first is not None and past.origins == (str(first.name),):
         return own if _fit(before, value) else None
     # a node that stands for several, or was split, or stands for another
     handed = source.handed_on(past.origins)

@@ -12,6 +12,7 @@ from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import producer_of, rewrite
+from me2e_compress.graph.nodes import LAYOUT_OPERATORS, maker
 from me2e_compress.targets.onnxruntime.kernels import LAYERS, has_kernel
 from me2e_compress.targets.onnxruntime.lower import Draft, lower
 from me2e_compress.targets.onnxruntime.region import find_region
@@ -104,6 +105,11 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
         if rewrite.can_replace(node.outputs[0], value):
             rewrite.replace_value(node.outputs[0], value)
     rewrite.sweep(copy)
+    # What only changes the layout has the range of its input.
+    for node in reversed(copy.graph):
+        value = node.inputs[0] if maker(node.outputs[0], *LAYOUT_OPERATORS) else None
+        if value is not None and node.outputs[0] in reach:
+            reach.setdefault(value, reach[node.outputs[0]])
     return Draft(
         copy,
         {str(n.outputs[0].name): w for n, w in weights.items() if w is not None},

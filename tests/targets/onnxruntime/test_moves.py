@@ -1,0 +1,156 @@
+"""What keeps a grid, what has its own, and what is never negative: by numbers."""
+
+import numpy as np
+import onnx
+import onnx_ir as ir
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from onnx import helper
+
+from me2e_compress.targets.onnxruntime.kernels import (
+    MOVES,
+    has_average_kernel,
+    is_average,
+    is_move,
+)
+from me2e_compress.targets.onnxruntime.region import never_negative
+from tests.targets.onnxruntime.draws import (
+    AVERAGED,
+    MOVED,
+    SHAPE,
+    answer,
+    node_of,
+    on_grid,
+    one_node,
+    paired,
+)
+from tests.targets.onnxruntime.lowered import Floats
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def drawn(op: str, seed: int) -> tuple[onnx.ModelProto, Floats]:
+    rng = np.random.default_rng(seed)
+    shape = (2, 4, 1, 8) if op == "Squeeze" else SHAPE
+    x = (rng.standard_normal(shape) * rng.uniform(0.1, 9)).astype(np.float32)
+    model = one_node(op, rng)
+    for at, size in enumerate(shape):
+        model.graph.input[0].type.tensor_type.shape.dim[at].dim_value = size
+    return model, x
+
+
+def test_every_operator_that_moves_is_drawn() -> None:
+    assert set(MOVED) == MOVES
+
+
+@pytest.mark.parametrize("op", sorted({*MOVES, *MOVED, *AVERAGED}))
+@given(SEEDS, st.sampled_from([0, 128]))
+def test_what_moves_gives_the_same_integers_before_and_behind(
+    op: str, seed: int, zero: int
+) -> None:
+    model, x = drawn(op, seed)
+    if not is_move(node_of(model)):
+        return
+    grid = float(np.abs(x).max()) / (255 - zero), zero
+
+    moved = answer(model, x)
+    want = on_grid(moved, *grid)
+
+    # on the input's grid, in onnxruntime's uint8, and in a range that holds all of it
+    np.testing.assert_array_equal(answer(model, on_grid(x, *grid)), want)
+    np.testing.assert_array_equal(
+        answer(paired(model, grid, grid), x, optimize=True), want
+    )
+    assert np.abs(moved).max(initial=0) <= np.abs(x).max()
+
+
+@given(SEEDS)
+def test_an_average_has_a_range_of_its_own(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x = np.maximum(rng.standard_normal((1, 4, 32, 32)) - 2, 0).astype(np.float32)
+    model = one_node("GlobalAveragePool", rng)
+    for at, size in enumerate(x.shape):
+        model.graph.input[0].type.tensor_type.shape.dim[at].dim_value = size
+    mean = answer(model, x)
+
+    # sparse features: the average would get 10 of 255 steps
+    assert not is_move(node_of(model))
+    assert 10 * mean.max() < x.max()
+
+
+@given(st.sampled_from(sorted(AVERAGED)), SEEDS, st.sampled_from([0, 128]))
+def test_int8_averages_are_those_of_the_nodes(op: str, seed: int, zero: int) -> None:
+    model, x = drawn(op, seed)
+    if not has_average_kernel(node_of(model)):
+        return
+    x = np.abs(x) if zero == 0 else x
+    mean = answer(model, x)
+    before = float(np.abs(x).max()) / (255 - zero), zero
+    behind = float(np.abs(mean).max()) / (255 - zero), zero
+
+    qdq = paired(model, before, behind)
+
+    # half a step is rounded either way
+    difference = answer(qdq, x) - answer(qdq, x, optimize=True)
+    assert np.abs(difference).max() < 1.5 * behind[0]
+
+
+@pytest.mark.parametrize("op", sorted(AVERAGED))
+def test_only_standard_averages_are_averages(op: str) -> None:
+    value = ir.Value(name="x")
+    own, other = ir.node(op, [value]), ir.node(op, [value], domain="vendor")
+
+    assert is_average(own)
+    assert has_average_kernel(own)
+    assert not is_average(other)
+    assert not has_average_kernel(other)
+
+
+UNARY = (
+    *("Abs", "Acos", "Asin", "Asinh", "Atan", "Celu", "Ceil", "Cos", "Elu", "Erf"),
+    *("Exp", "Floor", "HardSigmoid", "HardSwish", "Identity", "LeakyRelu", "Log"),
+    *("LogSoftmax", "Mish", "Neg", "PRelu", "Relu", "Round", "Selu", "Sigmoid", "Sign"),
+    *("Sin", "Softmax", "Softplus", "Softsign", "Sqrt", "Tan", "Tanh"),
+    *("ThresholdedRelu", "Hardmax", "GlobalMaxPool", "Reciprocal"),
+)
+
+
+@pytest.mark.parametrize("op", UNARY)
+@given(SEEDS)
+def test_what_counts_as_never_negative_is_not(op: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x = (rng.standard_normal(SHAPE) * rng.uniform(0.1, 9)).astype(np.float32)
+    more, alpha = (["x"] if op == "PRelu" else []), float(rng.uniform(-1, 1))
+    options = {"alpha": alpha, "beta": alpha} if op == "HardSigmoid" else {}
+    model = one_node("GlobalAveragePool", rng)
+    model.graph.node[0].CopyFrom(helper.make_node(op, ["x", *more], ["y"], **options))
+
+    if never_negative(node_of(model).outputs[0]):
+        assert not (answer(model, x) < 0).any()
+
+
+@pytest.mark.parametrize("op", sorted({*MOVED, *AVERAGED}))
+@given(SEEDS)
+def test_what_hands_on_that_nothing_is_negative_does(op: str, seed: int) -> None:
+    model, x = drawn(op, seed)
+    relu = ir.node("Relu", [ir.Value(name="r")])
+    node = node_of(model)
+    node.replace_input_with(0, relu.outputs[0])
+
+    if never_negative(node.outputs[0]):
+        assert not (answer(model, np.maximum(x, 0)) < 0).any()
+    else:  # it interpolates, or brings a value of its own
+        assert op == "Resize"
+
+
+def test_an_operator_of_another_domain_may_be_negative() -> None:
+    value = ir.Value(name="x")
+
+    for op in ("Abs", "Relu", "Softmax"):
+        assert never_negative(ir.node(op, [value]).outputs[0])
+        assert not never_negative(ir.node(op, [value], domain="vendor").outputs[0])
+    own = ir.node("Relu", [value]).outputs
+    assert never_negative(ir.node("Concat", own, {"axis": 1}).outputs[0])
+    other = ir.node("Concat", own, {"axis": 1}, domain="vendor")
+    assert not never_negative(other.outputs[0])
