@@ -140,10 +140,8 @@ def has_average_kernel(node: ir.Node) -> bool:
     """
     options = node.attributes
     dilated = set(options.get_ints("dilations", [1])) != {1}
-    counted = options.get_int("count_include_pad", 0) and options.get_int(
-        "ceil_mode", 0
-    )
-    return is_average(node) and not dilated and not counted
+    beyond = all(options.get_int(n, 0) for n in ("ceil_mode", "count_include_pad"))
+    return is_average(node) and not dilated and not beyond
 
 
 def end_of(node: ir.Node) -> ir.Value:

@@ -136,9 +136,9 @@ def _averages(
     only: set[ir.Node] = set()
     # Readers are decided before what they read.
     for node in reversed(graph):
-        value = node.outputs[0] if node.outputs else None
-        if value is None or not (has_average_kernel(node) or is_move(node)):
+        if not (has_average_kernel(node) or is_move(node)):
             continue
+        value = node.outputs[0]
         others = [
             use
             for use in value.uses()

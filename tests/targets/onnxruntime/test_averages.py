@@ -5,6 +5,7 @@ import onnx
 import onnx_ir as ir
 import pytest
 
+from me2e_compress import graph
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.onnxruntime import OnnxRuntime, convert, unranged
 from me2e_compress.targets.tensorrt import TensorRT
@@ -83,7 +84,7 @@ HEADS = [
         "QLinearGlobalAveragePool",
     ),
     (
-        f"{WINDOWS} d = Conv(p, k) s = Add(p, d) y = Conv(s, k)",
+        f"{WINDOWS} d = Conv<strides=[2,2]>(r, k) s = Add(p, d) y = Conv(s, k)",
         IMAGE,
         "QLinearAveragePool",
     ),
@@ -160,13 +161,15 @@ SHARED = f"o = Conv(r, k) {GLOBAL} f = Flatten(p) y = Gemm(f, l)"
 
 def test_a_tensorrt_graph_has_the_range_of_an_average_behind_its_layout() -> None:
     model = averaged(SHARED, f"{FLAT}, float[3,8,h,w] o")
-    plan, fed = make_plan(model, FULL, PAPER), X
-    source = TensorRT().place(
-        model, plan, measured(model, TensorRT().tensors(plan, model), fed)
-    )
+    plan = make_plan(model, FULL, PAPER)
+    ranges = measured(model, TensorRT().tensors(plan, model), X)
+    source = TensorRT().place(model, plan, ranges)
 
     assert set(unranged(source)) == {"o"}
-    small = convert(source, measured(source, ("o",), fed))
+    small = convert(source, measured(source, ("o",), X))
+    step = graph.array_of(small.graph.initializers["p_scale"])
+    assert step is not None
+    np.testing.assert_allclose(255 * step, ranges.tensors["f"][1], rtol=1e-6)
     assert kernels(small)["QLinearGlobalAveragePool"] == 1
 
 
