@@ -167,7 +167,7 @@ def test_a_tensorrt_graph_has_the_range_of_an_average_behind_its_layout() -> Non
 
     assert set(unranged(source)) == {"o"}
     small = convert(source, measured(source, ("o",), X))
-    step = graph.array_of(small.graph.initializers["p_scale"])
+    step = graph.array_of(small.graph.initializers["f_scale"])
     assert step is not None
     np.testing.assert_allclose(255 * step, ranges.tensors["f"][1], rtol=1e-6)
     assert kernels(small)["QLinearGlobalAveragePool"] == 1
