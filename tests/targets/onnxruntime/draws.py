@@ -87,7 +87,8 @@ def one_node(op: str, rng: np.random.Generator) -> onnx.ModelProto:
     attributes, others = {**MOVED, **AVERAGED}[op](rng)
     arrays = {f"i{at}": each for at, each in enumerate(others) if each is not None}
     names = ["" if each is None else f"i{at}" for at, each in enumerate(others)]
-    node = helper.make_node(op, ["x", *names], ["y"], **attributes)
+    node = helper.make_node(op, ["x", *names], ["y"])
+    node.attribute.extend(helper.make_attribute(*each) for each in attributes.items())
     return helper.make_model(
         helper.make_graph(
             [node],

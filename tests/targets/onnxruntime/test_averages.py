@@ -5,7 +5,7 @@ import onnx
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph
+from me2e_compress.graph.nodes import scalar_of
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.onnxruntime import OnnxRuntime, convert, unranged
 from me2e_compress.targets.tensorrt import TensorRT
@@ -167,9 +167,8 @@ def test_a_tensorrt_graph_has_the_range_of_an_average_behind_its_layout() -> Non
 
     assert set(unranged(source)) == {"o"}
     small = convert(source, measured(source, ("o",), X))
-    step = graph.array_of(small.graph.initializers["f_scale"])
-    assert step is not None
-    np.testing.assert_allclose(255 * step, ranges.tensors["f"][1], rtol=1e-6)
+    step = scalar_of(small.graph.initializers["f_scale"])
+    assert step == pytest.approx(ranges.tensors["f"][1] / 255)
     assert kernels(small)["QLinearGlobalAveragePool"] == 1
 
 

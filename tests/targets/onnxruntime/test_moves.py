@@ -122,9 +122,11 @@ def test_what_counts_as_never_negative_is_not(op: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     x = (rng.standard_normal(SHAPE) * rng.uniform(0.1, 9)).astype(np.float32)
     more, alpha = (["x"] if op == "PRelu" else []), float(rng.uniform(-1, 1))
-    options = {"alpha": alpha, "beta": alpha} if op == "HardSigmoid" else {}
     model = one_node("GlobalAveragePool", rng)
-    model.graph.node[0].CopyFrom(helper.make_node(op, ["x", *more], ["y"], **options))
+    node = model.graph.node[0]
+    node.CopyFrom(helper.make_node(op, ["x", *more], ["y"]))
+    for name in ("alpha", "beta") if op == "HardSigmoid" else ():
+        node.attribute.append(helper.make_attribute(name, alpha))
 
     if never_negative(node_of(model).outputs[0]):
         assert not (answer(model, x) < 0).any()
