@@ -234,7 +234,9 @@ def weigh(chosen: argparse.Namespace) -> dict[str, object]:
     with tempfile.TemporaryDirectory() as folder:
         rewritten = Path(folder) / "rewritten.onnx"
         try:
-            session = Session(path, threads=chosen.threads, rewritten=rewritten)
+            session = Session(
+                path, threads=chosen.threads, int8_kernels=True, rewritten=rewritten
+            )
         except GraphError as error:
             return {"refused": str(error)}
         kernels = Counter(node.op_type for node in graph.load(rewritten).graph)
@@ -266,7 +268,9 @@ def macs_of_a_frame(model: ir.Model, nodes: Iterable[ir.Node]) -> int:
 def clock(chosen: argparse.Namespace) -> dict[str, tuple[float, ...]]:
     """Time one file."""
     subject = subjects.at(chosen.out)
-    session = Session(path_of(subject, chosen.file), threads=chosen.threads)
+    session = Session(
+        path_of(subject, chosen.file), threads=chosen.threads, int8_kernels=True
+    )
     frames = [CalibrationSet(subject.held_out)[0]]
     found = time_interleaved({chosen.file: session}, frames, RUNS)[chosen.file]
     return {"cpu_s": found.cpu_s, "wall_s": found.wall_s}

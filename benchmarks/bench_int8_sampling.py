@@ -135,7 +135,7 @@ def show(case: Case, rounds: int) -> None:
     """Print one case: both kinds of maps, and masks."""
     for layer in (False, True):
         sessions = [
-            Session(case.model(layer=layer, pair=pair), threads=1)
+            Session(case.model(layer=layer, pair=pair), threads=1, int8_kernels=True)
             for pair in (False, True)
         ]
         plain, small = milliseconds(sessions, [case.feeds()] * 2, rounds)

@@ -210,7 +210,8 @@ def report(
     held_out = CalibrationSet(subject.held_out)
     reference = Session(subject.model, threads=2, release=True)
     sessions = {
-        name: Session(path, threads=2, release=True) for name, path in files.items()
+        name: Session(path, threads=2, int8_kernels=True, release=True)
+        for name, path in files.items()
     }
     quality = {
         name: {e.name: e.sqnr_db for e in compare(reference, each, held_out).outputs}

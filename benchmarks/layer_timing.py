@@ -119,7 +119,7 @@ def time_both(layer: Layer) -> tuple[float, float]:
     model = layer.graph()
     sessions = {
         "float": Session(model, threads=1),
-        "int8": Session(int8_of(model), threads=1),
+        "int8": Session(int8_of(model), threads=1, int8_kernels=True),
     }
     array = np.random.default_rng(1).standard_normal(layer.read).astype(np.float32)
     frames = [Frame(0, starts_scene=True, arrays={"x": array})]

@@ -47,7 +47,13 @@ def our_session(
     path: Path, feeds: Mapping[str, Array], provider: Provider, given: Any
 ) -> tuple[Run, Outputs]:
     """Open a file as every command does; return what runs it, and its outputs."""
-    session = Session(path, threads=given.threads, provider=provider, stock=given.stock)
+    session = Session(
+        path,
+        threads=given.threads,
+        provider=provider,
+        stock=given.stock,
+        int8_kernels=True,
+    )
     fed = {name: feeds[name] for name in session.inputs}
     return lambda: session.run(fed), lambda: session.run(fed)
 

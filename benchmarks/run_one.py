@@ -78,7 +78,7 @@ def our_session(path: str, frame: Mapping[str, Any], threads: int) -> Run:
     """Open a file as every command of this package does."""
     from me2e_compress.runtime.session import Session
 
-    session = Session(Path(path), threads=threads)
+    session = Session(Path(path), threads=threads, int8_kernels=True)
     fed = {name: frame[name] for name in session.inputs}
     return lambda: session.run(fed)
 

@@ -62,7 +62,9 @@ class OnnxPolicy:
             EvaluationError: It cannot be run, or does not keep the contract.
         """
         try:
-            session = open_session(path, threads=1, provider=provider, said=said)
+            session = open_session(
+                path, threads=1, int8_kernels=True, provider=provider, said=said
+            )
             return cls.of(session, adapter or Adapter(), stage)
         except (GraphError, FramesError, EvaluationError) as error:
             words = str(error).removeprefix(f"{path}: ")

@@ -92,8 +92,9 @@ def break_down(
     # Profile the source graph: the session optimizes it again.
     with tempfile.TemporaryDirectory(prefix="me2e-profile-") as folder:
         session = Session(
-            source, threads=threads, provider=provider, profiled=Path(folder)
-        )
+            source, threads=threads, int8_kernels=True, provider=provider,
+            profiled=Path(folder),
+        )  # fmt: skip
         counted = _profiled(session, frames, wanted, warm_up, on_run)
     return _divided(counted, places)
 

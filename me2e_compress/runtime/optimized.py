@@ -23,7 +23,7 @@ def optimized(model: ir.Model, provider: Provider = CPU) -> ir.Model:
     """
     with tempfile.TemporaryDirectory(prefix="me2e-optimized-") as folder:
         path = Path(folder) / "model.onnx"
-        Session(model, threads=1, rewritten=path, provider=provider)
+        Session(model, threads=1, int8_kernels=True, rewritten=path, provider=provider)
         found = ir.load(path)
         ir.external_data.load_to_model(found)
     return found

@@ -79,7 +79,9 @@ class TimedSession:
         provider: Provider = CPU,
         said: Mapping[str, str] | None = None,
     ) -> None:
-        self._timed = open_session(model, threads=threads, provider=provider, said=said)
+        self._timed = open_session(
+            model, threads=threads, int8_kernels=True, provider=provider, said=said
+        )
         self.inputs, self.outputs = self._timed.inputs, self._timed.outputs
         self.metadata, self.recurrent = self._timed.metadata, self._timed.recurrent
         self.provider = provider

@@ -32,6 +32,15 @@ from me2e_compress.runtime.float_products import write_float_products
 from me2e_compress.runtime.int8_values import read_int8
 from me2e_compress.runtime.providers import CPU, Provider
 
+QDQ_OFF = "session.disable_quant_qdq"
+"""The entry that keeps pairs and their layers as they are: float kernels then answer
+what the nodes say. onnxruntime's own int8 (1.31) answers otherwise where it
+
+* writes a float bias as int32 in steps of input times weight, and it does not fit;
+* takes a Gemm's int32 bias in those steps, whatever its own scale is;
+* quantizes a float weight between pairs, with one scale in all;
+* adds uint8 by int8 products in 16 bits, on processors without VNNI."""
+
 _BY = "session"
 _AS_WRITTEN = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
 _FLOAT_KERNELS = ("MultiScaleDeformableAttention", "RawDeformableAttention")
@@ -82,10 +91,19 @@ def runnable(
         except (ImportError, OSError):
             made, _ = compiled_or_expanded(model, compiled=False, theirs=theirs)
     # Files without fused nodes are opened unread, so their products stay, too.
-    optimizes = options.graph_optimization_level != _AS_WRITTEN
-    if made is not model and provider.native == CPU.native and optimizes:
+    if made is not model and provider.native == CPU.native and _by_int8(options):
         write_float_products(made.graph)
     return made
+
+
+def _by_int8(options: ort.SessionOptions) -> bool:
+    """Return whether onnxruntime may make int8 kernels of pairs."""
+    if options.graph_optimization_level == _AS_WRITTEN:
+        return False
+    try:
+        return options.get_session_config_entry(QDQ_OFF) != "1"
+    except RuntimeError:  # it is not set
+        return True
 
 
 def compiled_or_expanded(

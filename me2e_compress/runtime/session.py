@@ -21,6 +21,7 @@ from me2e_compress.runtime.opening import (
     open_graph,
 )
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.runnable import QDQ_OFF
 
 __all__ = [
     "Level",
@@ -62,7 +63,11 @@ class Session:
         threads: threads within an operator; 0 takes every core.
         optimize: False runs the nodes exactly as written (``ORT_DISABLE_ALL``), like
             the level ``none``; True is the level ``all``.
-        stock: also makes the optimizations that the provider leaves out.
+        stock: all that onnxruntime does by itself: also the optimizations that the
+            provider leaves out, and int8 kernels.
+        int8_kernels: runs pairs of quantization nodes by onnxruntime's int8 kernels.
+            Without them the session answers what the nodes say; for what the kernels
+            answer otherwise see :data:`QDQ_OFF`.
         frugal: runs nodes in the priority-based order, in which a reduction written
             right after its producer frees that tensor at once.
         release: frees working memory after every run, so that several sessions fit in
@@ -85,6 +90,7 @@ class Session:
         threads: int = 0,
         optimize: bool | Level = True,
         stock: bool = False,
+        int8_kernels: bool = False,
         frugal: bool = False,
         release: bool = False,
         rewritten: Path | None = None,
@@ -104,6 +110,8 @@ class Session:
         options.graph_optimization_level = _LEVELS[level]
         # One block for all tensors of a run: twice the memory on VAD-tiny, no gain.
         options.enable_mem_pattern = False
+        if not (stock or int8_kernels) and provider.target == CPU.target:
+            options.add_session_config_entry(QDQ_OFF, "1")
         if frugal:
             options.execution_order = ort.ExecutionOrder.PRIORITY_BASED
         if rewritten is not None:

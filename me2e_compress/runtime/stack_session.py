@@ -62,6 +62,7 @@ def open_session(
     threads: int = 0,
     optimize: bool = True,
     stock: bool = False,
+    int8_kernels: bool = False,
     release: bool = False,
     provider: Provider = CPU,
     said: Mapping[str, str] | None = None,
@@ -75,6 +76,7 @@ def open_session(
         threads=threads,
         optimize=optimize,
         stock=stock,
+        int8_kernels=int8_kernels,
         release=release,
         provider=provider,
     )

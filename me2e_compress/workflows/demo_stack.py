@@ -227,7 +227,13 @@ class StackDemo(Demo):
         paths = {path.name: path for path in (self._source, exact, self._small)}
         # all files run in turn on one frame, so that noise meets each alike
         sessions = {
-            name: Session(path, threads=THREADS, release=True, provider=self.provider)
+            name: Session(
+                path,
+                threads=THREADS,
+                int8_kernels=True,
+                release=True,
+                provider=self.provider,
+            )
             for name, path in paths.items()
         }
         frame = CalibrationSet(self._held_out)[0]

@@ -33,6 +33,7 @@ from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import compiled_or_expanded, unsupported
+from me2e_compress.targets.quantized import describe_quantized
 from me2e_compress.workflows import opening_main
 from me2e_compress.workflows.listener import Listener
 
@@ -50,7 +51,7 @@ class FirstRun:
     Attributes:
         seconds: how long it took.
         answers: its outputs, frame by frame; None where they are not those that a
-            session here would give: it did not run, or lacked an input.
+            session here would give: it did not run, lacked an input, or is int8.
     """
 
     seconds: float
@@ -168,7 +169,8 @@ def try_apart(
         words = [str(file), scratch, ",".join(kernels), *CPU.left_out]
         done = run_script(_SCRIPT, words)
         answers = None
-        if state is not None and _are_complete(model, frames, state):
+        complete = state is not None and _are_complete(model, frames, state)
+        if complete and not describe_quantized(model):  # int8 kernels ran there
             answers = _answers(len(frames), Path(scratch))
     # Exit codes that the script does not give itself mean a crash.
     if done.returncode not in _REFUSED:

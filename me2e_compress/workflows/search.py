@@ -195,6 +195,8 @@ def _joules(trials: Trials, threads: int, kind: Joules, made: ir.Model) -> float
 def _seconds(trials: Trials, threads: int, made: ir.Model) -> float:
     """Return the least wall time of a frame in 5 runs."""
     provider = trials.reference.session.provider
-    session = Session(made, threads=threads, release=True, provider=provider)
+    session = Session(
+        made, threads=threads, int8_kernels=True, release=True, provider=provider
+    )
     first = next(iter(trials.reference.frames))
     return time_interleaved({"int8": session}, [first], 5)["int8"].best_wall_s

@@ -81,7 +81,9 @@ def _metered(
     try:
         held = _held(frames)
         sessions = {
-            name: open_session(path, threads=threads, provider=provider, said=said)
+            name: open_session(
+                path, threads=threads, int8_kernels=True, provider=provider, said=said
+            )
             for name, path in models.items()
         }
         # Each model replays the frames held in memory endlessly.
