@@ -27,6 +27,7 @@ from me2e_compress.targets.base import (
     valid,
     warning,
 )
+from me2e_compress.targets.onnxruntime.int8_rewrites import int8_rewrites
 from me2e_compress.targets.onnxruntime.region import never_negative
 from me2e_compress.targets.quantized import QUANTIZE, is_dequantized
 
@@ -150,4 +151,5 @@ RULES: tuple[LintRule, ...] = (
     signed_activations,
     unanswered,
     padded_pools,
+    int8_rewrites,
 )

@@ -1,0 +1,294 @@
+"""Lint rules: where onnxruntime's own int8 answers otherwise than the nodes of a file.
+
+Measured with onnxruntime 1.31.1 on the CPU, opsets 11 to 23, each pattern with and
+without ``WeightBiasQuantization``; no bug report is known of the first and the third.
+Our own measurements run without these rewrites
+(:data:`me2e_compress.runtime.runnable.QDQ_OFF`), whoever deploys a file gets them.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import numpy.typing as npt
+import onnx_ir as ir
+
+from me2e_compress.graph import channel_axis, input_at, is_standard, nodes_of, rank_of
+from me2e_compress.graph.nodes import (
+    array_of,
+    constant_values,
+    maker,
+    sole_reader,
+    unrenamed,
+)
+from me2e_compress.graph.shapes import open_shape
+from me2e_compress.targets.base import LintFinding, name_of
+from me2e_compress.targets.quantized import DEQUANTIZE, QUANTIZE
+from me2e_compress.targets.weights import evaluate_constants, quantize_weight
+
+INT32_MAX = float(2**31 - 1)
+"""The largest int32; a bias of more steps becomes -2^31."""
+
+SCALES_APART = 1e-3
+"""Relative difference of two scales that are meant to be equal: twice what rounding to
+float16 moves one."""
+
+_REMEDY = "disabled_optimizers=['WeightBiasQuantization'] keeps it"
+_CLIPS = ("Clip", "Dropout", "Identity", "Relu")
+_MOVES = ("MaxPool", "Reshape", "Slice", "Squeeze", "Transpose", "Unsqueeze")
+"""Operators that onnxruntime moves a pair across, to the layer."""
+_FOLDED = ("Add", "BatchNormalization", "Mul")
+"""Operators that it folds into a float weight first."""
+
+Numbers = npt.NDArray[np.float64]
+Constants = Mapping[str, npt.NDArray[np.generic]]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Layer:
+    """A layer that reads a dequantized activation.
+
+    Attributes:
+        node: Conv, ConvTranspose, Gemm or MatMul.
+        end: what it makes, behind the Add of a MatMul's bias.
+        pair: the DequantizeLinear that it reads.
+        bias: its third operand, or the other one of that Add.
+    """
+
+    node: ir.Node
+    end: ir.Value
+    pair: ir.Node
+    bias: ir.Value | None
+
+    @property
+    def is_reshaped(self) -> bool:
+        """Whether the rows of a MatMul are flattened first, and its answer is not."""
+        return self.node.op_type == "MatMul" and rank_of(self.node.inputs[0]) != 2
+
+    @property
+    def weight(self) -> ir.Value:
+        """Return its weight."""
+        weight = self.node.inputs[1]
+        assert weight is not None
+        return unrenamed(weight)
+
+
+def int8_rewrites(model: ir.Model) -> Iterator[LintFinding]:
+    """Find layers that onnxruntime's int8 computes otherwise than the file says.
+
+    * ``wrapped-bias``: it rounds a float bias to int32 in steps of input times weight,
+      and more steps than int32 holds become -2^31.
+    * ``bias-scale``: its QGemm takes an int32 bias in those steps, whatever the scale
+      of the bias is.
+    * ``float-weight``: it rounds a float weight between two pairs to int8, with one
+      scale in all.
+    """
+    layers = list(_layers(model))
+    constants = _constants(model, layers)
+    for layer in layers:
+        message = _wrapped(layer, constants)
+        if message:
+            yield _wrong("wrapped-bias", layer, message)
+        elif message := _misread(layer, constants):
+            yield _wrong("bias-scale", layer, message)
+        elif message := _rounded(layer, constants):
+            yield _wrong("float-weight", layer, message)
+
+
+def _wrong(rule: str, layer: _Layer, message: str) -> LintFinding:
+    return LintFinding("wrong", rule, name_of(layer.node), message)
+
+
+def _layers(model: ir.Model) -> Iterator[_Layer]:
+    for node in nodes_of(model):
+        if not is_standard(node) or len(node.inputs) < 2 or node.inputs[1] is None:
+            continue
+        pair = _maker_behind(node.inputs[0], DEQUANTIZE)
+        if pair is None:
+            continue
+        if node.op_type in ("Conv", "ConvTranspose", "Gemm"):
+            yield _Layer(node, node.outputs[0], pair, input_at(node, 2))
+        elif node.op_type == "MatMul" and rank_of(node.inputs[1]) == 2:
+            # onnxruntime makes a Gemm of a MatMul and the Add behind it
+            addition = sole_reader(node.outputs[0])
+            bias = None if addition is None else _added(node, addition)
+            if addition is not None and bias is not None:
+                yield _Layer(node, addition.outputs[0], pair, bias)
+
+
+def _added(product: ir.Node, addition: ir.Node) -> ir.Value | None:
+    """Return what is added to a product, if onnxruntime makes a Gemm of the two."""
+    sides = [v for v in addition.inputs if v is not product.outputs[0]]
+    if addition.op_type != "Add" or len(sides) != 1:
+        return None
+    shape, columns = open_shape(sides[0]), open_shape(product.inputs[1])
+    most = 2 if rank_of(product.inputs[0]) == 2 else 1
+    if not shape or not columns or len(shape) > most or shape[-1] != columns[-1]:
+        return None
+    return sides[0]
+
+
+def _maker_behind(value: ir.Value | None, op_type: str) -> ir.Node | None:
+    """Return the node of a type that makes a value, behind Identities and moves."""
+    while (node := maker(value, "Identity", *_MOVES)) is not None:
+        value = node.inputs[0]
+    return maker(value, op_type)
+
+
+def _constants(model: ir.Model, layers: list[_Layer]) -> Constants:
+    """Return the scales and biases of layers, and the float weights, by name."""
+    wanted: list[ir.Value | None] = []
+    for layer in layers:
+        stored = maker(layer.weight, DEQUANTIZE)
+        wanted += [layer.pair.inputs[1], stored.inputs[1] if stored else layer.weight]
+        scale = _scale_of_bias(layer)
+        wanted += [layer.bias if scale is None else scale]
+    values = [value for value in dict.fromkeys(wanted) if value is not None]
+    known = {str(v.name): array for v in values if (array := array_of(v)) is not None}
+    # What nodes compute of constants is folded by onnxruntime, too
+    constant = constant_values(model)
+    names = [str(v.name) for v in values if v in constant and str(v.name) not in known]
+    return {**known, **evaluate_constants(model, names)}
+
+
+def _scale_of_bias(layer: _Layer) -> ir.Value | None:
+    """Return the scale of a bias that is stored as integers."""
+    stored = None if layer.bias is None else maker(unrenamed(layer.bias), DEQUANTIZE)
+    return None if stored is None else stored.inputs[1]
+
+
+def _numbers(value: ir.Value | None, constants: Constants) -> Numbers | None:
+    array = None if value is None else constants.get(str(value.name))
+    return None if array is None else np.asarray(array, np.float64)
+
+
+def _steps(layer: _Layer, constants: Constants) -> Numbers | None:
+    """Return the step of the products: [channels], or [1] for one step everywhere."""
+    stored = maker(layer.weight, DEQUANTIZE)
+    if stored is None:
+        return None
+    left = _numbers(layer.pair.inputs[1], constants)
+    right = _numbers(stored.inputs[1], constants)
+    if left is None or right is None or left.size != 1 or right.ndim > 1:
+        return None
+    # Scales must run along the output channels
+    if right.size > 1:
+        rank, axis = rank_of(layer.weight), stored.attributes.get_int("axis", 1)
+        if rank is not None and axis % rank != channel_axis(layer.node):
+            return None
+    return left.reshape(-1) * right.reshape(-1)
+
+
+def _wrapped(layer: _Layer, constants: Constants) -> str:
+    """Say by how much a float bias exceeds int32; empty if it does not."""
+    steps, bias = _steps(layer, constants), _numbers(layer.bias, constants)
+    if steps is None or bias is None or _scale_of_bias(layer) is not None:
+        return ""
+    fits = bias.ndim == 1 and steps.size in (1, bias.size)
+    if not fits or not _reaches_quantizer(layer):
+        return ""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        counts = np.nan_to_num(np.abs(bias) / np.abs(steps), nan=0.0, posinf=np.inf)
+    wrapped = np.flatnonzero(counts > INT32_MAX)
+    if not wrapped.size:
+        return ""
+    worst = int(counts.argmax())
+    return (
+        "onnxruntime rounds its bias to int32 in steps of input times weight, and"
+        f" {wrapped.size} of {bias.size} do not fit: {bias[worst]:.3g} of channel"
+        f" {worst} is {counts[worst]:.1e} steps; {_REMEDY} in float"
+    )
+
+
+def _misread(layer: _Layer, constants: Constants) -> str:
+    """Say how far the scale of a product's int32 bias is from what QGemm takes."""
+    steps = _steps(layer, constants)
+    own = _numbers(_scale_of_bias(layer), constants)
+    if steps is None or own is None or not own.size or not _becomes_gemm(layer):
+        return ""
+    if own.size > 1 and 1 < steps.size != own.size:
+        return ""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = own.reshape(-1) / steps
+    if np.all(np.abs(ratios - 1) <= SCALES_APART):
+        return ""
+    worst = int(np.abs(np.log(np.abs(ratios) + 1e-300)).argmax())
+    return (
+        "onnxruntime's QGemm takes its int32 bias in steps of input times weight,"
+        f" {steps[min(worst, steps.size - 1)]:.3g}, the file in steps of"
+        f" {own.reshape(-1)[min(worst, own.size - 1)]:.3g}: a bias {ratios[worst]:.3g}"
+        " times as large; lower-int8, or a float bias, mends it"
+    )
+
+
+def _becomes_gemm(layer: _Layer) -> bool:
+    """Return whether onnxruntime makes a QGemm of a product: 8 bits, no factors."""
+    node, integers = layer.node, layer.pair.inputs[0]
+    factors = [node.attributes.get_float(name, 1.0) for name in ("alpha", "beta")]
+    kind = None if integers is None else integers.dtype
+    if node.op_type not in ("Gemm", "MatMul") or factors != [1.0, 1.0]:
+        return False
+    if kind not in (ir.DataType.INT8, ir.DataType.UINT8, None):
+        return False
+    # A quantizer beside other readers hides the product
+    readers = [] if layer.is_reshaped else list(layer.end.consumers())
+    if any(each.op_type == QUANTIZE for each in readers):
+        return len(readers) == 1 and not layer.end.is_graph_output()
+    # So does a clip, unless the quantizer behind it clips as far
+    clip = sole_reader(layer.end) if readers else None
+    if clip is None or clip.op_type not in ("Clip", "Relu"):
+        return True
+    quantizer = sole_reader(clip.outputs[0])
+    if quantizer is None or quantizer.op_type != QUANTIZE:
+        return True
+    zero = array_of(input_at(quantizer, 2))
+    return zero is None or _is_least(zero)
+
+
+def _is_least(zero: npt.NDArray[np.generic]) -> bool:
+    """Return whether nothing below a zero point can be stored."""
+    return bool((zero == np.iinfo(zero.dtype).min).all())
+
+
+def _rounded(layer: _Layer, constants: Constants) -> str:
+    """Say what rounding a float weight between pairs costs; empty if none is."""
+    weight = constants.get(str(layer.weight.name))
+    bias = _numbers(layer.bias, constants)
+    if weight is None or weight.dtype != np.float32 or not weight.size:
+        return ""
+    if layer.bias is not None and (
+        bias is None or bias.ndim != 1 or _scale_of_bias(layer) is not None
+    ):
+        return ""
+    folded = _FOLDED if layer.node.op_type == "Conv" else ("BatchNormalization",)
+    if not _reaches_quantizer(layer, folded):
+        return ""
+    exact = weight.astype(np.float32)
+    integers, step = quantize_weight(exact, None)
+    noise = float(np.square(exact - integers * step).sum(dtype=np.float64))
+    signal = float(np.square(exact).sum(dtype=np.float64))
+    loss = f" ({10 * np.log10(signal / noise):.1f} dB)" if noise and signal else ""
+    return (
+        "it stands between two pairs, so onnxruntime rounds its float weight to int8,"
+        f" with one scale in all{loss}; {_REMEDY}"
+    )
+
+
+def _reaches_quantizer(layer: _Layer, folded: tuple[str, ...] = ()) -> bool:
+    """Return whether a QuantizeLinear alone reads a layer, behind what is looked past.
+
+    Those are what is folded into the layer first, then clips, then moves.
+    """
+    value = layer.end
+    stages = [_MOVES] if layer.is_reshaped else [folded, _CLIPS, _MOVES]
+    while len(value.uses()) == 1:
+        (reader,) = value.consumers()
+        if reader.op_type == QUANTIZE:
+            return True
+        while stages and reader.op_type not in stages[0]:
+            stages.pop(0)
+        others = [v for v in reader.inputs[1:] if v is not None and v is not value]
+        if not stages or any(array_of(v) is None for v in others):
+            return False
+        value = reader.outputs[0]
+    return False
