@@ -101,7 +101,7 @@ def _by_int8(options: ort.SessionOptions) -> bool:
     if options.graph_optimization_level == _AS_WRITTEN:
         return False
     try:
-        return options.get_session_config_entry(QDQ_OFF) != "1"
+        return str(options.get_session_config_entry(QDQ_OFF)) != "1"
     except RuntimeError:  # it is not set
         return True
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,9 @@ from me2e_compress.graph import CONVOLUTIONS, opset_of, producer_of, rewrite
 from me2e_compress.quantization.plan import Decision
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import run_once
+
+Stored = TypeVar("Stored", bound=np.generic)
+"""The type of stored integers."""
 
 MIN_OPSET = 13
 """The first opset whose DequantizeLinear has an axis, i.e. one scale a channel."""
@@ -92,6 +96,48 @@ def quantize_weight(
         rounded = np.moveaxis(balanced_steps(kernels).reshape(sides.shape), 0, axis)
     integers = np.clip(rounded, -QUANT_MAX, QUANT_MAX).astype(np.int8)
     return integers, steps.reshape(() if axis is None else -1)
+
+
+def requantized(
+    integers: npt.NDArray[Stored],
+    scales: Array,
+    fresh: Array,
+    axis: int | None,
+    zero: Array | None = None,
+) -> npt.NDArray[Stored]:
+    """Round integers of some scales to other scales, in the same type.
+
+    Args:
+        integers: of any shape; ``(integer - zero) * scale`` is what they stand for.
+        scales: [channels] along ``axis``, or [] for all.
+        fresh: the other ones, of the same shape, above 0.
+        axis: the axis of the channels; None without channels.
+        zero: their zero points, of the same shape; None for 0.
+    """
+    shape = [1] * integers.ndim
+    if axis is not None and scales.size > 1:
+        shape[axis] = -1
+    ratio = (scales.astype(np.float64) / fresh.astype(np.float64)).reshape(shape)
+    centre = np.zeros(1) if zero is None else zero.astype(np.float64).reshape(shape)
+    kind = np.iinfo(integers.dtype.name)
+    moved = np.rint((integers.astype(np.float64) - centre) * ratio) + centre
+    return np.clip(moved, kind.min, kind.max).astype(integers.dtype)
+
+
+def scales_in(
+    scales: npt.NDArray[np.float32], kind: npt.DTypeLike
+) -> npt.NDArray[np.floating]:
+    """Round scales to a floating-point type, but none to 0.
+
+    Below its smallest normal number, 2^-14 of float16, a type has fewer digits, and
+    none below its smallest one, 2^-24: such scales are rounded up, so that integers of
+    theirs, rounded again (:func:`requantized`), still fit.
+    """
+    near = scales.astype(kind)
+    below = near.astype(np.float64) < scales
+    few = scales < np.finfo(near.dtype).smallest_normal
+    above = np.nextafter(near, near.dtype.type(np.inf))
+    return np.asarray(np.where(below & few, above, near), near.dtype)
 
 
 def balanced_steps(exact: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:

@@ -16,6 +16,7 @@ from me2e_compress.passes.convert_float16.element_types import (
     ElementTypes,
     Retyping,
 )
+from me2e_compress.passes.convert_float16.scales import hold_scales
 from me2e_compress.passes.convert_float16.wide_nodes import matching, wide_nodes
 from me2e_compress.targets.quantized import describe_quantized
 
@@ -82,6 +83,7 @@ class ConvertFloat16(Pass):
         wide = found | wide
         # Everything else that can be float16 becomes float16
         narrow = [n for n in model.graph if n not in wide and types.inputs(n)]
+        hold_scales(model, set(narrow))
         retyping = Retyping(model, types, self.name)
         retyping.run(narrow, keep_io=self.keep_io)
         return PassResult(model, retyping.changed, _notes(narrow, wide, context))

@@ -247,7 +247,7 @@ def _becomes_gemm(layer: _Layer) -> bool:
 
 def _is_least(zero: npt.NDArray[np.generic]) -> bool:
     """Return whether nothing below a zero point can be stored."""
-    return bool((zero == np.iinfo(zero.dtype).min).all())
+    return bool(np.all(zero == np.iinfo(zero.dtype.name).min))
 
 
 def _rounded(layer: _Layer, constants: Constants) -> str:

@@ -1,8 +1,5 @@
 """Determine which layers onnxruntime's CPU computes on uint8 and int8."""
 
-import math
-
-import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
@@ -15,6 +12,7 @@ from me2e_compress.graph.shapes import (
     open_shape,
     static_shape,
 )
+from me2e_compress.targets.biases import is_bias
 
 MOVES = frozenset(
     {
@@ -85,33 +83,6 @@ def reads_one_pixel(node: ir.Node) -> bool:
         and node.attributes.get_int("group", 1) == 1
         and not any(node.attributes.get_ints("pads", []))
     )
-
-
-def is_bias(value: ir.Value | None, rank: int, columns: int | None) -> bool:
-    """Return whether a value is a constant that adds one number to every column."""
-    # A higher rank or more columns would change the product's shape.
-    array = graph.array_of(value)
-    return (
-        array is not None
-        and array.ndim <= rank
-        and math.prod(array.shape[:-1]) == 1
-        and array.size in (1, columns)
-        and array.dtype == np.float32
-    )
-
-
-def biased_end(product: ir.Node) -> ir.Node | None:
-    """Return the Add of a bias to a MatMul; None if others read the product."""
-    value = product.outputs[0]
-    addition = sole_reader(value)
-    rank = rank_of(product.inputs[0]) or 0
-    if addition is None or addition.op_type != "Add":
-        return None
-    # The other operand must be a plain bias.
-    others = [each for each in addition.inputs if each is not value]
-    columns = extent(product, weight=True).columns
-    found = len(others) == 1 and is_bias(others[0], rank, columns)
-    return addition if found else None
 
 
 def is_move(node: ir.Node) -> bool:

@@ -13,26 +13,22 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress import graph
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph import rewrite
-from me2e_compress.targets.onnxruntime.insertion import Place
-from me2e_compress.targets.onnxruntime.kernels import (
+from me2e_compress.graph import rank_of, rewrite
+from me2e_compress.targets.biases import (
+    Floats,
+    bias_by_channel,
     biased_end,
-    end_of,
-    reads_one_pixel,
+    least_scales,
+    with_room,
 )
+from me2e_compress.targets.onnxruntime.insertion import Place
+from me2e_compress.targets.onnxruntime.kernels import end_of, reads_one_pixel
 from me2e_compress.targets.quantized import QUANTIZE
 from me2e_compress.targets.weights import QuantizedWeight
 from me2e_compress.targets.writer import Writer
 
-BIAS_MAX = 2**30
-"""Largest int32 bias: half the accumulator is left for the products, which need at most
-127 * 255 * K: enough for K up to 33,000."""
-
 CHANNELS_SECOND, CHANNELS_LAST = (0, 3, 1, 2), (0, 2, 3, 1)
-
-Floats = npt.NDArray[np.float32]
 
 
 def write_layer(
@@ -52,7 +48,7 @@ def write_layer(
 
     ``step`` is the scale of the uint8 tensor that the layer reads.
     """
-    bias = _bias(node, len(weight.scales))
+    bias = bias_by_channel(node, len(weight.scales))
     integers = None
     if bias is not None:
         weight, integers = with_bias(weight, bias, step)
@@ -86,36 +82,11 @@ def with_bias(
     If a channel's weights are so small that its bias does not fit, the channel gets a
     coarser scale: its products are then below the bias's own rounding.
     """
-    # The scales at which the largest bias still fits.
-    least = np.abs(bias) / (np.float64(BIAS_MAX) * step)
-    scales = np.maximum(weight.scales, least).astype(np.float32)
-    if (scales > weight.scales).any():
-        shape = [1] * weight.integers.ndim
-        if weight.axis is not None:
-            shape[weight.axis] = -1
-        ratio = (weight.scales / scales).reshape(shape)
-        coarse = np.rint(weight.integers * ratio).astype(np.int8)
-        weight = QuantizedWeight(f"{weight.name}_coarse", coarse, scales, weight.axis)
+    roomy = with_room(weight, least_scales(bias, step))
+    if roomy is not weight:
+        weight = dataclasses.replace(roomy, name=f"{weight.name}_coarse")
     integers = np.rint(bias / (weight.scales.astype(np.float64) * step))
     return weight, integers.astype(np.int32)
-
-
-def _bias(node: ir.Node, channels: int) -> Floats | None:
-    """Read the bias of a layer, one number a channel; None if it has none."""
-    if node.op_type == "MatMul":
-        end = biased_end(node)
-        value = None if end is None else _other(end, node.outputs[0])
-    else:
-        value = graph.bias_of(node)
-    array = graph.array_of(value)
-    if array is None:
-        return None
-    return np.broadcast_to(array.astype(np.float32).reshape(-1), (channels,))
-
-
-def _other(addition: ir.Node, known: ir.Value) -> ir.Value | None:
-    left, right = addition.inputs
-    return right if left is known else left
 
 
 def _store(writer: Writer, node: ir.Node, index: int, weight: QuantizedWeight) -> None:
@@ -174,7 +145,7 @@ def _write_row(writer: Writer, node: ir.Node, size: Sequence[int]) -> ir.Node:
     old, (image, weight) = node.outputs[0], node.inputs[:2]
     if image is None or weight is None:
         raise PreconditionError(f"{node.name} is not a convolution")
-    name, ones = str(old.name), [1] * (graph.rank_of(image) or 4)
+    name, ones = str(old.name), [1] * (rank_of(image) or 4)
     place = Place(writer, node, [node])
     row = place.reshaped(image, [-1, size[1]], f"{name}_row")
     inputs = [row, weight, weight]

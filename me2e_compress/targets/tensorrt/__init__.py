@@ -8,10 +8,11 @@ of a tensor share one pair, all float readers read the tensor itself.
 """
 
 import dataclasses
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress.calibration.observers import scale_of
@@ -26,10 +27,16 @@ from me2e_compress.quantization.plan import (
     tensors_of,
 )
 from me2e_compress.targets.base import LintRule, Target
+from me2e_compress.targets.biases import bias_by_channel, least_scales, with_room
 from me2e_compress.targets.tensorrt.costs import MACHINES, costs_of
 from me2e_compress.targets.tensorrt.lint import rules
 from me2e_compress.targets.tensorrt.lint.support_matrix import version_of
-from me2e_compress.targets.weights import QuantizedWeight, weights_of
+from me2e_compress.targets.weights import (
+    QuantizedWeight,
+    requantized,
+    scales_in,
+    weights_of,
+)
 from me2e_compress.targets.writer import Writer
 
 __all__ = ["TensorRT"]
@@ -72,9 +79,10 @@ class TensorRT(Target):
         """
         self.check_types(plan, model)
         weights = weights_of(model, plan.chosen, balanced=plan.balanced)
-        copy = model.clone()
+        copy, shared = model.clone(), share_scales(plan, ranges)
         nodes = {str(node.outputs[0].name): node for node in copy.graph}
-        pairs = _Pairs(copy.graph, share_scales(plan, ranges))
+        weights = _with_room(weights, nodes, shared)
+        pairs = _Pairs(copy.graph, shared)
         for decision in plan.chosen:
             pairs.apply(nodes[decision.output], decision, weights.get(decision.output))
         rewrite.sweep(copy)
@@ -107,6 +115,34 @@ class TensorRT(Target):
     def lint_rules(self) -> tuple[LintRule, ...]:
         """Return the rules of its parser and of explicit quantization."""
         return rules(version_of(self.version) if self.version else None)
+
+
+def _with_room(
+    weights: Mapping[str, QuantizedWeight],
+    nodes: Mapping[str, ir.Node],
+    ranges: Ranges,
+) -> dict[str, QuantizedWeight]:
+    """Leave room for the biases: TensorRT keeps them in float, onnxruntime does not.
+
+    Layers that share a weight share its scales, so the largest of their least ones.
+    """
+    least: dict[tuple[str, int | None], npt.NDArray[np.float64]] = {}
+    for output, weight in weights.items():
+        value = nodes[output].inputs[0]
+        known = None if value is None else ranges.tensors.get(str(value.name))
+        channels = None if weight.axis is None else weight.scales.size
+        bias = bias_by_channel(nodes[output], channels)
+        if bias is None or known is None:
+            continue
+        key = weight.name, weight.axis
+        wanted = least_scales(bias, scale_of(*known))
+        least[key] = np.maximum(wanted, least.get(key, 0.0))
+    return {
+        output: weight
+        if (weight.name, weight.axis) not in least
+        else with_room(weight, least[weight.name, weight.axis])
+        for output, weight in weights.items()
+    }
 
 
 class _Pairs:
@@ -157,7 +193,8 @@ class _Pairs:
         """Return the dequantized tensor that all int8 readers of a value share."""
         name = str(value.name)
         if name not in self._activations:
-            step = np.array(scale_of(*self._ranges.tensors[name]), _numpy(value))
+            exact = np.array(scale_of(*self._ranges.tensors[name]))
+            step = scales_in(exact, _numpy(value))
             scale = self._write.constant(step, f"{name}_scale")
             if self._zero is None:
                 self._zero = self._write.constant(np.array(0, np.int8), "int8_zero")
@@ -171,10 +208,11 @@ class _Pairs:
     ) -> ir.Value:
         key = weight.name, weight.axis
         if key not in self._weights:
+            scales = scales_in(weight.scales, _numpy(like))
             self._weights[key] = self._write.dequantized(
                 weight.name,
-                weight.integers,
-                weight.scales.astype(_numpy(like)),
+                requantized(weight.integers, weight.scales, scales, weight.axis),
+                scales,
                 weight.axis,
                 reader,
                 f"{weight.name}_DequantizeLinear",
