@@ -37,6 +37,7 @@ from me2e_compress.workflows.inspect_result import InspectResult
 from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.lint import RuleSummary
 from me2e_compress.workflows.measured_loss import MeasuredLoss
+from me2e_compress.workflows.runtime_loss import RuntimeLoss
 from me2e_compress.zoo.weights_record import WeightsRecord
 
 PAGE = Path(__file__).parents[1] / "docs" / "json.md"
@@ -56,7 +57,7 @@ NAMED = (
     *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity, Remedy, Rung),
     *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
     *(Int8Outcome, RuleSummary, WeightsRecord, RangeFinding, DumpResult),
-    *(FirstDifference,),
+    *(FirstDifference, RuntimeLoss),
 )
 """Classes that the forms name; what their fields name is found."""
 HEAD = """\

@@ -143,7 +143,7 @@ def _compare(
             f"no output in common: {', '.join(a.outputs)} and {', '.join(b.outputs)}"
         )
     # what can be compared: single outputs, the plan, sets of agents
-    tallies = {name: _Tally(name) for name in shared}
+    tallies = {name: Tally(name) for name in shared}
     adapter, reason = common_adapter(a, b)
     named = SetOutputs.of(a.metadata, {name: a.outputs[name].shape for name in shared})
     sets = None if named is None else SetTally(named)
@@ -203,8 +203,8 @@ MODES_RANK = 4
 """Rank of a plan with modes: [1, modes, n, 2]."""
 
 
-class _Tally:
-    """Sums over frames of one output."""
+class Tally:
+    """Sums over frames of one output: float64."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -213,6 +213,7 @@ class _Tally:
         self.discrete = False
 
     def add(self, a: Array, b: Array, frame: int) -> None:
+        """Add a frame; EvaluationError if shapes differ, or a number is not finite."""
         if a.shape != b.shape:
             raise EvaluationError(
                 f"output {self.name} is {list(a.shape)} in the first model,"
@@ -232,6 +233,7 @@ class _Tally:
         self.gap = max(self.gap, float(gap.max()))
 
     def result(self) -> OutputFidelity:
+        """Return the output's fidelity over the frames so far."""
         error = self.gap / self.reach if self.reach else math.inf if self.gap else 0.0
         sqnr, apart = _decibels(self.signal, self.noise), len(self.frames_db) > 1
         least, most = (

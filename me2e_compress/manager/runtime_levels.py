@@ -4,7 +4,8 @@ It rewrites a graph when it opens it, at levels that do more and more; a rewrite
 wrong for a graph (there were some in every release) is not the fault of a pass.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 
 import onnx_ir as ir
 
@@ -60,7 +61,7 @@ def _of_graph(
             return
         for name in [each for each in waiting if gaps[each] > allowed[each]]:
             waiting = [each for each in waiting if each != name]
-            node = _first_node(model, name, level, allowed[name], inputs)
+            node = first_node(model, name, level, allowed[name], inputs)
             where = "" if node is None else f", from node {node.name} ({node.op_type})"
             yield (
                 f"onnxruntime gives another {name} of the graph {what} at its level"
@@ -69,12 +70,14 @@ def _of_graph(
             )
 
 
-def _first_node(
+def first_node(
     model: ir.Model,
     output: str,
     level: Level,
     allowed: float,
     inputs: VerificationInputs,
+    *,
+    int8_kernels: bool = False,
 ) -> ir.Node | None:
     """Find the first node behind which a level differs, in log2 trials.
 
@@ -87,7 +90,11 @@ def _first_node(
     behind = [node for node in model.graph if node in makers]
 
     def differs(node: ir.Node) -> bool:
-        return _gap(_up_to(model, node), feeds, level, inputs) > allowed
+        part = _up_to(model, node)
+        opened = partial(Session, part, provider=inputs.provider)
+        if int8_kernels:
+            opened = partial(opened, int8_kernels=True)
+        return _gap(opened, feeds, level) > allowed
 
     if not behind or not differs(behind[-1]):
         return None
@@ -111,12 +118,11 @@ def _up_to(model: ir.Model, node: ir.Node) -> ir.Model:
 
 
 def _gap(
-    part: ir.Model, feeds: Mapping[str, Array], level: Level, inputs: VerificationInputs
+    opened: Callable[..., Session], feeds: Mapping[str, Array], level: Level
 ) -> float:
     try:
         plain, optimized = (
-            Session(part, optimize=each, provider=inputs.provider).run(feeds)
-            for each in ("none", level)
+            opened(optimize=each).run(feeds) for each in ("none", level)
         )
     except (GraphError, FramesError):
         return 0.0  # an output of a type that cannot be compared, say

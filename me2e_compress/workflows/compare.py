@@ -24,6 +24,11 @@ from me2e_compress.workflows.checks import check_number, model_path
 from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, counted, table
+from me2e_compress.workflows.runtime_loss import (
+    RuntimeLoss,
+    RuntimeTally,
+    has_int8_kernels,
+)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -31,7 +36,8 @@ class CompareResult(Result):
     """How close a graph stays to another.
 
     `open_loop` holds both plans against the recorded future; where that is None, not
-    measured, `open_loop_reason` says why. `liveness` is None if it was not asked for.
+    measured, `open_loop_reason` says why. `liveness` is None if it was not asked for;
+    `runtime`, what onnxruntime's int8 answers otherwise, if there is none to ask.
     """
 
     reference: Path
@@ -40,6 +46,7 @@ class CompareResult(Result):
     open_loop: OpenLoop | None = None
     open_loop_reason: str = ""
     liveness: Liveness | None = None
+    runtime: RuntimeLoss | None = None
 
     @property
     def status(self) -> Status:
@@ -54,7 +61,8 @@ class CompareResult(Result):
     def lines(self) -> tuple[str, ...]:
         """Return how far the plan moved, and which outputs answer their inputs."""
         alive = () if self.liveness is None else self.liveness.lines()
-        return (self.headline, *alive)
+        runtime = () if self.runtime is None else self.runtime.lines()
+        return (self.headline, *alive, *runtime)
 
     def alerts(self) -> tuple[str, ...]:
         """Return the outputs that are dead, and states that are not fed."""
@@ -97,11 +105,13 @@ class CompareResult(Result):
         """Return the fidelity, liveness, and both plans against the recorded future."""
         alive = None if self.liveness is None else dataclasses.asdict(self.liveness)
         driven = None if self.open_loop is None else dataclasses.asdict(self.open_loop)
+        runtime = None if self.runtime is None else dataclasses.asdict(self.runtime)
         return {
             **dataclasses.asdict(self.fidelity),
             "open_loop": driven,
             "open_loop_reason": self.open_loop_reason,
             "liveness": alive,
+            "runtime": runtime,
         }
 
 
@@ -190,7 +200,14 @@ def compare(
     # plans are judged against the recorded future where one is known
     tally = None if read is None else OpenLoopTally(read)
     lively = LivenessTally(left, right) if alive else None
-    watching = [each.add for each in (tally, lively) if each is not None]
+    # what onnxruntime's int8 answers, beside the nodes as they stand
+    kernels = None
+    if not as_it_stands and has_int8_kernels(models[-1], provider):
+        third = open_session(
+            paths[1], stock=True, release=True, provider=provider, said=said[paths[1]]
+        )
+        kernels = RuntimeTally(third, recording)
+    watching = [each.add for each in (tally, lively, kernels) if each is not None]
 
     def watch(a: dict[str, Array], b: dict[str, Array], frame: Frame) -> None:
         for add in watching:
@@ -198,6 +215,9 @@ def compare(
 
     fidelity = measure(left, right, map(reported, recording), watch)
     found = CompareResult(*paths, fidelity)
+    if kernels is not None:
+        runtime = kernels.result(models[-1], fidelity)
+        found = dataclasses.replace(found, runtime=runtime)
     if lively is not None:
         model = models[-1]
         told = lively.result(alive, model, ablated=_is_ablated(model))

@@ -16,15 +16,15 @@ from me2e_compress.errors import EvaluationError, FramesError, GraphError, Me2eE
 from me2e_compress.fidelity.compare import Fidelity, Reference
 from me2e_compress.fidelity.floor import Floor, Rounding
 from me2e_compress.fidelity.liveness import LivenessTally
-from me2e_compress.fidelity.output_liveness import Liveness
 from me2e_compress.graph import LoadedModel
 from me2e_compress.manager import Report
 from me2e_compress.manager.report import LossyPass
 from me2e_compress.passes import Context, Pass
+from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import QuantPlan, plan_of
 from me2e_compress.quantization.plan.overrides import Override, overrides_text
-from me2e_compress.runtime.frames import Frames
+from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.others_load import cpu_seconds
 from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
@@ -33,6 +33,7 @@ from me2e_compress.sensitivity.remedy import MOST_TRIALS, RemedySearch
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.workflows.measured_loss import NOT_ASKED, MeasuredLoss
+from me2e_compress.workflows.runtime_loss import RuntimeTally, has_int8_kernels
 from me2e_compress.zoo.shipped import sample_frames
 
 KEPT_OUT = "kept out of calibration"
@@ -134,8 +135,9 @@ class _Measurement:
         """Measure; below the floor, find out which outputs, passes and nodes."""
         before = self.report.lossy[0].before
         reference = self._reference(self.report.lossy[0])
-        fidelity, liveness = self._answers(reference)
-        found = dataclasses.replace(found, fidelity=fidelity, liveness=liveness)
+        found = self._answers(found, reference)
+        fidelity = found.fidelity
+        assert fidelity is not None
         low = [each.output for each in self.floor.shortfalls(fidelity)]
         if not low:
             return found
@@ -148,18 +150,46 @@ class _Measurement:
         )
         return self._blame(found, reference) if below else found
 
-    def _answers(self, reference: Reference) -> tuple[Fidelity, Liveness | None]:
+    def _answers(self, found: MeasuredLoss, reference: Reference) -> MeasuredLoss:
         """Compare the result with the graph before, and how both answer their inputs.
 
-        What lossy passes other than a quantizer cut, they are meant to cut.
+        What lossy passes other than a quantizer cut, they are meant to cut. A graph for
+        onnxruntime is run by its int8 kernels, too.
         """
         session, model = self._session(self.report.model), self.report.model
-        if not self.floor.alive:
-            return reference.compare(session), None
-        tally = LivenessTally(reference.session, session)
-        fidelity = reference.compare(session, watch=tally.add)
+        alive = self.floor.alive
+        lively = LivenessTally(reference.session, session) if alive else None
+        kernels = self._kernels(model)
+        watching = [each.add for each in (lively, kernels) if each is not None]
+
+        def watch(a: dict[str, Array], b: dict[str, Array], frame: Frame) -> None:
+            for add in watching:
+                add(a, b, frame)
+
+        fidelity = reference.compare(session, watch=watch)
         ablated = not all(each.applied.quantizes for each in self.report.lossy)
-        return fidelity, tally.result(self.floor.alive, model, ablated=ablated)
+        return dataclasses.replace(
+            found,
+            fidelity=fidelity,
+            liveness=None
+            if lively is None
+            else lively.result(alive, model, ablated=ablated),
+            runtime=None if kernels is None else kernels.result(model, fidelity),
+        )
+
+    def _kernels(self, model: ir.Model) -> RuntimeTally | None:
+        """Return what runs a graph that was written for onnxruntime as it runs it."""
+        provider = self.context.provider
+        written = any(
+            TARGETS.parse(each.target).opens
+            if isinstance(each, QuantizeInt8)
+            else isinstance(each, LowerInt8)
+            for each in (lossy.applied for lossy in self.report.lossy)
+        )
+        if not written or not has_int8_kernels(model, provider):
+            return None
+        session = Session(model, stock=True, release=True, provider=provider)
+        return RuntimeTally(session, self.frames)
 
     def _blame(self, found: MeasuredLoss, reference: Reference) -> MeasuredLoss:
         """Name the passes, and where int8 is to blame, the nodes."""

@@ -8,6 +8,7 @@ from me2e_compress.fidelity.floor import Floor, Rounding, Shortfall, shown
 from me2e_compress.fidelity.output_liveness import Liveness
 from me2e_compress.sensitivity.remedy import Remedy
 from me2e_compress.workflows.result import Table, counted, table
+from me2e_compress.workflows.runtime_loss import RuntimeLoss
 
 NOT_ASKED = "--measure-frames 0"
 
@@ -33,6 +34,7 @@ class MeasuredLoss:
         remedy: what would restore the quality; None if nothing was searched, because
             another pass is guilty, or the one that quantizes takes no overrides.
         liveness: which outputs still answer their inputs; None if not asked.
+        runtime: what onnxruntime's int8 answers otherwise; None if it is not for it.
         seconds: CPU time of measuring and searching.
         search_seconds: CPU time of the search for a remedy.
     """
@@ -43,6 +45,7 @@ class MeasuredLoss:
     unsteady: Mapping[str, float] = dataclasses.field(default_factory=dict)
     rounding: Rounding | None = None
     liveness: Liveness | None = None
+    runtime: RuntimeLoss | None = None
     shortfalls: tuple[Shortfall, ...] = ()
     guilty: tuple[str, ...] = ()
     remedy: Remedy | None = None
@@ -61,6 +64,8 @@ class MeasuredLoss:
             yield from self._rounded(found, self.rounding)
         if self.liveness is not None:
             yield from self.liveness.lines()
+        if self.runtime is not None:
+            yield from self.runtime.lines()
 
     def alerts(self) -> Iterator[str]:
         """Yield what cannot be compared or is below the floor, and what helps."""
