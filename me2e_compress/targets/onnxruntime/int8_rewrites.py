@@ -234,13 +234,13 @@ def _becomes_gemm(layer: _Layer) -> bool:
     readers = [] if layer.is_reshaped else list(layer.end.consumers())
     if any(each.op_type == QUANTIZE for each in readers):
         return len(readers) == 1 and not layer.end.is_graph_output()
-    # So does a clip, unless the quantizer behind it clips as far
+    # So does a clip that one node reads, unless that is a quantizer that clips as far
     clip = sole_reader(layer.end) if readers else None
     if clip is None or clip.op_type not in ("Clip", "Relu"):
         return True
     quantizer = sole_reader(clip.outputs[0])
     if quantizer is None or quantizer.op_type != QUANTIZE:
-        return True
+        return quantizer is None
     zero = array_of(input_at(quantizer, 2))
     return zero is None or _is_least(zero)
 
@@ -280,7 +280,10 @@ def _reaches_quantizer(layer: _Layer, folded: tuple[str, ...] = ()) -> bool:
     Those are what is folded into the layer first, then clips, then moves.
     """
     value = layer.end
-    stages = [_MOVES] if layer.is_reshaped else [folded, _CLIPS, _MOVES]
+    moves = _MOVES
+    if layer.node.op_type == "Gemm" and layer.bias is None:
+        moves = tuple(each for each in moves if each != "Transpose")  # fused before
+    stages = [moves] if layer.is_reshaped else [folded, _CLIPS, moves]
     while len(value.uses()) == 1:
         (reader,) = value.consumers()
         if reader.op_type == QUANTIZE:

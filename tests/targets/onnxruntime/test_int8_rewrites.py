@@ -1,0 +1,105 @@
+"""Lint names what onnxruntime's int8 computes otherwise, and nothing else."""
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from me2e_compress.runtime.session import Session
+from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_rewrites
+from tests.profiles import scaled
+from tests.targets.onnxruntime.rewritten import SIZE, Drawn
+
+FAR_DB, ROUNDED_DB = 26.0, 60.0
+"""SQNR of what is computed otherwise (but a rounded weight), and of a rounded one."""
+
+
+def sqnr(drawn: Drawn, **options: bool) -> float:
+    """Hold a session against the nodes as they stand, in float64."""
+    model, frame = drawn.model(), drawn.frame()
+    exact = Session(model, threads=1, optimize=False).run(frame)["y"]
+    answer = Session(model, threads=1, **options).run(frame)["y"]
+    wide, noise = exact.astype(np.float64), exact.astype(np.float64) - answer
+    return float(
+        10 * np.log10(np.square(wide).sum() / (np.square(noise).sum() + 1e-30))
+    )
+
+
+@st.composite
+def layers(draw: st.DrawFn) -> Drawn:
+    """Draw a form; a MatMul has a bias, and no operator gives an int32 one."""
+    op = draw(st.sampled_from(("Conv", "ConvTranspose", "Gemm", "Add")))
+    weight = draw(st.sampled_from(("channel", "tensor", "float")))
+    biases = ("float", "far", "own", "none") if weight == "float" else (
+        "float", "far", "own", "right", "none",
+    )  # fmt: skip
+    bias = draw(st.sampled_from(biases))
+    assume(op != "Add" or bias != "none")
+    shapes = ((SIZE,),) if op.startswith("Conv") else ((SIZE,), (1, SIZE))
+    rows = op == "Add" and draw(st.booleans())
+    return Drawn(
+        op,
+        weight,
+        bias,
+        draw(st.sampled_from(shapes)) if bias != "right" else (SIZE,),
+        draw(st.sampled_from(("", "Cast"))),
+        draw(st.sampled_from(("", "Relu", "Transpose", "Sigmoid"))),
+        answered=draw(st.booleans()),
+        transposed=op == "Gemm" and draw(st.booleans()),
+        rows=rows,
+        kind=draw(st.sampled_from(("uint8", "int8"))),
+        opset=draw(st.sampled_from((13, 17, 19, 21))),
+        seed=draw(st.integers(0, 2**32 - 2)),
+    )
+
+
+@settings(max_examples=scaled(150))
+@given(layers())
+def test_what_runs_otherwise_is_named_and_nothing_else(drawn: Drawn) -> None:
+    rules = [each.rule for each in int8_rewrites(drawn.model())]
+
+    apart = sqnr(drawn, stock=True)
+
+    if "float-weight" in rules:
+        assert apart < ROUNDED_DB
+    elif rules:
+        assert apart < FAR_DB
+    else:
+        assert apart > FAR_DB  # ties are rounded otherwise at times
+
+
+@settings(max_examples=scaled(50))
+@given(layers())
+def test_our_sessions_answer_what_the_nodes_say(drawn: Drawn) -> None:
+    assert sqnr(drawn) > 100
+
+
+@pytest.mark.parametrize(
+    ("drawn", "rule", "words"),
+    [
+        (Drawn(bias="far"), "wrapped-bias", "1 of 8 do not fit"),
+        (Drawn("ConvTranspose", bias="far"), "wrapped-bias", "of channel 3 is"),
+        (Drawn("Add", bias="far", rows=True), "wrapped-bias", "1 of 8 do not fit"),
+        (Drawn("Gemm", bias="own"), "bias-scale", "the file in steps of 0.001"),
+        (Drawn("Add", "tensor", "own", (1, SIZE)), "bias-scale", "steps of 0.001"),
+        (Drawn(weight="float"), "float-weight", "rounds its float weight to int8"),
+    ],
+)
+def test_the_layer_and_the_cause_are_named(drawn: Drawn, rule: str, words: str) -> None:
+    found = [e for e in OnnxRuntime().lint(drawn.model()) if e.severity == "wrong"]
+
+    assert [(each.rule, each.node) for each in found] == [(rule, "layer")]
+    assert words in found[0].message
+
+
+@pytest.mark.parametrize(("off", "rules"), [(1.0005, []), (1.002, ["bias-scale"])])
+def test_a_scale_that_float16_rounded_is_the_right_one(
+    off: float, rules: list[str]
+) -> None:
+    model = Drawn("Gemm", bias="right").model()
+    scale = model.graph.initializers["bs"]
+    assert scale.const_value is not None
+    scale.const_value = ir.tensor(scale.const_value.numpy() * np.float32(off))
+
+    assert [each.rule for each in int8_rewrites(model)] == rules
