@@ -161,3 +161,44 @@ def test_a_scale_stays_where_the_output_has_a_type_of_its_own() -> None:
     assert types_of(half)["QuantizeLinear"] == "FLOAT16"
     (y,) = compute(half, {"x": np.ones(4, np.float32)})
     np.testing.assert_array_equal(y, np.ones(4, np.float32))
+
+
+FAINT = """<ir_version: 9, opset_import: ["" : 19]>
+    faint (float[1,8,6,6] x, int8[32,8,3,3] w, float[32] s, int8[32] z)
+        => (float[1,32,4,4] y) <float sx = {0.03125}, int8 zx = {0}> {
+        q = QuantizeLinear(x, sx, zx)
+        d = DequantizeLinear(q, sx, zx)
+        v = DequantizeLinear<axis=0>(w, s, z)
+        y = Conv<kernel_shape=[3,3]>(d, v)
+    }"""
+
+
+@pytest.mark.parametrize("faint", [1e-5, 3e-7, 1e-9, 1e-30])
+def test_no_scale_becomes_zero_or_loses_its_digits(faint: float) -> None:
+    random = np.random.default_rng(5)
+    scales = random.uniform(0.002, 0.004, 32).astype(np.float32)
+    scales[::4] = random.uniform(0.5, 1, 8) * faint
+    integers = random.integers(-127, 128, (32, 8, 3, 3)).astype(np.int8)
+    model = ir.from_onnx_text(FAINT)
+    stored = {"w": integers, "s": scales, "z": np.zeros(32, np.int8)}
+    for value in list(model.graph.inputs):
+        if value.name in stored:
+            model.graph.inputs.remove(value)
+            value.const_value = ir.tensor(stored[value.name], name=value.name)
+            model.graph.register_initializer(value)
+    graph.infer_shapes(model)
+    exact = integers * scales.astype(np.float64).reshape(-1, 1, 1, 1)
+
+    half = ConvertFloat16().run(model, Context(MODULES)).model
+
+    (node,) = (n for n in half.graph if n.outputs[0].name == "v")
+    held, steps = (graph.array_of(value) for value in node.inputs[:2])
+    assert held is not None
+    assert steps is not None
+    assert steps.dtype == np.float16
+    assert (steps > 0).all()
+    wide = steps.astype(np.float64).reshape(-1, 1, 1, 1)
+    off = np.abs(held * wide - exact) / wide
+    assert off.max() <= 0.5 + 127 * 2.0**-11
+    others = np.arange(32) % 4 != 0
+    np.testing.assert_array_equal(held[others], integers[others])

@@ -1,0 +1,215 @@
+"""Scales leave room for the biases beside them, and stay what they were elsewhere."""
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from me2e_compress import graph
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.graph import producer_of
+from me2e_compress.quantization.plan import make_plan
+from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.targets import TARGETS
+from me2e_compress.targets.biases import (
+    BIAS_MAX,
+    bias_by_channel,
+    least_scales,
+    with_room,
+)
+from me2e_compress.targets.weights import (
+    QuantizedWeight,
+    quantize_weight,
+    requantized,
+    scales_in,
+)
+from tests.nets import MODULES, PAPER, net
+from tests.profiles import scaled
+
+DEAD = """
+<ir_version: 9, opset_import: ["" : 19]>
+net (float[1,8,6,6] x, float[6,8] t, float[8,8,3,3] conv, float[8] b1,
+     float[8,8,3,3] up, float[8] b2, float[8,8] right, float[8] b3,
+     float[8,8] turned, float[8] b4, float[8,8] matrix, float[1,8] b5, float[8] b6)
+    => (float[1,8,4,4] a, float[1,8,8,8] b, float[6,8] c, float[6,8] d, float[6,8] e,
+        float[6,8] f) {
+    a = Conv<kernel_shape=[3,3]>(x, conv, b1)
+    b = ConvTranspose<kernel_shape=[3,3]>(x, up, b2)
+    c = Gemm(t, right, b3)
+    d = Gemm<transB=1>(t, turned, b4)
+    p = MatMul(t, matrix)
+    e = Add(p, b5)
+    s = Tanh(t)
+    q = MatMul(s, matrix)
+    f = Add(b6, q)
+}
+"""
+AXES = {"conv": 0, "up": 1, "right": 1, "turned": 0, "matrix": 1}
+DEAD_CHANNEL = 3
+
+
+def dead(seed: int, faint: float) -> ir.Model:
+    """Draw layers of which one channel has weights of ``faint`` and a bias."""
+    random = np.random.default_rng(seed)
+    weights = {}
+    for name, axis in AXES.items():
+        size = (8, 8, 3, 3) if name in ("conv", "up") else (8, 8)
+        rows = random.normal(size=size)
+        np.moveaxis(rows, axis, 0)[DEAD_CHANNEL] *= faint
+        weights[name] = rows
+    for index in range(1, 7):
+        weights[f"b{index}"] = random.normal(size=(1, 8) if index == 5 else 8) + 1
+    # the second reader of a weight has the larger bias
+    weights["b6"] = weights["b6"] * 50
+    return net(DEAD, weights)
+
+
+def placed(model: ir.Model, target: str) -> ir.Model:
+    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
+    runtime = TARGETS.parse(target)
+    ranges = dict.fromkeys(runtime.tensors(plan, model), (-3.0, 2.0))
+    return runtime.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
+
+
+def counts(model: ir.Model) -> list[float]:
+    """Count the steps of every float bias in units of input times weight."""
+    found = []
+    for node in model.graph:
+        if node.op_type not in ("Conv", "ConvTranspose", "Gemm", "MatMul"):
+            continue
+        pairs = [producer_of(value) for value in node.inputs[:2]]
+        left, right = (
+            None if n is None else graph.array_of(n.inputs[1]) for n in pairs
+        )
+        bias = bias_by_channel(node, 8)
+        if left is not None and right is not None and bias is not None:
+            steps = left.astype(np.float64) * right.astype(np.float64)
+            found.append(float(np.abs(bias / steps).max()))
+    return found
+
+
+@settings(max_examples=scaled(40))
+@given(seed=st.integers(0, 2**32 - 1), exponent=st.floats(-14, 0))
+def test_no_bias_of_a_placed_graph_wraps(seed: int, exponent: float) -> None:
+    model = placed(dead(seed, 10.0**exponent), "tensorrt")
+
+    steps = counts(model)
+
+    assert len(steps) == 6
+    assert max(steps) <= BIAS_MAX * (1 + 1e-6)
+
+
+def test_only_the_channel_that_needs_it_changes() -> None:
+    source, model = dead(0, 1e-12), placed(dead(0, 1e-12), "tensorrt")
+    for name, axis in AXES.items():
+        weight = graph.array_of(source.graph.initializers[name])
+        assert weight is not None
+        integers, scales = quantize_weight(weight.astype(np.float32), axis)
+        written = graph.array_of(model.graph.initializers[f"{name}_int8"])
+        steps = graph.array_of(model.graph.initializers[f"{name}_scale"])
+        assert written is not None
+        assert steps is not None
+
+        raised = np.flatnonzero(scales != steps)
+
+        assert raised.tolist() == [DEAD_CHANNEL]
+        assert (steps >= scales).all()
+        others = np.delete(integers, DEAD_CHANNEL, axis)
+        np.testing.assert_array_equal(np.delete(written, DEAD_CHANNEL, axis), others)
+
+
+@settings(max_examples=scaled(100))
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    bias=st.floats(-12, 12),
+    step=st.floats(-6, 3),
+    axis=st.sampled_from((0, 1, None)),
+)
+def test_a_raised_scale_is_the_least_that_fits(
+    seed: int, bias: float, step: float, axis: int | None
+) -> None:
+    random = np.random.default_rng(seed)
+    exact = random.normal(size=(5, 5)).astype(np.float32)
+    weight = QuantizedWeight("w", *quantize_weight(exact, axis), axis)
+    added = (random.normal(size=5) * 10.0**bias).astype(np.float32)
+    unit = np.float32(10.0**step)
+
+    roomy = with_room(weight, least_scales(added, unit))
+
+    steps = np.abs(added) / (roomy.scales.astype(np.float64) * unit)
+    assert steps.max() <= BIAS_MAX * (1 + 1e-6)
+    kept = roomy.scales == weight.scales
+    most = steps.max() if axis is None else steps[~kept]
+    assert kept.all() or np.allclose(most, BIAS_MAX, rtol=1e-6)
+    assert (roomy is weight) == bool(kept.all())
+
+
+@settings(max_examples=scaled(100))
+@given(exponent=st.floats(-45, 4))
+def test_float16_holds_every_scale(exponent: float) -> None:
+    exact = np.array([10.0**exponent, 1.0], np.float32)
+
+    half = scales_in(exact, np.float16)
+
+    assert half.dtype == np.float16
+    assert (half > 0).all() or not exact[0]
+    if exact[0] < np.finfo(np.float16).smallest_normal:  # rounded up: nothing clips
+        assert half[0] >= exact[0]
+    else:
+        np.testing.assert_allclose(half, exact, rtol=2.0**-11)
+
+
+@settings(max_examples=scaled(100))
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(("int8", "uint8", "int32")),
+    ratio=st.floats(1, 1e6),
+)
+def test_integers_of_a_larger_scale_are_off_by_half_a_step(
+    seed: int, kind: str, ratio: float
+) -> None:
+    random = np.random.default_rng(seed)
+    limits = np.iinfo(kind)
+    stored = random.integers(limits.min, limits.max, (4, 6), endpoint=True).astype(kind)
+    zero = np.full(6, 128 if kind == "uint8" else 0, kind)
+    scales = random.uniform(1e-7, 1e-3, 6).astype(np.float32)
+    fresh = (scales * np.float32(ratio)).astype(np.float32)
+
+    again = requantized(stored, scales, fresh, 1, zero)
+
+    before = (stored.astype(np.float64) - zero) * scales
+    after = (again.astype(np.float64) - zero) * fresh
+    assert again.dtype == stored.dtype
+    assert (np.abs(before - after) <= fresh.astype(np.float64) * (0.5 + 1e-6)).all()
+
+
+@pytest.mark.parametrize("faint", [1e-3, 1e-9])
+def test_a_float16_graph_has_no_scale_of_zero(faint: float) -> None:
+    model = dead(1, faint)
+    for value in (*model.graph.inputs, *model.graph.initializers.values()):
+        if value.const_value is not None:
+            half = value.const_value.numpy().astype(np.float16)
+            value.const_value = ir.tensor(half, name=value.name)
+        value.type = ir.TensorType(ir.DataType.FLOAT16)
+    for node in model.graph:
+        node.outputs[0].type = ir.TensorType(ir.DataType.FLOAT16)
+
+    made = placed(model, "tensorrt")
+
+    for name, axis in AXES.items():
+        weight, scales, integers = (
+            graph.array_of(each.graph.initializers[label])
+            for each, label in (
+                (model, name), (made, f"{name}_scale"), (made, f"{name}_int8"),
+            )
+        )  # fmt: skip
+        assert weight is not None
+        assert scales is not None
+        assert integers is not None
+        assert scales.dtype == np.float16
+        assert (scales > 0).all()
+        steps = np.moveaxis(weight, axis, -1) / scales.astype(np.float64)
+        off = np.abs(steps - np.moveaxis(integers, axis, -1))
+        assert off.max() <= 1 + 127 * 2.0**-11  # balanced: by less than a step
+    assert max(counts(made)) <= BIAS_MAX * (1 + 1e-2)
