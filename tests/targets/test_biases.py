@@ -184,7 +184,7 @@ def test_integers_of_a_larger_scale_are_off_by_half_a_step(
     assert (np.abs(before - after) <= fresh.astype(np.float64) * (0.5 + 1e-6)).all()
 
 
-@pytest.mark.parametrize("faint", [1e-3, 1e-9])
+@pytest.mark.parametrize("faint", [1e-3, 3e-5, 1e-9])
 def test_a_float16_graph_has_no_scale_of_zero(faint: float) -> None:
     model = dead(1, faint)
     for value in (*model.graph.inputs, *model.graph.initializers.values()):

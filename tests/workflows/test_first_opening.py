@@ -15,6 +15,7 @@ from me2e_compress.workflows import first_opening
 from me2e_compress.workflows.first_opening import try_apart, try_file
 from me2e_compress.workflows.listener import SILENT
 from tests.stacks import write_stack
+from tests.targets.onnxruntime.rewritten import Drawn
 
 COUNTER = """
 <ir_version: 8, opset_import: ["" : 17]>
@@ -61,6 +62,16 @@ def test_what_it_answers_is_what_a_session_here_would(tmp_path: Path) -> None:
     assert found.answers is not None
     here = [each["sum_out"] for each in replay(Session(model), frames)]
     np.testing.assert_array_equal([e["sum_out"] for e in found.answers], here)
+
+
+def test_what_int8_kernels_answered_there_is_no_answer(tmp_path: Path) -> None:
+    layer = Drawn("Gemm", bias="own")
+    frames = [Frame(0, True, layer.frame())]
+
+    found = try_apart(layer.model(), "layer", frames=frames, memory=tmp_path)
+
+    assert found is not None
+    assert found.answers is None
 
 
 @pytest.mark.parametrize("starts", [True, False])

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_rewrites
 from tests.profiles import scaled
-from tests.targets.onnxruntime.rewritten import SIZE, Drawn
+from tests.targets.onnxruntime.rewritten import SIZE, STEP, Drawn
 
 FAR_DB, ROUNDED_DB = 26.0, 60.0
 """SQNR of what is computed otherwise (but a rounded weight), and of a rounded one."""
@@ -103,3 +103,33 @@ def test_a_scale_that_float16_rounded_is_the_right_one(
     scale.const_value = ir.tensor(scale.const_value.numpy() * np.float32(off))
 
     assert [each.rule for each in int8_rewrites(model)] == rules
+
+
+@pytest.mark.parametrize(("share", "rules"), [(0.99, []), (1.01, ["wrapped-bias"])])
+def test_a_bias_wraps_beyond_int32(share: float, rules: list[str]) -> None:
+    model, frame = Drawn().model(), Drawn().frame()
+    stored = model.graph.initializers
+    scales, bias = (stored[name].const_value for name in ("ws", "b"))
+    assert scales is not None
+    assert bias is not None
+    numbers = bias.numpy().copy()
+    numbers[5] = share * 2.0**31 * STEP * scales.numpy()[5]
+    stored["b"].const_value = ir.tensor(numbers)
+    # the widest grid that still shows the channel
+    stored["t"].const_value = ir.tensor(np.float32(numbers[5] / 100))
+
+    answers = [
+        Session(model, threads=1, stock=stock).run(frame)["y"][:, 5].mean()
+        for stock in (False, True)
+    ]
+
+    assert [each.rule for each in int8_rewrites(model)] == rules
+    assert (answers[1] < 0 < answers[0]) == bool(rules)
+
+
+def test_what_lies_behind_rows_that_were_flattened() -> None:
+    """A clip behind them keeps the layer float; so the bias does not wrap."""
+    drawn = Drawn("Add", bias="far", rows=True, behind="Relu")
+
+    assert not list(int8_rewrites(drawn.model()))
+    assert sqnr(drawn, stock=True) > FAR_DB
