@@ -1,20 +1,19 @@
 """Lint rules: where onnxruntime's own int8 answers otherwise than the nodes of a file.
 
-Measured with onnxruntime 1.31.1 on the CPU, opsets 11 to 23, each pattern with and
-without ``WeightBiasQuantization``; no bug report is known of the first and the third.
-Our own measurements run without these rewrites
-(:data:`me2e_compress.runtime.runnable.QDQ_OFF`), whoever deploys a file gets them.
+Measured with onnxruntime 1.31.1 on the CPU, opsets 11 to 23. Our own measurements run
+without these rewrites (``QDQ_OFF`` of runtime/runnable.py), deployed files get them.
 """
 
 import dataclasses
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress.graph import channel_axis, input_at, is_standard, nodes_of, rank_of
 from me2e_compress.graph.nodes import (
+    Array,
+    Numbers,
     array_of,
     constant_values,
     maker,
@@ -26,8 +25,7 @@ from me2e_compress.targets.base import LintFinding, name_of
 from me2e_compress.targets.quantized import DEQUANTIZE, QUANTIZE
 from me2e_compress.targets.weights import evaluate_constants, quantize_weight
 
-INT32_MAX = float(2**31 - 1)
-"""The largest int32; a bias of more steps becomes -2^31."""
+INT32_MAX = 2.0**31 - 1  # a bias of more steps becomes -2^31
 
 SCALES_APART = 1e-3
 """Relative difference of two scales that are meant to be equal: twice what rounding to
@@ -37,11 +35,9 @@ _REMEDY = "disabled_optimizers=['WeightBiasQuantization'] keeps it"
 _CLIPS = ("Clip", "Dropout", "Identity", "Relu")
 _MOVES = ("MaxPool", "Reshape", "Slice", "Squeeze", "Transpose", "Unsqueeze")
 """Operators that onnxruntime moves a pair across, to the layer."""
-_FOLDED = ("Add", "BatchNormalization", "Mul")
-"""Operators that it folds into a float weight first."""
+_FOLDED = ("Add", "BatchNormalization", "Mul")  # into a float weight, first
 
-Numbers = npt.NDArray[np.float64]
-Constants = Mapping[str, npt.NDArray[np.generic]]
+Constants = Mapping[str, Array]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,17 +82,10 @@ def int8_rewrites(model: ir.Model) -> Iterator[LintFinding]:
     layers = list(_layers(model))
     constants = _constants(model, layers)
     for layer in layers:
-        message = _wrapped(layer, constants)
-        if message:
-            yield _wrong("wrapped-bias", layer, message)
-        elif message := _misread(layer, constants):
-            yield _wrong("bias-scale", layer, message)
-        elif message := _rounded(layer, constants):
-            yield _wrong("float-weight", layer, message)
-
-
-def _wrong(rule: str, layer: _Layer, message: str) -> LintFinding:
-    return LintFinding("wrong", rule, name_of(layer.node), message)
+        for rule, judge in _RULES.items():
+            if message := judge(layer, constants):
+                yield LintFinding("wrong", rule, name_of(layer.node), message)
+                break
 
 
 def _layers(model: ir.Model) -> Iterator[_Layer]:
@@ -185,7 +174,7 @@ def _wrapped(layer: _Layer, constants: Constants) -> str:
     if steps is None or bias is None or _scale_of_bias(layer) is not None:
         return ""
     fits = bias.ndim == 1 and steps.size in (1, bias.size)
-    if not fits or not _reaches_quantizer(layer):
+    if not fits or _quantizer(layer) is None:
         return ""
     with np.errstate(divide="ignore", invalid="ignore"):
         counts = np.nan_to_num(np.abs(bias) / np.abs(steps), nan=0.0, posinf=np.inf)
@@ -242,28 +231,37 @@ def _becomes_gemm(layer: _Layer) -> bool:
     if quantizer is None or quantizer.op_type != QUANTIZE:
         return quantizer is None
     zero = array_of(input_at(quantizer, 2))
-    return zero is None or _is_least(zero)
+    return zero is None or bool(np.all(zero == np.iinfo(zero.dtype.name).min))
 
 
-def _is_least(zero: npt.NDArray[np.generic]) -> bool:
-    """Return whether nothing below a zero point can be stored."""
-    return bool(np.all(zero == np.iinfo(zero.dtype.name).min))
+def rounded_layers(model: ir.Model) -> Iterator[tuple[ir.Node, ir.Node]]:
+    """Yield the layers of rule ``float-weight``, with the quantizers behind them."""
+    layers = list(_layers(model))
+    constants = _constants(model, layers)
+    for layer in layers:
+        if (quantizer := _quantizer_of_float(layer, constants)) is not None:
+            yield layer.node, quantizer
+
+
+def _quantizer_of_float(layer: _Layer, constants: Constants) -> ir.Node | None:
+    """Return the quantizer for which a float weight is rounded; None if it is not."""
+    weight = constants.get(str(layer.weight.name))
+    bias = _numbers(layer.bias, constants)
+    if weight is None or weight.dtype != np.float32 or not weight.size:
+        return None
+    if layer.bias is not None and (
+        bias is None or bias.ndim != 1 or _scale_of_bias(layer) is not None
+    ):
+        return None
+    folded = _FOLDED if layer.node.op_type == "Conv" else ("BatchNormalization",)
+    return _quantizer(layer, folded)
 
 
 def _rounded(layer: _Layer, constants: Constants) -> str:
     """Say what rounding a float weight between pairs costs; empty if none is."""
-    weight = constants.get(str(layer.weight.name))
-    bias = _numbers(layer.bias, constants)
-    if weight is None or weight.dtype != np.float32 or not weight.size:
+    if _quantizer_of_float(layer, constants) is None:
         return ""
-    if layer.bias is not None and (
-        bias is None or bias.ndim != 1 or _scale_of_bias(layer) is not None
-    ):
-        return ""
-    folded = _FOLDED if layer.node.op_type == "Conv" else ("BatchNormalization",)
-    if not _reaches_quantizer(layer, folded):
-        return ""
-    exact = weight.astype(np.float32)
+    exact = constants[str(layer.weight.name)].astype(np.float32)
     integers, step = quantize_weight(exact, None)
     noise = float(np.square(exact - integers * step).sum(dtype=np.float64))
     signal = float(np.square(exact).sum(dtype=np.float64))
@@ -274,8 +272,8 @@ def _rounded(layer: _Layer, constants: Constants) -> str:
     )
 
 
-def _reaches_quantizer(layer: _Layer, folded: tuple[str, ...] = ()) -> bool:
-    """Return whether a QuantizeLinear alone reads a layer, behind what is looked past.
+def _quantizer(layer: _Layer, folded: tuple[str, ...] = ()) -> ir.Node | None:
+    """Return the QuantizeLinear that alone reads a layer, behind what is looked past.
 
     Those are what is folded into the layer first, then clips, then moves.
     """
@@ -287,11 +285,15 @@ def _reaches_quantizer(layer: _Layer, folded: tuple[str, ...] = ()) -> bool:
     while len(value.uses()) == 1:
         (reader,) = value.consumers()
         if reader.op_type == QUANTIZE:
-            return True
+            return reader
         while stages and reader.op_type not in stages[0]:
             stages.pop(0)
         others = [v for v in reader.inputs[1:] if v is not None and v is not value]
         if not stages or any(array_of(v) is None for v in others):
-            return False
+            return None
         value = reader.outputs[0]
-    return False
+    return None
+
+
+_RULES = {"wrapped-bias": _wrapped, "bias-scale": _misread, "float-weight": _rounded}
+"""What says how a layer is computed otherwise, or nothing, by rule."""

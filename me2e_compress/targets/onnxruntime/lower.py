@@ -14,6 +14,7 @@ from me2e_compress.targets.onnxruntime.image_blocks import (
     filter_of_blocks,
     read_blocks,
 )
+from me2e_compress.targets.onnxruntime.int8_rewrites import rounded_layers
 from me2e_compress.targets.onnxruntime.kernels import has_average_kernel, is_average
 from me2e_compress.targets.onnxruntime.layer_forms import write_layer
 from me2e_compress.targets.onnxruntime.region import Grid, Region, find_region
@@ -63,6 +64,7 @@ def lower(draft: Draft) -> ir.Model:
         write_layer(writer, layer, weight, step)
     _screen_products(writer)
     _screen_averages(writer)
+    _screen_float_weights(writer, draft.model)
     rewrite.sweep(draft.model)
     return draft.model
 
@@ -167,6 +169,24 @@ def _screen_averages(writer: Writer) -> None:
         screen.outputs[0].shape, screen.outputs[0].type = value.shape, value.type
         rewrite.replace_value(value, screen.outputs[0])
         screen.replace_input_with(0, value)
+
+
+def _screen_float_weights(writer: Writer, model: ir.Model) -> None:
+    """Insert a Sum of one operand behind layers that stay float between pairs.
+
+    Given:   q = QuantizeLinear(Relu(ConvTranspose(DequantizeLinear(x), w)))
+    Result:  q = QuantizeLinear(Sum(Relu(ConvTranspose(DequantizeLinear(x), w))))
+
+    Without it onnxruntime (1.31) rounds the float weight to int8, with one scale in
+    all, though it may have no int8 kernel for the layer.
+    """
+    for layer, quantizer in list(rounded_layers(model)):
+        value = quantizer.inputs[0]
+        assert value is not None
+        node = writer.node("Sum", [value], f"{value.name}_alone", [layer])
+        writer.graph.insert_before(quantizer, node)
+        node.outputs[0].shape, node.outputs[0].type = value.shape, value.type
+        quantizer.replace_input_with(0, node.outputs[0])
 
 
 def _would_run_in_float(product: ir.Node) -> bool:

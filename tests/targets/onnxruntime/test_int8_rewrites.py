@@ -6,8 +6,14 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.graph import array_of
+from me2e_compress.quantization.plan import make_plan
+from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.runtime.optimized import optimized
 from me2e_compress.runtime.session import Session
-from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_rewrites
+from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_layers, int8_rewrites
+from tests.nets import MODULES, PAPER, net
 from tests.profiles import scaled
 from tests.targets.onnxruntime.rewritten import SIZE, STEP, Drawn
 
@@ -133,3 +139,38 @@ def test_what_lies_behind_rows_that_were_flattened() -> None:
 
     assert not list(int8_rewrites(drawn.model()))
     assert sqnr(drawn, stock=True) > FAR_DB
+
+
+UP = """
+<ir_version: 9, opset_import: ["" : 17]>
+up (float[1,8,6,6] x, float[8,8,1,1] w, float[8,8,2,2] t, float[8] b, float[8,8,1,1] v)
+    => (float[1,8,12,12] y) {
+    c = Conv(x, w)
+    r = Relu(c)
+    u = ConvTranspose<kernel_shape=[2,2], strides=[2,2]>(r, t%s)
+    s = Relu(u)
+    y = Conv(s, v)
+}
+"""
+
+
+@pytest.mark.parametrize("bias", ["", ", b"])
+def test_a_layer_that_stays_float_keeps_its_weight(bias: str) -> None:
+    random = np.random.default_rng(0)
+    sizes = {"w": (8, 8, 1, 1), "t": (8, 8, 2, 2), "b": 8, "v": (8, 8, 1, 1)}
+    weights = {name: random.normal(0, 0.3, size) for name, size in sizes.items()}
+    # one scale in all leaves little of the other channels
+    weights["t"][:, 0] *= 300
+    model = net(UP % bias, weights)
+    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
+    target = OnnxRuntime()
+    ranges = dict.fromkeys(target.tensors(plan, model), (-3.0, 3.0))
+
+    placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
+
+    assert [each.op_type for each in int8_layers(placed)] == ["Conv", "Conv"]
+    assert not list(int8_rewrites(placed))
+    assert "Sum" in [node.op_type for node in placed.graph]
+    (up,) = (n for n in optimized(placed).graph if n.op_type == "ConvTranspose")
+    assert up.inputs[1] is not None
+    assert array_of(up.inputs[1]) is not None  # not behind a DequantizeLinear
