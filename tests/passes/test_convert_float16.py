@@ -1,6 +1,7 @@
 """Weights and interface in float16, what frames and options keep, int8 scales."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -180,7 +181,7 @@ def test_no_scale_becomes_zero_or_loses_its_digits(faint: float) -> None:
     scales[::4] = random.uniform(0.5, 1, 8) * faint
     integers = random.integers(-127, 128, (32, 8, 3, 3)).astype(np.int8)
     model = ir.from_onnx_text(FAINT)
-    stored = {"w": integers, "s": scales, "z": np.zeros(32, np.int8)}
+    stored: dict[str, Any] = {"w": integers, "s": scales, "z": np.zeros(32, np.int8)}
     for value in list(model.graph.inputs):
         if value.name in stored:
             model.graph.inputs.remove(value)
@@ -192,12 +193,13 @@ def test_no_scale_becomes_zero_or_loses_its_digits(faint: float) -> None:
     half = ConvertFloat16().run(model, Context(MODULES)).model
 
     (node,) = (n for n in half.graph if n.outputs[0].name == "v")
-    held, steps = (graph.array_of(value) for value in node.inputs[:2])
-    assert held is not None
-    assert steps is not None
-    assert steps.dtype == np.float16
+    held, steps = (
+        np.asarray(graph.array_of(value), np.float64) for value in node.inputs[:2]
+    )
+    assert node.inputs[1] is not None
+    assert node.inputs[1].dtype == HALF
     assert (steps > 0).all()
-    wide = steps.astype(np.float64).reshape(-1, 1, 1, 1)
+    wide = steps.reshape(-1, 1, 1, 1)
     off = np.abs(held * wide - exact) / wide
     assert off.max() <= 0.5 + 127 * 2.0**-11
     others = np.arange(32) % 4 != 0

@@ -19,7 +19,10 @@ def test_what_is_timed_is_what_onnxruntime_runs(tmp_path: Path) -> None:
     path = tmp_path / "layer.onnx"
     graph.save(layer.model(), path)
     frame = layer.frame()
-    plain, stock = (Session(path, stock=s).run(frame)["y"] for s in (False, True))
+    plain, stock = (
+        np.asarray(Session(path, stock=s).run(frame)["y"], np.float64)
+        for s in (False, True)
+    )
 
     timed = TimedSession(path, threads=1).run(frame)["y"]
 

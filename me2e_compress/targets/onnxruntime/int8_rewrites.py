@@ -278,7 +278,7 @@ def _quantizer(layer: _Layer, folded: tuple[str, ...] = ()) -> ir.Node | None:
     Those are what is folded into the layer first, then clips, then moves.
     """
     value = layer.end
-    moves = _MOVES
+    moves: tuple[str, ...] = _MOVES
     if layer.node.op_type == "Gemm" and layer.bias is None:
         moves = tuple(each for each in moves if each != "Transpose")  # fused before
     stages = [moves] if layer.is_reshaped else [folded, _CLIPS, moves]

@@ -106,7 +106,7 @@ class Drawn:
             scales = scales if by_channel else scales[3]
         scales = scales.astype(np.float32)
         bias = random.uniform(1, 3, self.bias_shape)
-        along = {"axis": axis} if by_channel else {}
+        along: dict[str, Any] = {"axis": axis} if by_channel else {}
         # small integers of 7 bits do not overflow 16 on any processor
         integers = random.integers(-63, 64, size).astype(np.int8)
         constants |= {"w": integers, "ws": scales, "wz": np.zeros(scales.shape, "i1")}
@@ -117,8 +117,8 @@ class Drawn:
             constants["w"] = random.normal(0, 0.2, size).astype(np.float32)
             nodes = [helper.make_node("Identity", ["w"], ["wd"])]
         if self.bias in ("own", "right"):
-            units = np.float32(STEP) * scales
-            units = np.float32(0.001) if self.bias == "own" else units
+            own = self.bias == "own"
+            units = np.asarray(0.001 if own else STEP * scales, np.float32)
             constants |= {"b": np.rint(bias / units).astype(np.int32), "bs": units}
             along = {"axis": 0} if np.ndim(units) else {}
             nodes += [
@@ -127,7 +127,9 @@ class Drawn:
         elif self.bias != "none":
             wide = np.float64 if self.constant == "Cast" else np.float32
             constants["b"] = bias.astype(wide)
-            to = {"to": TensorProto.FLOAT} if self.constant == "Cast" else {}
+            to: dict[str, Any] = (
+                {"to": TensorProto.FLOAT} if self.constant == "Cast" else {}
+            )
             given = self.constant or "Identity"
             nodes += [helper.make_node(given, ["b"], ["bd"], **to)]
         return nodes
@@ -140,5 +142,7 @@ class Drawn:
                 helper.make_node("MatMul", inputs[:2], ["p"], name="layer"),
                 helper.make_node("Add", ["p", "bd"], ["c"]),
             ]
-        options = {"transB": int(self.transposed)} if self.op == "Gemm" else {}
+        options: dict[str, Any] = {}
+        if self.op == "Gemm":
+            options = {"transB": int(self.transposed)}
         return [helper.make_node(self.op, inputs, ["c"], name="layer", **options)]

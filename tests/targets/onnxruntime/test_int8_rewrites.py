@@ -21,12 +21,13 @@ FAR_DB, ROUNDED_DB = 26.0, 60.0
 """SQNR of what is computed otherwise (but a rounded weight), and of a rounded one."""
 
 
-def sqnr(drawn: Drawn, **options: bool) -> float:
+def sqnr(drawn: Drawn, *, stock: bool = False) -> float:
     """Hold a session against the nodes as they stand, in float64."""
     model, frame = drawn.model(), drawn.frame()
     exact = Session(model, threads=1, optimize=False).run(frame)["y"]
-    answer = Session(model, threads=1, **options).run(frame)["y"]
-    wide, noise = exact.astype(np.float64), exact.astype(np.float64) - answer
+    answer = Session(model, threads=1, stock=stock).run(frame)["y"]
+    wide = np.asarray(exact, np.float64)
+    noise = wide - np.asarray(answer, np.float64)
     return float(
         10 * np.log10(np.square(wide).sum() / (np.square(noise).sum() + 1e-30))
     )
@@ -157,7 +158,7 @@ up (float[1,8,6,6] x, float[8,8,1,1] w, float[8,8,2,2] t, float[8] b, float[8,8,
 @pytest.mark.parametrize("bias", ["", ", b"])
 def test_a_layer_that_stays_float_keeps_its_weight(bias: str) -> None:
     random = np.random.default_rng(0)
-    sizes = {"w": (8, 8, 1, 1), "t": (8, 8, 2, 2), "b": 8, "v": (8, 8, 1, 1)}
+    sizes = {"w": (8, 8, 1, 1), "t": (8, 8, 2, 2), "b": (8,), "v": (8, 8, 1, 1)}
     weights = {name: random.normal(0, 0.3, size) for name, size in sizes.items()}
     # one scale in all leaves little of the other channels
     weights["t"][:, 0] *= 300
