@@ -21,7 +21,7 @@ from me2e_compress.runtime.opening import (
     open_graph,
 )
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.runnable import QDQ_OFF
+from me2e_compress.runtime.runnable import NO_OVERFLOW, QDQ_OFF
 
 __all__ = [
     "Level",
@@ -65,9 +65,9 @@ class Session:
             the level ``none``; True is the level ``all``.
         stock: all that onnxruntime does by itself: also the optimizations that the
             provider leaves out, and int8 kernels.
-        int8_kernels: runs pairs of quantization nodes by onnxruntime's int8 kernels.
-            Without them the session answers what the nodes say; for what the kernels
-            answer otherwise see :data:`QDQ_OFF`.
+        int8_kernels: runs pairs of quantization nodes by onnxruntime's int8 kernels,
+            those whose sums do not overflow. Without them the session answers what the
+            nodes say; for what the kernels answer otherwise see :data:`QDQ_OFF`.
         frugal: runs nodes in the priority-based order, in which a reduction written
             right after its producer frees that tensor at once.
         release: frees working memory after every run, so that several sessions fit in
@@ -110,8 +110,9 @@ class Session:
         options.graph_optimization_level = _LEVELS[level]
         # One block for all tensors of a run: twice the memory on VAD-tiny, no gain.
         options.enable_mem_pattern = False
-        if not (stock or int8_kernels) and provider.target == CPU.target:
-            options.add_session_config_entry(QDQ_OFF, "1")
+        if not stock and provider.target == CPU.target:
+            entry = NO_OVERFLOW if int8_kernels else QDQ_OFF
+            options.add_session_config_entry(entry, "1")
         if frugal:
             options.execution_order = ort.ExecutionOrder.PRIORITY_BASED
         if rewritten is not None:

@@ -94,7 +94,10 @@ class Writer:
         zeros = np.zeros(scales.shape, integers.dtype)
         stored = self.constant(integers, f"{name}_{integers.dtype}")
         steps = self.constant(scales, f"{name}_scale")
-        inputs = [stored, steps, self.constant(zeros, f"{name}_zero")]
+        # Not shared: with ``session.x64quantprecision``, which processors without VNNI
+        # need, onnxruntime (1.31) refuses a zero point that two weights read
+        zero = rewrite.add_constant(self.graph, zeros, f"{name}_zero", self._names)
+        inputs = [stored, steps, zero]
         axes = None if axis is None else {"axis": axis}
         # Weights may be shared, the name of the reader is not
         label = label or f"{reader.name or reader.outputs[0].name}/{name}_float"

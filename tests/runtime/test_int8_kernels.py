@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
@@ -11,6 +12,7 @@ from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.runtime.profile import TimedSession
 from me2e_compress.runtime.session import Session
+from tests.passes.small import read
 from tests.targets.onnxruntime.rewritten import Drawn
 
 
@@ -19,15 +21,15 @@ def test_what_is_timed_is_what_onnxruntime_runs(tmp_path: Path) -> None:
     path = tmp_path / "layer.onnx"
     graph.save(layer.model(), path)
     frame = layer.frame()
-    plain, stock = (
-        np.asarray(Session(path, stock=s).run(frame)["y"], np.float64)
+    plain, kernels = (
+        np.asarray(Session(path, int8_kernels=s).run(frame)["y"], np.float64)
         for s in (False, True)
     )
 
     timed = TimedSession(path, threads=1).run(frame)["y"]
 
-    np.testing.assert_array_equal(timed, stock)
-    assert np.abs(plain - stock).max() > 1
+    np.testing.assert_array_equal(timed, kernels)
+    assert np.abs(plain - kernels).max() > 1
 
 
 def test_what_drives_is_what_onnxruntime_runs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,3 +44,36 @@ def test_what_drives_is_what_onnxruntime_runs(monkeypatch: pytest.MonkeyPatch) -
         OnnxPolicy.open(Path("m.onnx"))
 
     assert given["int8_kernels"] is True
+
+
+OVERFLOWS = """<ir_version: 9, opset_import: ["" : 17]>
+m (float[8,64] x) => (float[8,16] y)
+<float one = {1.0}, uint8 zero = {0}, float far = {8192.0},
+ float farther = {1.6e7}, int8 none = {0}> {
+    q = QuantizeLinear(x, one, zero)
+    d = DequantizeLinear(q, one, zero)
+    v = DequantizeLinear(w, one, none)
+    a = Gemm(d, v)
+    b = QuantizeLinear(a, far, zero)
+    c = DequantizeLinear(b, far, zero)
+    e = DequantizeLinear(u, one, none)
+    g = Gemm(c, e)
+    f = QuantizeLinear(g, farther, zero)
+    y = DequantizeLinear(f, farther, zero)
+}"""
+"""Two int8 layers with one zero point; the first sums products of 255 by 127."""
+
+
+def test_sums_of_int8_do_not_overflow_on_any_processor(tmp_path: Path) -> None:
+    draws = np.random.default_rng(0)
+    large = draws.integers(100, 128, (64, 16)).astype(np.int8)
+    model = read(OVERFLOWS, w=large, u=draws.integers(0, 128, (16, 16)).astype(np.int8))
+    x = draws.integers(200, 256, (8, 64)).astype(np.float32)
+    graph.save(model, tmp_path / "m.onnx")
+    opened: list[ir.Model | Path] = [model, tmp_path / "m.onnx"]
+    for source in opened:
+        session = Session(source, threads=1, int8_kernels=True)
+        by_kernels = session.run({"x": x})["y"]
+        by_nodes = Session(source, threads=1, optimize=False).run({"x": x})["y"]
+        np.testing.assert_array_equal(by_kernels, by_nodes)
+    assert (x @ large).min() > 32767  # where 16 bits end
