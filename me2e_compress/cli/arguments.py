@@ -22,9 +22,8 @@ Scheme = Annotated[
 Rules = Annotated[
     str | None, typer.Option(help="rules of the int8 plan: safe, paper, or see list")
 ]
-Target = Annotated[
-    str | None, typer.Option(help="runtime of the graph: tensorrt or onnxruntime")
-]
+TARGET = "runtime of the graph: onnxruntime or tensorrt"
+Target = Annotated[str | None, typer.Option(help=TARGET)]
 Overrides = Annotated[
     Path | None, typer.Option(help="TOML file of exceptions to the int8 plan")
 ]
@@ -88,6 +87,7 @@ TrialRules = Annotated[
     str,
     typer.Option("--rules", help="rules of the int8 plan: safe, paper, or see list"),
 ]
+TrialTarget = Annotated[str, typer.Option("--target", help=TARGET)]
 JudgedFrames = Annotated[
     int, typer.Option("-n", "--count", help="number of frames (to judge on)")
 ]

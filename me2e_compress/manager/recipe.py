@@ -22,7 +22,7 @@ from pathlib import Path
 from me2e_compress.errors import RecipeError
 from me2e_compress.passes import PASSES, Pass
 from me2e_compress.registry import documents
-from me2e_compress.registry.registry import default_of, fields_of
+from me2e_compress.registry.registry import fields_of, is_written
 from me2e_compress.registry.text import chosen_fields
 
 __all__ = ["adding_no_weights", "load", "parse", "shipped", "to_text", "to_toml"]
@@ -109,7 +109,7 @@ def _entry(each: Pass) -> str:
     lines = ["[[pass]]", f"name = {_value(each.name)}"]
     for field in fields_of(type(each)):
         value = getattr(each, field.name)
-        if value is not None and value != default_of(field):
+        if value is not None and is_written(field, value):
             lines.append(f"{field.name} = {_value(value)}")
     return "\n".join(lines) + "\n"
 

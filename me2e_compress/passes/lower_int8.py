@@ -11,6 +11,7 @@ from me2e_compress.calibration.observers import DEFAULT_METHOD
 from me2e_compress.display import counted
 from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.quantization.plan import plan_of, stamp_plan
 from me2e_compress.targets import onnxruntime
 
 
@@ -59,6 +60,8 @@ class LowerInt8(Pass):
             )
         lowered = onnxruntime.convert(model, ranges)
         provenance.sign(model, lowered, self.name)
+        if plan := plan_of(model):
+            stamp_plan(lowered, dataclasses.replace(plan, target="onnxruntime"))
         layers = onnxruntime.int8_layers(lowered)
         return PassResult(
             lowered,

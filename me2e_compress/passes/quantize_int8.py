@@ -22,7 +22,8 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.targets import TARGETS, Target
+from me2e_compress.registry.registry import WRITTEN
+from me2e_compress.targets import DEFAULT_TARGET, TARGETS, Target
 from me2e_compress.targets.quantized import describe_quantized
 
 _SHOWN = 5
@@ -49,7 +50,7 @@ class QuantizeInt8(Pass):
             float; ``paper``, its two stages alone; a rule set of your own, by name or,
             in Python, as an object; each with options, ``paper{extra=[my-rule]}``.
         without: names of rules to switch off, e.g. ``gemv``.
-        target: who will run the graph.
+        target: who will run the graph: ``onnxruntime``, ``tensorrt``.
         attention_limit: longest attention that becomes int8, in tokens; None leaves it
             to the rules (512).
         overrides: TOML file of exceptions to the plan.
@@ -67,7 +68,8 @@ class QuantizeInt8(Pass):
     modules: tuple[str, ...] = ()
     rules: str | RuleSet = DEFAULT_RULES
     without: tuple[str, ...] = ()
-    target: str = "tensorrt"
+    # what a text means must not change with the default
+    target: str = dataclasses.field(default=DEFAULT_TARGET, metadata=WRITTEN)
     attention_limit: int | None = None
     overrides: Path | None = None
     method: str | None = None
@@ -93,7 +95,7 @@ class QuantizeInt8(Pass):
                 " this one for onnxruntime"
             )
         # Plan, and stop if there is nothing to do
-        target, plan = self._runtime, self._placeable(model, context)
+        target, plan = self._runtime, self.plan(model, context)
         target.check_types(plan, model)
         tensors = target.tensors(plan, model)
         if not tensors:
@@ -109,23 +111,21 @@ class QuantizeInt8(Pass):
         return PassResult(placed, len(plan.placed), notes)
 
     def plan(self, model: ir.Model, context: Context) -> QuantPlan:
-        """Choose for every node; shapes must be inferred."""
+        """Choose for every node, as its target can; shapes must be inferred."""
         overrides = Overrides()
         if self.overrides is not None:
             overrides = Overrides.load(self.overrides)
         rules, scheme = self._rules(), self._scheme(context)
         costs, objection = self._runtime.costs, self._runtime.fused_objection
-        return make_plan(model, scheme, rules, overrides, costs, objection)
+        plan = make_plan(model, scheme, rules, overrides, costs, objection)
+        kept_float = self._runtime.kept_float(plan, model)
+        return dataclasses.replace(
+            plan, kept_float=kept_float, target=self._runtime.name
+        )
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
         """Return the names of the tensors that its target reads in int8."""
-        plan = self._placeable(model, context)
-        return self._runtime.tensors(plan, model)
-
-    def _placeable(self, model: ir.Model, context: Context) -> QuantPlan:
-        plan = self.plan(model, context)
-        kept_float = self._runtime.kept_float(plan, model)
-        return dataclasses.replace(plan, kept_float=kept_float)
+        return self._runtime.tensors(self.plan(model, context), model)
 
     @property
     def method_of_ranges(self) -> str:

@@ -163,7 +163,7 @@ class Registry(Generic[T]):
             field.name: values[field.name]
             for field in fields
             if not callable(values[field.name])
-            and (defaults or values[field.name] != default_of(field))
+            and (defaults or is_written(field, values[field.name]))
         }
         return write_item(item.name, chosen, short=len(fields) == 1)
 
@@ -240,6 +240,15 @@ def fields_of(cls: type) -> tuple["dataclasses.Field[Any]", ...]:
     """Return the fields of a dataclass that are its options, those by keyword last."""
     fields = [field for field in dataclasses.fields(cls) if field.init]
     return tuple(sorted(fields, key=lambda field: field.kw_only is True))
+
+
+WRITTEN: Mapping[str, bool] = {"written": True}
+"""Metadata of a field that a text names even at its default."""
+
+
+def is_written(field: "dataclasses.Field[Any]", value: object) -> bool:
+    """Return whether a text names an option: most are left out at their default."""
+    return bool(field.metadata.get("written")) or value != default_of(field)
 
 
 def default_of(field: "dataclasses.Field[Any]") -> object:

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable
 
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.manager import recipe
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.providers import CPU, PROVIDERS
 from me2e_compress.simulator.routes import load_routes, pick_routes
@@ -19,7 +18,6 @@ from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.study.write import StudyFiles, write_study
 from me2e_compress.workflows.claims import check_ours
 from me2e_compress.workflows.compare import CompareResult
-from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import CompressResult, beside
 from me2e_compress.workflows.demo_stack import Demo
 from me2e_compress.workflows.export import ExportOptions, export_stack
@@ -108,27 +106,10 @@ class DriverDemo(Demo):
         return {"compress": self.compress, **super().steps, "drive": self.drive}
 
     def compress(self, listener: Listener) -> CompressResult:
-        """Copy the driver, record frames, and compress it.
-
-        The int8 plan is for the provider that drives here: one placed for TensorRT is
-        slower than float on the CPU.
-        """
+        """Copy the driver, record frames, and compress it."""
         export_stack(self.name, self._source, ExportOptions(force=self.force))
         self._record(self._source, (CALIBRATION_FRAMES, HELD_OUT_FRAMES), listener)
-        passes = recipe.load(self.recipe_name)
-        quantizes = any(each.quantizes for each in passes)
-        target = self.provider.target if quantizes else None
-        # Fidelity is measured on frames of other routes, see `compare`.
-        options = CompressOptions(
-            target=target,
-            measure_frames=0,
-            allow_empty=True,
-            provider=self.provider,
-            force=self.force,
-        )
-        found = compress(
-            self._source, self._small, passes, self._frames, options, listener
-        )
+        found = self._compressed(listener, allow_empty=True)
         self._told.append(Section("The passes", found.tables()))
         plan = plan_of(found.report.model)
         if plan is not None:
@@ -205,6 +186,6 @@ class DriverDemo(Demo):
             return ()
         return (
             f"Its int8 is for {target}, which drives here. For TensorRT:",
-            f"  me2e-compress compress {self.name} -r {self.recipe_name} --frames"
-            f" {self._frames} -o {self.name}.trt.onnx",
+            f"  me2e-compress compress {self.name} -r {self.recipe_name} --target"
+            f" tensorrt --frames {self._frames} -o {self.name}.trt.onnx",
         )

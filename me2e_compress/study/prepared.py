@@ -18,6 +18,7 @@ from me2e_compress.manager.recipe import to_text
 from me2e_compress.runtime.providers import CPU, PROVIDERS
 from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.workspace import Workspace
+from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.version import __version__
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import beside, written_model
@@ -99,7 +100,10 @@ def prepare_variant(
     origin = source.name, to_text(variant.passes)
     if not variant.passes:
         origin = _reported_beside(model) or origin
-    weights = named_weights(graph.load(model).metadata_props)
+    loaded = graph.load(model)
+    weights = named_weights(loaded.metadata_props)
+    if slow := slow_here(loaded, study.provider):
+        listener.on_warning(f"variant {variant.name}: {slow}")
     size = graph.file_bytes(model)
     return PreparedVariant(
         variant, driver, model, *origin, sha256, size, weights=weights

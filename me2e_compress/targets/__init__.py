@@ -17,6 +17,7 @@ from me2e_compress.targets.base import (
 )
 
 __all__ = [
+    "DEFAULT_TARGET",
     "TARGETS",
     "LintFinding",
     "LintRule",
@@ -29,6 +30,9 @@ __all__ = [
 ]
 
 _HERE = "me2e_compress.targets"
+
+DEFAULT_TARGET = "onnxruntime"
+"""For whom int8 is written where nobody is named: who runs it on this machine."""
 
 TARGETS: Registry[Target] = Registry(
     "target",

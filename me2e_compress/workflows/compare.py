@@ -1,6 +1,7 @@
 """Compare the outputs and plans of two graphs on the same frames."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 
 import onnx_ir as ir
@@ -20,6 +21,7 @@ from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack_session import open_session
+from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import check_number, model_path
 from me2e_compress.workflows.first_opening import try_model
 from me2e_compress.workflows.listener import SILENT, Listener
@@ -38,6 +40,7 @@ class CompareResult(Result):
     `open_loop` holds both plans against the recorded future; where that is None, not
     measured, `open_loop_reason` says why. `liveness` is None if it was not asked for;
     `runtime`, what onnxruntime's int8 answers otherwise, if there is none to ask.
+    `slow_here` tells by file name of int8 whose form is slow on this CPU.
     """
 
     reference: Path
@@ -47,6 +50,7 @@ class CompareResult(Result):
     open_loop_reason: str = ""
     liveness: Liveness | None = None
     runtime: RuntimeLoss | None = None
+    slow_here: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def status(self) -> Status:
@@ -59,10 +63,11 @@ class CompareResult(Result):
             raise EvaluationError(f"{self.candidate}: {'; '.join(dead)}")
 
     def lines(self) -> tuple[str, ...]:
-        """Return how far the plan moved, and which outputs answer their inputs."""
+        """Return how far the plan moved, which outputs answer, and what is slow."""
         alive = () if self.liveness is None else self.liveness.lines()
         runtime = () if self.runtime is None else self.runtime.lines()
-        return (self.headline, *alive, *runtime)
+        slow = (f"{name}: {why}" for name, why in self.slow_here.items())
+        return (self.headline, *alive, *runtime, *slow)
 
     def alerts(self) -> tuple[str, ...]:
         """Return the outputs that are dead, and states that are not fed."""
@@ -112,6 +117,7 @@ class CompareResult(Result):
             "open_loop_reason": self.open_loop_reason,
             "liveness": alive,
             "runtime": runtime,
+            "slow_here": self.slow_here,
         }
 
 
@@ -171,11 +177,14 @@ def compare(
     paths = model_path(reference), model_path(candidate)
     recording = CalibrationSet(Path(frames))
     said, models = dict[Path, dict[str, str]](), list[ir.Model]()
+    slow = dict[str, str]()
     # each graph must take the frames, and open in another process first
     for path in dict.fromkeys(paths):
         loaded = LoadedModel.load(path)
         said[path] = adapted(loaded.model, adapter, module_map)
         models.append(loaded.model)
+        if why := slow_here(loaded.model, provider):
+            slow[path.name] = why
         recording.check(loaded.model)
         try_model(loaded, listener, provider, recording)
     total = len(recording)
@@ -214,7 +223,7 @@ def compare(
             add(a, b, frame)
 
     fidelity = measure(left, right, map(reported, recording), watch)
-    found = CompareResult(*paths, fidelity)
+    found = CompareResult(*paths, fidelity, slow_here=slow)
     if kernels is not None:
         runtime = kernels.result(models[-1], fidelity)
         found = dataclasses.replace(found, runtime=runtime)

@@ -117,6 +117,7 @@ class CompressResult(Result):
         """Yield what became int8, what is proven, and how far the outputs moved."""
         if self.int8 is not None:
             yield self.int8.line
+            yield from filter(None, [self.int8.slow_here])
         yield from _proof(self.report)
         if self.loss is not None:
             yield from self.loss.lines()

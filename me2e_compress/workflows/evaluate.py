@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from me2e_compress import graph
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import POLICIES, Driver, driver_named
 from me2e_compress.errors import EvaluationError, GraphError
@@ -16,6 +17,7 @@ from me2e_compress.metrics.scores import Scores
 from me2e_compress.metrics.scores import score as score_episodes
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.simulator.routes import Route, pick_routes
+from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import check_folder, check_number, model_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.deadlines_table import deadlines_table
@@ -81,6 +83,7 @@ class EvaluateResult(Result):
     Attributes:
         policy: the policy as named, or the evaluator where that drives none.
         late: latencies charged to decisions, against the frame time; None if none were.
+        slow_here: why the policy's file is slow on this CPU, whose form is not its own.
     """
 
     policy: str
@@ -88,6 +91,7 @@ class EvaluateResult(Result):
     scores: Scores
     pictures: tuple[Path, ...] = ()
     late: Deadlines | None = None
+    slow_here: str | None = None
 
     @property
     def headline(self) -> str:
@@ -99,8 +103,9 @@ class EvaluateResult(Result):
         return ()
 
     def alerts(self) -> tuple[str, ...]:
-        """Return the routes that ended by a failure."""
-        return tuple(filter(None, [self.scores.failed]))
+        """Return the routes that ended by a failure, and a form that is slow here."""
+        slow = self.slow_here and f"{self.policy}: {self.slow_here}"
+        return tuple(filter(None, [self.scores.failed, slow]))
 
     def tables(self) -> tuple[Table, ...]:
         """Return every score with its interval, and the latencies charged."""
@@ -115,7 +120,8 @@ class EvaluateResult(Result):
     def to_json(self) -> object:
         """Return the scores, and the latencies charged to decisions."""
         late = None if self.late is None else self.late.to_json()
-        return {**self.scores.to_json(), "deadlines": late}
+        slow = self.slow_here
+        return {**self.scores.to_json(), "deadlines": late, "slow_here": slow}
 
 
 def evaluate(
@@ -194,7 +200,9 @@ def _evaluated(
     scores = score_episodes(episodes, set_size)
     pictures = _pictures(evaluator.job, shown, output)
     late = charged(episodes, measured=options.source.measured)
-    return EvaluateResult(policy, output, scores, pictures, late)
+    model = graph.load(driver.path) if isinstance(driver, OnnxDriver) else None
+    slow = None if model is None else slow_here(model, options.provider)
+    return EvaluateResult(policy, output, scores, pictures, late, slow)
 
 
 def with_stage(driver: Driver, host_stage: str) -> Driver:

@@ -13,6 +13,8 @@ from me2e_compress.manager.report import LossyPass
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import FLOAT, Decision, QuantPlan, plan_of
+from me2e_compress.runtime.providers import CPU
+from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.result import Table, counted, megabytes, table
 
 LEAST_BYTES = 1024
@@ -90,6 +92,10 @@ LISTED, SHOWN = 10, 5
 """Numbers of float weights that a report lists, and that a table shows."""
 LEAST_SHOWN = 10_000
 """Bytes of float weights from which on a rule is named."""
+_FOR_TENSORRT = (
+    "it is quantized in TensorRT's form, slow in onnxruntime's CPU: --target"
+    " onnxruntime writes what is fast here"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,6 +110,8 @@ class Int8Outcome:
         kept: layers left float, by rule and reason; most first.
         weights: the largest that stayed float; at most `LISTED`.
         float_bytes: weights that stayed float, by rule; most first.
+        slow_here: that this CPU runs it slowly, and what is fast; None where it is
+            written for onnxruntime, or another provider runs it.
     """
 
     by: str
@@ -112,6 +120,7 @@ class Int8Outcome:
     kept: Mapping[str, int] = dataclasses.field(default_factory=dict)
     weights: tuple[FloatWeight, ...] = ()
     float_bytes: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    slow_here: str | None = None
 
     @classmethod
     def of(cls, report: Report, context: Context) -> Self | None:
@@ -135,6 +144,7 @@ class Int8Outcome:
             dict(Counter(f"{e.rule}: {e.reason}" for e in left).most_common()),
             weights[:LISTED],
             _by_rule(weights),
+            _slow(report, plan, context) if changes else None,
         )
 
     @property
@@ -188,6 +198,12 @@ def _by_rule(weights: Iterable[FloatWeight]) -> dict[str, int]:
     for each in weights:
         found[each.rule] += each.bytes
     return dict(found.most_common())
+
+
+def _slow(report: Report, plan: QuantPlan, context: Context) -> str | None:
+    said = slow_here(report.model, context.provider)
+    here = context.provider.native == CPU.native
+    return _FOR_TENSORRT if not said and here and plan.target == "tensorrt" else said
 
 
 def _plan(report: Report, quantizer: LossyPass, context: Context) -> QuantPlan | None:

@@ -19,7 +19,7 @@ from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
-from me2e_compress.targets import TARGETS
+from me2e_compress.targets import DEFAULT_TARGET, TARGETS
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
     Given,
@@ -40,7 +40,7 @@ class TrialOptions:
     Attributes:
         scheme: modules that may be int8: ``feature-ext``, ``prediction``, ``full``.
         rules: rules of the int8 plans.
-        target: runtime of the int8 graph; None leaves it to the workflow.
+        target: runtime of the int8 graph.
         ranges: file of saved ranges, instead of calibrating.
         module_map: preset or TOML file; None finds the preset.
         count: number of frames to judge on.
@@ -54,7 +54,7 @@ class TrialOptions:
 
     scheme: str = "full"
     rules: str = DEFAULT_RULES
-    target: str | None = None
+    target: str = DEFAULT_TARGET
     ranges: str | Path | None = None
     module_map: str | Path | None = None
     count: int = 4
@@ -93,13 +93,12 @@ class TrialFiles:
     def trials(
         self,
         options: TrialOptions,
-        target: str,
         listener: Listener,
         drive: Drive | None = None,
     ) -> tuple[Trials, tuple[str, ...]]:
         """Prepare the graph, calibrate once, and name the modules to try."""
         # check names and frames before anything is run
-        rules, place = RULE_SETS.parse(options.rules), TARGETS.parse(target)
+        rules, place = RULE_SETS.parse(options.rules), TARGETS.parse(options.target)
         read = graph.LoadedModel.load(self.model)
         loaded = read.model
         adapted(loaded, options.adapter, options.module_map)
@@ -131,13 +130,15 @@ class TrialFiles:
         )
         return made, scheme.modules
 
-    def write(self, choice: Int8Choice, options: TrialOptions, target: str) -> str:
+    def write(self, choice: Int8Choice, options: TrialOptions) -> str:
         """Write the recipe, and return a line that says what it makes int8."""
         before = {
             each.name: each.dims if isinstance(each, FixShapes) else {}
             for each in options.exact()
         }
-        overrides = write_recipe(self.output, choice, before, options.rules, target)
+        overrides = write_recipe(
+            self.output, choice, before, options.rules, options.target
+        )
         listed = ", ".join(choice.modules) or "no module"
         more = f", {len(choice.floats)} of their nodes in float" if overrides else ""
         return f"{self.output}: int8 in {listed}{more}"

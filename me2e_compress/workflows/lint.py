@@ -5,6 +5,7 @@ import functools
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Self
 
 import onnx_ir as ir
 
@@ -14,6 +15,7 @@ from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import FixShapes
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets import TARGETS, LintFinding, Severity, Target
 from me2e_compress.targets.base import SEVERITIES, worst_first
@@ -30,7 +32,8 @@ class LintOptions:
     """The runtime that is asked, and how.
 
     Attributes:
-        target: ``tensorrt`` or ``onnxruntime``.
+        target: ``onnxruntime`` or ``tensorrt``; None is whom the file was written for
+            by the plan that it carries, else ``tensorrt``.
         trt_check: also parse and build the graph by TensorRT-RTX.
         sm: GPU generation that is built for.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
@@ -42,7 +45,7 @@ class LintOptions:
             version is none.
     """
 
-    target: str = "tensorrt"
+    target: str | None = None
     trt_check: bool = False
     sm: int = 86
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -50,23 +53,33 @@ class LintOptions:
     target_version: str | None = None
 
     def __post_init__(self) -> None:
-        if self.trt_check and self.target != "tensorrt":
-            raise RecipeError(f"--trt-check is for tensorrt, not for {self.target}")
-        if self.target_version is not None and self.target != "tensorrt":
-            raise RecipeError(
-                f"--target-version is for tensorrt, not for {self.target}"
-            )
-        if self.provider != CPU and not self.judge.opens:
+        if (option := self._of_tensorrt) and self.target not in (None, "tensorrt"):
+            raise RecipeError(f"--{option} is for tensorrt, not for {self.target}")
+        if self.provider != CPU and self.target and not self.judge.opens:
             raise RecipeError(
                 f"--provider and --plugins are onnxruntime's: lint for {self.target}"
                 " opens no session"
             )
 
+    def of(self, model: ir.Model) -> Self:
+        """Return these options with the target that a graph is asked for."""
+        if self.target is not None:
+            return self
+        plan = None if self._of_tensorrt else plan_of(model)
+        written_for = "" if plan is None else plan.target
+        return dataclasses.replace(self, target=written_for or "tensorrt")
+
+    @property
+    def _of_tensorrt(self) -> str:
+        """Name an option that only TensorRT serves."""
+        version = "" if self.target_version is None else "target-version"
+        return "trt-check" if self.trt_check else version
+
     @functools.cached_property
     def judge(self) -> Target:
         """The target, whose rules judge the graph."""
         if self.target_version is None:
-            return TARGETS.parse(self.target)
+            return TARGETS.parse(self.target or "tensorrt")
         try:
             return TensorRT(version=self.target_version)
         except ValueError as reason:
@@ -108,7 +121,7 @@ class LintResult(Result):
         if said := self._first("error", f"{self.options.target} refuses it"):
             return said
         if self.build is not None and not self.build.passed:
-            return f"{self.model}: {_why(self.build)}"
+            return f"{self.model}: {self.build.refusal}"
         return None
 
     @property
@@ -156,8 +169,8 @@ class LintResult(Result):
             for each in SEVERITIES
             if counts[each] or each in always
         ]
-        version = self.options.target_version
-        runtime = f"{self.options.target} {version}" if version else self.options.target
+        asked = self.options.target, self.options.target_version
+        runtime = " ".join(filter(None, asked))
         return (
             f"{self.model.name} for {runtime}: {', '.join(said)}"
             " (our own rules and operator tables)"
@@ -165,13 +178,16 @@ class LintResult(Result):
 
     def summary(self) -> tuple[RuleSummary, ...]:
         """Return one row per rule."""
-        rows: dict[tuple[Severity, str], list[LintFinding]] = {}
-        for each in self.findings:
-            rows.setdefault((each.severity, each.rule), []).append(each)
         return tuple(
             RuleSummary(*key, len(found), found[0].node, found[0].message)
-            for key, found in rows.items()
+            for key, found in self._by_rule().items()
         )
+
+    def _by_rule(self) -> dict[tuple[Severity, str], list[LintFinding]]:
+        rules: dict[tuple[Severity, str], list[LintFinding]] = {}
+        for each in self.findings:
+            rules.setdefault((each.severity, each.rule), []).append(each)
+        return rules
 
     def lines(self) -> tuple[str, ...]:
         """Return the headline, and TensorRT-RTX's answer."""
@@ -183,17 +199,12 @@ class LintResult(Result):
         if not self.findings:
             return ()
         # a rule that fails everywhere would bury the others
-        rows = list[tuple[str, ...]]()
-        seen: Counter[tuple[str, str]] = Counter()
-        for each in self.findings:
-            key = (each.severity, each.rule)
-            seen[key] += 1
-            if seen[key] <= shown:
-                rows.append((*key, each.node, each.message))
+        rules = self._by_rule().items()
+        rows = [(*key, e.node, e.message) for key, own in rules for e in own[:shown]]
         more = (
-            f"{severity} {rule}: {count - shown} more"
-            for (severity, rule), count in seen.items()
-            if count > shown
+            f"{severity} {rule}: {len(own) - shown} more"
+            for (severity, rule), own in rules
+            if len(own) > shown
         )
         columns = ("", "rule", "node", "what")
         return (table("Findings", columns, rows, "\n".join(more), words=4),)
@@ -203,8 +214,9 @@ class LintResult(Result):
         return [dataclasses.asdict(each) for each in self.findings]
 
     def to_json(self) -> object:
-        """Return the findings, and the answer of TensorRT-RTX."""
-        return {"findings": self.findings, "tensorrt_rtx": self.build}
+        """Return the target, the findings, and the answer of TensorRT-RTX."""
+        asked, build = self.options.target, self.build
+        return {"target": asked, "findings": self.findings, "tensorrt_rtx": build}
 
 
 def lint(
@@ -224,8 +236,9 @@ def lint(
         PreconditionError: No input has such an open dimension.
         MissingExtraError: TensorRT-RTX is asked for and not installed.
     """
-    options, path = options or LintOptions(), model_path(model)
+    path = model_path(model)
     loaded = graph.load(path)
+    options = (options or LintOptions()).of(loaded)
     if options.dims:
         modules = load_map(None, loaded)
         loaded = FixShapes(options.dims).run(loaded, Context(modules)).model
@@ -275,22 +288,10 @@ def _said(verdict: BuildResult, sm: int) -> tuple[str, ...]:
     kernels = ", ".join(f"{int8[kind]} of {every[kind]} {kind}s" for kind in every)
     parsed = "parsed" if verdict.parsed else "not parsed"
     built = "built" if verdict.built else "not built"
-    lines = [
-        f"TensorRT-RTX {verdict.version}, on this CPU: {parsed}"
-        + ("" if verdict.built is None else f", {built} for SM{sm}")
-    ]
+    more = "" if verdict.built is None else f", {built} for SM{sm}"
+    lines = [f"TensorRT-RTX {verdict.version}, on this CPU: {parsed}{more}"]
     if kernels:
         lines.append(f"kernels with int8 operands: {kernels}")
     if verdict.cut:
         lines.append(f"cut at {len(verdict.cut)} plugins: {', '.join(verdict.cut[:5])}")
     return tuple(lines)
-
-
-def _why(verdict: BuildResult) -> str:
-    if verdict.missing:
-        return (
-            f"{len(verdict.missing)} convolutions that the plan makes int8 have no int8"
-            f" kernel, {verdict.missing[0]} first"
-        )
-    first = verdict.errors[0] if verdict.errors else "it does not say why"
-    return f"TensorRT-RTX refuses it: {first}"

@@ -23,6 +23,7 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.quantization.plan.decision import record
 from me2e_compress.quantization.rules import DEFAULT_RULES, RuleSet
+from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows.checks import lacking_shapes, model_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
@@ -36,6 +37,7 @@ class PlanOptions:
     Attributes:
         scheme: ``feature-ext``, ``prediction``; None is ``full``.
         rules: ``safe``, ``paper``, or a set of yours; None is ``safe``.
+        target: runtime of the int8 graph; None is ``onnxruntime``.
         overrides: TOML file of exceptions.
         module_map: preset or TOML file; None finds the preset.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
@@ -44,6 +46,7 @@ class PlanOptions:
 
     scheme: str | None = None
     rules: str | RuleSet | None = None
+    target: str | None = None
     overrides: str | Path | None = None
     module_map: str | Path | None = None
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -151,6 +154,7 @@ def _planned(
     plain = QuantizeInt8(
         scheme=options.scheme or "full",
         rules=options.rules or DEFAULT_RULES,
+        target=options.target or DEFAULT_TARGET,
     )
     overrides = None if options.overrides is None else Path(options.overrides)
     chosen = dataclasses.replace(plain, overrides=overrides)
@@ -185,7 +189,7 @@ def _check_options(
     read: Sequence[QuantPlan | ir.Model],
 ) -> None:
     """Refuse options that would change nothing, because all plans are made already."""
-    names = ("scheme", "rules", "overrides")
+    names = ("scheme", "rules", "target", "overrides")
     given = [name for name in names if getattr(options, name)]
     only = read[:1] if "overrides" in given else read
     if given and all(isinstance(each, QuantPlan) for each in only):

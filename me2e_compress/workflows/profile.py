@@ -25,6 +25,7 @@ from me2e_compress.runtime.others_load import OthersLoad
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
     check_count,
@@ -145,6 +146,7 @@ def profile(
         energy=energy,
         energy_output=joules,
         budget_ms=options.budget_ms,
+        slow_here=slow_here(loaded.model, options.provider),
     )
 
 

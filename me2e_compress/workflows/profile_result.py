@@ -30,6 +30,7 @@ class ProfileResult(Result):
         operators_us: microseconds of each operator, in inferences under a profiler.
         energy: joules, or why there are none; None if not asked for.
         told: other readings, in words, such as the power of a device.
+        slow_here: why the file is slow on this CPU, whose form is not its own.
     """
 
     model: Path
@@ -41,6 +42,7 @@ class ProfileResult(Result):
     energy_output: Path | None = None
     budget_ms: float = BUDGET_MS
     told: tuple[str, ...] = ()
+    slow_here: str | None = None
 
     @property
     def deadlines(self) -> Deadlines:
@@ -69,10 +71,12 @@ class ProfileResult(Result):
         return "" if self.trace.others is None else f" (--samples {needed})"
 
     def alerts(self) -> tuple[str, ...]:
-        """Return whether the machine was busy, and what puts joules in doubt."""
+        """Return what puts joules and times in doubt, and a form that is slow here."""
         energy = () if self.energy is None else self.energy.alerts()
         load = self.trace.others
-        return (*energy, str(load)) if load is not None and load.busy else energy
+        busy = str(load) if load is not None and load.busy else None
+        slow = self.slow_here and f"{self.model.name}: {self.slow_here}"
+        return (*energy, *filter(None, (busy, slow)))
 
     def tables(self) -> tuple[Table, ...]:
         """Return percentiles in milliseconds, then modules, energy and operators."""
@@ -103,6 +107,7 @@ class ProfileResult(Result):
             "modules": shares(self.trace.modules_us),
             "operators": shares(self.operators_us),
             "energy": None if self.energy is None else self.energy.to_json(),
+            "slow_here": self.slow_here,
             **(
                 {"others_cores": None, "cores": None}
                 if load is None

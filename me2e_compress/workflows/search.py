@@ -13,6 +13,7 @@ from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.sensitivity import Budget, Candidate, Int8Choice, Trials
 from me2e_compress.sensitivity import search as find
+from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows.budgets import (
     Joules,
     check_budgets,
@@ -31,7 +32,7 @@ class SearchOptions(TrialOptions):
 
     Attributes:
         max_mb: most MB of weights.
-        max_ms: most milliseconds per frame, on this CPU; its target is onnxruntime.
+        max_ms: most milliseconds per frame, on this CPU, so for its target alone.
         max_joules: most joules per frame: measured where a counter answers, else
             modelled.
     """
@@ -43,16 +44,11 @@ class SearchOptions(TrialOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_budgets(self.max_mb, self.max_ms, self.max_joules)
-        if self.max_ms is not None and self.runs_on != "onnxruntime":
+        if self.max_ms is not None and self.target != DEFAULT_TARGET:
             raise RecipeError(
-                f"--max-ms is measured on this CPU, where int8 for {self.runs_on} is"
-                " slow: use --target onnxruntime"
+                f"--max-ms is measured on this CPU, where int8 for {self.target} is"
+                f" slow: use --target {DEFAULT_TARGET}"
             )
-
-    @property
-    def runs_on(self) -> str:
-        """The runtime of the int8 graph."""
-        return self.target or ("tensorrt" if self.max_ms is None else "onnxruntime")
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -147,12 +143,12 @@ def _search(
     files: TrialFiles, options: SearchOptions, listener: Listener
 ) -> SearchResult:
     # calibrate once, then search variants of that one graph
-    trials, modules = files.trials(options, options.runs_on, listener)
+    trials, modules = files.trials(options, listener)
     budgets = _budgets(options, trials)
     report = partial(listener.on_progress, "modules")
     tried = find(trials, modules, budgets, progress=report)
     choice = Int8Choice(tried[-1].modules)
-    written = files.write(choice, options, options.runs_on)
+    written = files.write(choice, options)
     limits = tuple((each.unit, each.limit) for each in budgets)
     return SearchResult(files.output, tried, limits, written)
 

@@ -217,9 +217,8 @@ def _measured(
         folder = files.output.with_name(files.output.stem + ".drives")
         check_folder(folder, (files.frames,))
         drive = _on_routes(options.drive, files.model, folder, options)
-    target = options.target or "tensorrt"
     # calibrate once, try modules and nodes, then choose within the limits
-    trials, modules = files.trials(options, target, listener, drive)
+    trials, modules = files.trials(options, listener, drive)
     found = analyse(
         trials,
         modules,
@@ -227,7 +226,7 @@ def _measured(
         progress=partial(listener.on_progress, "modules"),
     )
     choice = advise(trials, found, options.limit, options.drive_limit)
-    written = files.write(choice, options, target)
+    written = files.write(choice, options)
     score = trials.score(choice) if choice.modules else None
     driving = trials.driving(choice) if choice.modules else None
     return SensitivityResult(

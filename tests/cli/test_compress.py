@@ -47,7 +47,9 @@ def test_the_checkpoint_is_named(cli: Cli, files: Path) -> None:
 def test_int8_by_scheme(cli: Cli, dense: Path) -> None:
     scheme = INT8.replace("full", "prediction")
     record = cli.document(f"compress dense.onnx {scheme} -o out.onnx")
-    assert record["steps"][-1]["text"] == 'quantize-int8{scheme="prediction"}'
+    assert record["steps"][-1]["text"] == (
+        'quantize-int8{scheme="prediction", target="onnxruntime"}'
+    )
     weights = graph.load(dense / "out.onnx").graph.initializers.values()
     assert ir.DataType.INT8 in [value.dtype for value in weights]
 
@@ -192,7 +194,8 @@ POOLED = """
         ["/backbone/End"] y = %s(d)
     }
 """
-LINTED = "compress pooled.onnx --scheme full --rules paper --frames pictures -o o.onnx"
+LINTED = "compress pooled.onnx --frames pictures -o o.onnx"
+PLANNED = "--scheme full --rules paper --target"
 
 
 def pooled(folder: Path, end: str = "Relu", shape: str = "1,16,8,8") -> None:
@@ -208,7 +211,7 @@ def test_what_the_target_computes_otherwise_is_an_alert(
 ) -> None:
     pooled(tmp_path)
 
-    found = cli.document(f"{LINTED} --target onnxruntime")
+    found = cli.document(f"{LINTED} {PLANNED} onnxruntime")
 
     assert found["status"] == "warning"
     assert "lint: o.onnx for onnxruntime: 0 errors, 1 wrong" in str(found["verdict"])
@@ -220,7 +223,10 @@ def test_what_the_target_computes_otherwise_is_an_alert(
 
 @pytest.mark.parametrize(
     ("target", "code", "status"),
-    [("--target tensorrt", 1, "refused"), ("", 0, "warning")],
+    [
+        (f"{PLANNED} tensorrt", 1, "refused"),
+        ("--passes quantize-int8{rules=paper,target=tensorrt}", 0, "warning"),
+    ],
 )
 def test_a_target_that_is_named_must_take_what_is_written(
     cli: Cli, tmp_path: Path, target: str, code: int, status: str

@@ -39,7 +39,7 @@ def test_the_quantized_graph_runs_and_stays_close(
 ) -> None:
     model = conv_attention()
 
-    result = QuantizeInt8(rules="paper").run(model, context)
+    result = QuantizeInt8(rules="paper", target="tensorrt").run(model, context)
     found = compare(Session(model), Session(result.model), frames)
 
     assert result.changes == 4
@@ -49,7 +49,7 @@ def test_the_quantized_graph_runs_and_stays_close(
 
 def test_notes_say_what_was_decided_by_which_rule(context: Context) -> None:
     notes = (
-        QuantizeInt8(rules="paper", attention_limit=8)
+        QuantizeInt8(rules="paper", target="tensorrt", attention_limit=8)
         .run(conv_attention(), context)
         .notes
     )
@@ -71,7 +71,7 @@ def test_notes_say_what_was_decided_by_which_rule(context: Context) -> None:
 def test_schemes_and_modules_choose(
     context: Context, options: dict[str, object], changes: int
 ) -> None:
-    chosen = QuantizeInt8(rules="paper", **options)  # type: ignore[arg-type]
+    chosen = QuantizeInt8(rules="paper", target="tensorrt", **options)  # type: ignore[arg-type]
 
     assert chosen.run(conv_attention(), context).changes == changes
 
@@ -82,10 +82,14 @@ def test_without_frames_there_is_no_calibration() -> None:
 
 
 def test_a_quantized_graph_is_not_quantized_again(context: Context) -> None:
-    once = QuantizeInt8(rules="paper").run(conv_attention(), context).model
+    once = (
+        QuantizeInt8(rules="paper", target="tensorrt")
+        .run(conv_attention(), context)
+        .model
+    )
 
     with pytest.raises(PreconditionError) as caught:
-        QuantizeInt8(rules="paper").run(once, context)
+        QuantizeInt8(rules="paper", target="tensorrt").run(once, context)
 
     assert "quantized already: 7 DequantizeLinear, 5 QuantizeLinear" in str(
         caught.value
@@ -96,22 +100,24 @@ def test_a_quantized_graph_is_not_quantized_again(context: Context) -> None:
 
 
 def test_the_graph_carries_its_plan(context: Context) -> None:
-    plan = plan_of(QuantizeInt8().run(conv_attention(), context).model)
+    plan = plan_of(QuantizeInt8(target="tensorrt").run(conv_attention(), context).model)
 
     assert plan is not None
-    assert plan.rules == "safe"
+    assert (plan.rules, plan.target) == ("safe", "tensorrt")
     assert len(plan.decisions) == 10
 
 
 def test_the_rules_of_the_default_keep_small_layers_in_float(context: Context) -> None:
-    notes = QuantizeInt8().run(conv_attention(), context).notes
+    notes = QuantizeInt8(target="tensorrt").run(conv_attention(), context).notes
 
     rules = "attention-weights 2, layer 1, small-product 1"
     assert f"1 of 10 nodes int8; by rule: {rules}" in notes
 
 
 def test_a_rule_that_is_switched_off_objects_to_nothing(context: Context) -> None:
-    options = QuantizeInt8(without=("small-product", "attention-weights"))
+    options = QuantizeInt8(
+        target="tensorrt", without=("small-product", "attention-weights")
+    )
 
     notes = options.run(conv_attention(), context).notes
 
@@ -155,7 +161,11 @@ def test_close_decisions_are_noted(context: Context) -> None:
         ),
         ({"target": "qnn"}, RecipeError, "no target 'qnn'; there are tensorrt"),
         ({"overrides": Path("none.toml")}, RecipeError, "none.toml: no such file"),
-        ({"method": "median"}, RecipeError, "no calibration method 'median'"),
+        (
+            {"method": "median", "rules": "paper"},
+            RecipeError,
+            "no calibration method 'median'",
+        ),
     ],
 )
 def test_what_is_not_there_is_named(
@@ -172,8 +182,16 @@ def test_saved_ranges_give_the_same_graph_without_frames(
     path = tmp_path / "r.json"
     Calibrator("max-min").run(model, TENSORS, frames).save(path)
 
-    measured = QuantizeInt8(rules="paper").run(conv_attention(), context).model
-    read = QuantizeInt8(rules="paper", ranges=path).run(model, Context(MODULES)).model
+    measured = (
+        QuantizeInt8(rules="paper", target="tensorrt")
+        .run(conv_attention(), context)
+        .model
+    )
+    read = (
+        QuantizeInt8(rules="paper", target="tensorrt", ranges=path)
+        .run(model, Context(MODULES))
+        .model
+    )
 
     assert graph.digest(read) == graph.digest(measured)
 

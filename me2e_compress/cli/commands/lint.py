@@ -21,9 +21,7 @@ TargetVersion = Annotated[
 
 def lint(
     model: given.Model,
-    target: Annotated[
-        str, typer.Option(help="runtime of the graph: tensorrt or onnxruntime")
-    ] = "tensorrt",
+    target: given.Target = None,
     trt_check: TrtCheck = False,
     target_version: TargetVersion = None,
     sm: Annotated[int, typer.Option(help="GPU generation that is built for")] = 86,

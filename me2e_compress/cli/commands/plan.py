@@ -24,6 +24,7 @@ def plan(
     model: Model,
     scheme: given.Scheme = None,
     rules: given.Rules = None,
+    target: given.Target = None,
     overrides: given.Overrides = None,
     module_map: given.ModuleMap = None,
     set_dim: given.SetDim = None,
@@ -34,12 +35,7 @@ def plan(
 ) -> None:
     """Show which nodes become int8, which stay float, by which rule, and why."""
     options = workflow.PlanOptions(
-        scheme,
-        rules,
-        overrides,
-        module_map,
-        sizes(set_dim or ()),
-        force,
+        scheme, rules, target, overrides, module_map, sizes(set_dim or ()), force
     )
     found = workflow.plan(model, output, against, options)
     show(found, (*found.tables(), *found.details()) if nodes else None)

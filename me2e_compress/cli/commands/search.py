@@ -10,6 +10,7 @@ from me2e_compress.cli.console import listening, show, tell
 from me2e_compress.errors import RecipeError
 from me2e_compress.extras import need_extra
 from me2e_compress.runtime.providers import provider_named
+from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows import search as workflow
 from me2e_compress.workflows.budgets import check_budgets
 from me2e_compress.workflows.checks import sizes
@@ -66,7 +67,7 @@ def search(
     workers: Workers = None,
     scheme: given.TrialScheme = "full",
     rules: given.TrialRules = "safe",
-    target: given.Target = None,
+    target: given.TrialTarget = DEFAULT_TARGET,
     ranges: given.SavedRanges = None,
     module_map: given.ModuleMap = None,
     set_dim: given.SetDim = None,

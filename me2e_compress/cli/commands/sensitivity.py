@@ -7,6 +7,7 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.runtime.providers import provider_named
+from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows import sensitivity as workflow
 from me2e_compress.workflows.checks import sizes
 
@@ -31,7 +32,7 @@ def sensitivity(
     output: given.RecipeOutput,
     scheme: given.TrialScheme = "full",
     rules: given.TrialRules = "safe",
-    target: given.Target = None,
+    target: given.TrialTarget = DEFAULT_TARGET,
     limit: Limit = 0.1,
     drive: Drive = None,
     drive_limit: DriveLimit = None,

@@ -109,6 +109,7 @@ class QuantPlan(Displayed):
         kept_float: int8 nodes that stay float on the target; empty before the plan was
             carried out for one.
         balanced: whether weights are rounded so that their errors cancel.
+        target: who is to run the graph; empty where the plan was made for nobody.
     """
 
     scheme: QuantScheme
@@ -117,6 +118,7 @@ class QuantPlan(Displayed):
     groups: tuple[ScaleGroup, ...] = ()
     kept_float: tuple[KeptFloat, ...] = ()
     balanced: bool = False
+    target: str = ""
 
     @property
     def chosen(self) -> tuple[Decision, ...]:
@@ -140,7 +142,9 @@ class QuantPlan(Displayed):
         counts = ", ".join(f"{rule} {count}" for rule, count in self.counts().items())
         kept = len(self.kept_float)
         return (
-            f"scheme {self.scheme.name}, rules {self.rules}: {len(self.chosen)} of"
+            f"scheme {self.scheme.name}, rules {self.rules}"
+            + (f", for {self.target}" if self.target else "")
+            + f": {len(self.chosen)} of"
             f" {len(self.decisions)} nodes int8; {counts}"
             + (f"; {kept} of them stay float on their target" if kept else "")
         )

@@ -9,6 +9,7 @@ from me2e_compress.errors import RecipeError
 from me2e_compress.quantization.rules import DEFAULT_RULES
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.sensitivity.search import nothing_fits
+from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows.budgets import Joules, check_budgets
 from me2e_compress.workflows.checks import MOST_THREADS, check_count
 
@@ -118,7 +119,7 @@ class RoadSearchOptions:
     baseline_median_s: float | None = None
     first_rung: int = 22
     rules: str = DEFAULT_RULES
-    target: str | None = None
+    target: str = DEFAULT_TARGET
     module_map: str | None = None
     adapter: Path | None = None
     dims: Mapping[str, int] = field(default_factory=dict)
@@ -133,13 +134,8 @@ class RoadSearchOptions:
         check_count("--first-rung", self.first_rung, least=1)
         check_count("--threads", self.threads, least=1, most=MOST_THREADS)
         timed = self.limits.max_ms is not None or self.latency == "trace"
-        if timed and self.runs_on != "onnxruntime":
+        if timed and self.target != DEFAULT_TARGET:
             raise RecipeError(
-                f"latency is measured here, where int8 for {self.runs_on} is slow: use"
-                " --target onnxruntime"
+                f"latency is measured here, where int8 for {self.target} is slow: use"
+                f" --target {DEFAULT_TARGET}"
             )
-
-    @property
-    def runs_on(self) -> str:
-        """The runtime of the int8 graphs."""
-        return self.target or "onnxruntime"

@@ -81,7 +81,7 @@ def search_on_road(
         rungs = climbed(made, fitting, options, tell)
         winner = rungs[-1].standings[0].name
         text = marks.IN_TOML + recipe.to_toml(
-            grid[winner].passes(options.rules, options.runs_on, options.dims)
+            grid[winner].passes(options.rules, options.target, options.dims)
         )
         write_bytes(recipe_file, text.encode())
     return RoadSearchResult(
@@ -107,7 +107,7 @@ def planned(
         replace(
             baseline,
             name=name,
-            passes=point.passes(options.rules, options.runs_on, options.dims),
+            passes=point.passes(options.rules, options.target, options.dims),
         )
         for name, point in grid.items()
     ]

@@ -56,18 +56,21 @@ def int8_layers(
     runs those of a graph placed for TensorRT in float.
     """
     return tuple(
-        node
-        for node in model.graph
-        if node.op_type in kinds and all(map(_dequantized, node.inputs[:2]))
+        node for node in model.graph if node.op_type in kinds and reads_integers(node)
     )
 
 
-def _dequantized(value: ir.Value | None) -> bool:
-    """Return whether a value is dequantized, possibly with a layout change after it."""
+def reads_integers(layer: ir.Node) -> bool:
+    """Return whether both operands of a layer come through a DequantizeLinear."""
+    return all(dequantizer_of(value) is not None for value in layer.inputs[:2])
+
+
+def dequantizer_of(value: ir.Value | None) -> ir.Node | None:
+    """Return the DequantizeLinear of a value, past a change of its layout."""
     node = producer_of(value)
     while node is not None and node.op_type in ("Reshape", "Transpose"):
         node = producer_of(node.inputs[0])
-    return node is not None and node.op_type == DEQUANTIZE
+    return node if node is not None and node.op_type == DEQUANTIZE else None
 
 
 def _draft_of_qdq(model: ir.Model) -> Draft:

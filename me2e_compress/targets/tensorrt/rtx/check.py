@@ -92,6 +92,17 @@ class BuildResult:
         """Whether every step that was run succeeded."""
         return self.parsed and self.built is not False and not self.missing
 
+    @property
+    def refusal(self) -> str:
+        """What is said first of a graph that did not pass."""
+        if self.missing:
+            return (
+                f"{len(self.missing)} convolutions that the plan makes int8 have no"
+                f" int8 kernel, {self.missing[0]} first"
+            )
+        first = self.errors[0] if self.errors else "it does not say why"
+        return f"TensorRT-RTX refuses it: {first}"
+
 
 def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> BuildResult:
     """Parse and build a graph with TensorRT-RTX, without a GPU.

@@ -1,0 +1,221 @@
+"""For whom int8 is written where nobody is named, and what is said of other files."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.errors import RecipeError
+from me2e_compress.manager import recipe
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.plan import plan_of
+from me2e_compress.runtime.providers import CudaProvider
+from me2e_compress.simulator.routes import save_routes
+from me2e_compress.workflows.lint import LintOptions
+from tests.command import Cli, write_frames
+from tests.evaluators.highway.drivers import PARKED, straight_on
+
+CONVOLUTIONS = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    m (float[1,16,8,8] x) => (float[1,16,8,8] y)
+    <float[16,16,1,1] w = {%s}, float[16,16,1,1] v = {%s}> {
+        ["/backbone/One"] a = Conv(x, w) ["/backbone/Relu"] b = Relu(a)
+        ["/backbone/Two"] c = Conv(b, v) ["/backbone/End"] y = Relu(c)
+    }
+"""
+INT8 = "compress m.onnx --scheme full --rules paper --frames frames"
+SLOW = "it is quantized in TensorRT's form, slow in onnxruntime's CPU"
+FAST = "--target onnxruntime writes what is fast here"
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    draws = np.random.default_rng()
+    weights = (
+        ",".join(f"{number:.4f}" for number in draws.normal(size=256)) for _ in "wv"
+    )
+    graph.save(ir.from_onnx_text(CONVOLUTIONS % tuple(weights)), tmp_path / "m.onnx")
+    frame = draws.normal(size=(1, 16, 8, 8)).astype(np.float32)
+    write_frames(tmp_path / "frames", x=frame)
+    return tmp_path
+
+
+def grids(path: Path) -> set[ir.DataType]:
+    """The types that activations are quantized to."""
+    nodes = graph.load(path).graph
+    zeros = [node.inputs[2] for node in nodes if node.op_type == "QuantizeLinear"]
+    return {zero.dtype for zero in zeros if zero is not None and zero.dtype is not None}
+
+
+def test_int8_is_for_onnxruntime_unless_somebody_is_named(
+    cli: Cli, model: Path
+) -> None:
+    shown = cli.done(f"{INT8} -o out.onnx").words
+
+    assert grids(model / "out.onnx") == {ir.DataType.UINT8}
+    assert "out.onnx for onnxruntime: 0 errors, 0 warnings" in shown
+    assert "TensorRT's form" not in shown
+    assert json.loads((model / "out.report.json").read_text())["int8"]["slow_here"] is (
+        None
+    )
+
+
+def test_int8_for_tensorrt_is_said_to_be_slow_here(cli: Cli, model: Path) -> None:
+    shown = cli.done(f"{INT8} --target tensorrt -o out.onnx").words
+
+    assert grids(model / "out.onnx") == {ir.DataType.INT8}
+    assert SLOW in shown
+    assert FAST in shown
+    report = json.loads((model / "out.report.json").read_text())
+    assert report["int8"]["slow_here"].startswith(SLOW)
+    assert any(SLOW in line for line in report["verdict"])
+
+
+@pytest.mark.usefixtures("dense")
+def test_a_product_that_is_fast_here_is_in_tensorrts_form_all_the_same(
+    cli: Cli,
+) -> None:
+    """A MatMul without a bias answers float at full speed; its target is said."""
+    line = "compress dense.onnx --scheme full --frames frames --map map.toml"
+
+    shown = cli.done(f"{line} --target tensorrt -o out.onnx").words
+
+    assert SLOW in shown
+    assert SLOW not in cli.done("profile out.onnx frames -o t.json").words
+
+
+@pytest.mark.usefixtures("model")
+@pytest.mark.parametrize("written_for", ["tensorrt", "onnxruntime"])
+def test_lint_asks_whom_a_file_was_written_for(cli: Cli, written_for: str) -> None:
+    cli.done(f"{INT8} --target {written_for} -o out.onnx")
+
+    assert f"out.onnx for {written_for}: 0 errors" in cli.done("lint out.onnx").out
+    assert cli.document("lint out.onnx")["target"] == written_for
+
+
+def test_lint_asks_tensorrt_of_files_that_do_not_say(cli: Cli, model: Path) -> None:
+    assert cli.document("lint m.onnx")["target"] == "tensorrt"
+    cli.done(f"{INT8} -o out.onnx")
+    # a plan of before it told its target, and none
+    made = graph.load(model / "out.onnx")
+    plan = json.loads(made.metadata_props.pop("me2e.quant_plan"))
+    graph.save(made, model / "other.onnx")
+    plan.pop("target")
+    made.metadata_props["me2e.quant_plan"] = json.dumps(plan)
+    graph.save(made, model / "older.onnx")
+
+    for file in ("other.onnx", "older.onnx"):
+        assert cli.document(f"lint {file}", code=1)["target"] == "tensorrt"
+    for option in ("--target tensorrt", "--target-version 10.13"):
+        assert cli.document(f"lint out.onnx {option}", code=1)["target"] == "tensorrt"
+    assert LintOptions(trt_check=True).of(made).target == "tensorrt"
+
+
+def test_a_provider_is_for_whom_opens_a_session(model: Path, cli: Cli) -> None:
+    cli.done(f"{INT8} -o out.onnx")
+    options = LintOptions(provider=CudaProvider())
+
+    assert options.of(graph.load(model / "out.onnx")).provider == CudaProvider()
+    with pytest.raises(RecipeError, match="lint for tensorrt opens no session"):
+        options.of(graph.load(model / "m.onnx"))
+
+
+def test_lowered_int8_is_for_onnxruntime(cli: Cli, model: Path) -> None:
+    cli.done(f"{INT8} --target tensorrt -o trt.onnx")
+    passes = "--passes import-normalize,lower-int8 --frames frames"
+
+    cli.done(f"compress trt.onnx {passes} -o cpu.onnx")
+
+    plan = plan_of(graph.load(model / "cpu.onnx"))
+    assert plan is not None
+    assert plan.target == cli.document("lint cpu.onnx")["target"] == "onnxruntime"
+    assert cli.document("profile cpu.onnx frames -o t.json")["slow_here"] is None
+
+
+@pytest.mark.usefixtures("model")
+def test_profile_and_compare_say_it_of_files_of_whoever(cli: Cli, model: Path) -> None:
+    cli.done(f"{INT8} --target tensorrt -o out.onnx")
+    # others write no plan
+    other = graph.load(model / "out.onnx")
+    other.metadata_props.clear()
+    graph.save(other, model / "other.onnx")
+
+    found = cli.document("profile other.onnx frames -o t.json")
+    assert found["slow_here"].startswith(SLOW)
+    assert "--passes import-normalize,lower-int8" in found["slow_here"]
+    assert found["status"] == "warning"
+    assert (
+        f"other.onnx: {SLOW}" in cli.done("profile other.onnx frames -o t.json").words
+    )
+    held = cli.document("compare m.onnx other.onnx frames")
+    assert list(held["slow_here"]) == ["other.onnx"]
+    assert f"other.onnx: {SLOW}" in cli.done("compare m.onnx other.onnx frames").words
+
+
+@pytest.mark.usefixtures("model")
+def test_profile_and_compare_say_nothing_of_other_files(cli: Cli) -> None:
+    cli.done(f"{INT8} -o out.onnx")
+
+    for file in ("m.onnx", "out.onnx"):
+        assert cli.document(f"profile {file} frames -o t.json")["slow_here"] is None
+        assert SLOW not in cli.done(f"profile {file} frames -o t.json").words
+    assert cli.document("compare m.onnx out.onnx frames")["slow_here"] == {}
+
+
+TURNED = """
+    q = QuantizeLinear(ahead, s, z) d = DequantizeLinear(q, s, z)
+    v = DequantizeLinear(w, s, z) m = MatMul(d, v) plan = Add(m, b)"""
+GRID = (
+    ", float s = {0.1}, int8 z = {0}, int8[2,2] w = {10, 0, 0, 10}, float[2] b = {0, 0}"
+)
+
+
+def test_evaluate_says_it_of_the_file_that_drives(cli: Cli, tmp_path: Path) -> None:
+    save_routes((PARKED,), tmp_path / "routes.json")
+    straight_on(tmp_path / "slow.onnx", body=TURNED, initializers=GRID)
+    straight_on(tmp_path / "float.onnx")
+
+    line = "--routes routes.json --latency none -o"
+    slow = cli.document(f"evaluate slow.onnx {line} slow")
+    plain = cli.document(f"evaluate float.onnx {line} float")
+
+    assert slow["slow_here"].startswith(SLOW)
+    assert f"slow.onnx: {slow['slow_here']}" in slow["verdict"]
+    assert plain["slow_here"] is None
+    assert not [each for each in plain["verdict"] if SLOW in each]
+
+
+@pytest.mark.usefixtures("model")
+def test_a_plan_is_for_the_target_that_compress_writes_for(cli: Cli) -> None:
+    assert cli.document("plan m.onnx")["target"] == "onnxruntime"
+    assert cli.document("plan m.onnx --target tensorrt")["target"] == "tensorrt"
+    said = cli.done("plan m.onnx --rules paper --target tensorrt").words
+    assert "rules paper, for tensorrt: 2 of" in said
+
+
+def test_recipes_of_trials_are_for_onnxruntime(cli: Cli, model: Path) -> None:
+    trial = "m.onnx frames --rules paper"
+
+    cli.done(f"sensitivity {trial} --limit 9 -o a.toml")
+    cli.done(f"search {trial} --max-mb 0.0015 -o b.toml")
+    cli.done(f"search {trial} --max-mb 0.0015 --target tensorrt -o c.toml")
+
+    made = [recipe.load(model / f"{name}.toml")[-1] for name in "abc"]
+    targets = [each.target for each in made if isinstance(each, QuantizeInt8)]
+    assert targets == ["onnxruntime", "onnxruntime", "tensorrt"]
+    assert "--target onnxruntime" in cli.refused(
+        f"search {trial} --max-ms 9 --target tensorrt -o d.toml"
+    )
+
+
+@pytest.mark.parametrize("target", ["onnxruntime", "tensorrt"])
+def test_a_pipeline_as_text_names_its_target(target: str) -> None:
+    """A report's text must mean the same where another default stands."""
+    (made,) = recipe.parse(f"quantize-int8{{target={target}}}")
+
+    assert recipe.to_text([made]) == f'quantize-int8{{target="{target}"}}'
+    assert f'target = "{target}"' in recipe.to_toml([made])
+    assert recipe.parse(recipe.to_text([made])) == (made,)

@@ -1,0 +1,267 @@
+"""Quantized files that onnxruntime's CPU runs in float, held against what it runs."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+from onnxruntime.quantization import (
+    CalibrationDataReader,
+    QuantFormat,
+    QuantType,
+    quantize_static,
+)
+
+from me2e_compress import graph
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.quantization.plan import make_plan
+from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.runtime.providers import (
+    CpuProvider,
+    CudaProvider,
+    TensorRtProvider,
+    TensorRtRtxProvider,
+)
+from me2e_compress.targets import TARGETS
+from me2e_compress.targets.onnxruntime import OnnxRuntime, slow_here
+from tests.nets import MODULES, PAPER, conv_attention, save_text
+
+LAYERS = {
+    "Conv": ("1,8,4,4", "8,8,1,1", "c = Conv(d, v)"),
+    "Conv with a bias": ("1,8,4,4", "8,8,1,1", "c = Conv(d, v, b)"),
+    "ConvTranspose": ("1,8,4,4", "8,8,1,1", "c = ConvTranspose(d, v)"),
+    "Gemm": ("4,8", "8,8", "c = Gemm(d, v)"),
+    "Gemm with a bias": ("4,8", "8,8", "c = Gemm(d, v, b)"),
+    "Gemm with an int32 bias": ("4,8", "8,8", "c = Gemm(d, v, e)"),
+    "MatMul": ("2,4,8", "8,8", "c = MatMul(d, v)"),
+    "MatMul with a bias": ("2,4,8", "8,8", "m = MatMul(d, v) c = Add(m, b)"),
+    "MatMul of a matrix": ("4,8", "8,8", "c = MatMul(d, v)"),
+}
+GRIDS = (("uint8", 128), ("uint8", 0), ("int8", 0), ("int8", -128), ("int8", 5))
+ENDS = {
+    "float": "y = Identity(c)",
+    "a pair": "a = QuantizeLinear(c, s, z) y = DequantizeLinear(a, s, z)",
+    "Relu": "y = Relu(c)",
+    "Relu and a pair": "r = Relu(c) a = QuantizeLinear(r, s, z)"
+    " y = DequantizeLinear(a, s, z)",
+    "Clip and a pair": "r = Clip(c, zero) a = QuantizeLinear(r, s, z)"
+    " y = DequantizeLinear(a, s, z)",
+    "Tanh and a pair": "r = Tanh(c) a = QuantizeLinear(r, s, z)"
+    " y = DequantizeLinear(a, s, z)",
+    "a pair and a float reader": "a = QuantizeLinear(c, s, z)"
+    " f = DequantizeLinear(a, s, z) g = Tanh(c) y = Add(f, g)",
+}
+TEXT = """
+<ir_version: 10, opset_import: ["" : 17]>
+m (float[%(read)s] x) => (float[%(answer)s] y)
+<int8[%(shape)s] w = {%(weight)s}, float s = {0.05}, float t = {0.0025},
+ float zero = {0.0}, int8 n = {0}, int32 i = {0}, int32[8] k = {9,8,7,6,5,4,3,2},
+ float[8] b = {1,2,3,4,5,6,7,8}, %(zero)s> {
+    q = QuantizeLinear(x, s, z)
+    d = DequantizeLinear(q, s, z)
+    v = DequantizeLinear(w, s, n)
+    e = DequantizeLinear(k, t, i)
+    %(body)s
+}
+"""
+
+
+def quantized(layer: str, end: str, grid: tuple[str, int]) -> ir.Model:
+    """One layer between pairs of a grid, and what reads it."""
+    read, shape, call = LAYERS[layer]
+    weight = np.random.default_rng(0).integers(-127, 128, 64)
+    kind, zero = grid
+    return ir.from_onnx_text(
+        TEXT
+        % {
+            "read": read,
+            "shape": shape,
+            "answer": ",".join("n" * len(read.split(","))),
+            "weight": ",".join(map(str, weight)),
+            "zero": f"{kind} z = {{{zero}}}",
+            "body": call + " " + ENDS[end],
+        }
+    )
+
+
+CASES = list(itertools.product(LAYERS, ENDS, GRIDS))
+
+
+@pytest.mark.parametrize(("layer", "end", "grid"), CASES)
+def test_a_layer_is_slow_where_the_session_runs_it_in_float(
+    layer: str, end: str, grid: tuple[str, int]
+) -> None:
+    model = quantized(layer, end, grid)
+
+    runs = [each.rule for each in OnnxRuntime().read_back(model)]
+
+    assert (slow_here(model) is not None) == ("float-kernel" in runs)
+
+
+CHAIN = """
+<ir_version: 10, opset_import: ["" : %(opset)d]>
+m (float[1,8,4,4] x) => (float[1,8,4,4] y)
+<float s = {0.05}, %(constants)s> {
+    q = %(quantize)s(x, s%(z)s)
+    d = DequantizeLinear(q, s%(z)s)
+    %(weights)s
+    c = Conv(d, v)
+    r = Relu(c)
+    q2 = %(quantize)s(r, s%(z)s)
+    d2 = DequantizeLinear(q2, s%(z)s)
+    y = Conv(d2, v)
+}
+"""
+FLOATS = ",".join(f"{number:.3f}" for number in np.linspace(-1, 1, 64))
+INTEGERS = ",".join(str(number) for number in range(-32, 32))
+STORED = "v = DequantizeLinear(w, s, n)"
+AS_FLOAT = "u = QuantizeLinear(w, s, n) v = DequantizeLinear(u, s, n)"
+LOWERED = "--passes import-normalize,lower-int8 makes it of this file"
+
+
+def chain(form: str) -> ir.Model:
+    """Two convolutions and a ReLU, with pairs on what layers read."""
+    floats = f"float[8,8,1,1] w = {{{FLOATS}}}, int8 n = {{0}}"
+    stored = f"int8[8,8,1,1] w = {{{INTEGERS}}}, int8 n = {{0}}"
+    fp8 = 17  # FLOAT8E4M3FN
+    constants, weights, quantize, z, opset = {
+        "ours": (stored, STORED, "QuantizeLinear", ", n", 13),
+        "modelopt": (floats, AS_FLOAT, "QuantizeLinear", ", n", 19),
+        "no zero point": (stored, STORED, "QuantizeLinear<output_dtype=3>", "", 21),
+        "fp8": (stored, STORED, f"QuantizeLinear<output_dtype={fp8}>", "", 21),
+        "uint8": (f"{stored}, uint8 z = {{128}}", STORED, "QuantizeLinear", ", z", 17),
+        "shifted": (f"{stored}, int8 z = {{3}}", STORED, "QuantizeLinear", ", z", 17),
+        "int16": (stored, STORED, "QuantizeLinear<output_dtype=5>", "", 21),
+    }[form]
+    words = {"constants": constants, "weights": weights, "quantize": quantize}
+    return ir.from_onnx_text(CHAIN % {**words, "z": z, "opset": opset})
+
+
+@pytest.mark.parametrize(
+    ("form", "shape", "remedy"),
+    [
+        ("ours", "TensorRT's form,", True),
+        ("modelopt", "TensorRT's form,", True),
+        ("no zero point", "TensorRT's form,", True),
+        ("fp8", "TensorRT's form,", False),
+        ("uint8", "a form that is", False),
+        ("shifted", "a form that is", False),
+        ("int16", "a form that is", False),
+    ],
+)
+def test_pairs_on_inputs_alone_are_slow_whoever_placed_them(
+    form: str, shape: str, remedy: bool
+) -> None:
+    said = slow_here(chain(form)) or ""
+
+    assert f"quantized in {shape} slow in onnxruntime's CPU" in said
+    assert "(no fast kernel for 2 of 2 layers)" in said
+    assert "compress --target onnxruntime writes what is fast here" in said
+    assert (LOWERED in said) == remedy
+
+
+def test_another_provider_runs_that_form_well() -> None:
+    model = chain("modelopt")
+
+    assert slow_here(model, CpuProvider(plugins=(Path("library.so"),))) is not None
+    for provider in (CudaProvider(), TensorRtProvider(), TensorRtRtxProvider()):
+        assert slow_here(model, provider) is None
+
+
+@pytest.mark.parametrize(("target", "is_slow"), [("tensorrt", 1), ("onnxruntime", 0)])
+def test_what_is_placed_for_the_cpu_is_not_slow_there(
+    target: str, is_slow: bool
+) -> None:
+    model = conv_attention()
+    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
+    place = TARGETS.parse(target)
+    ranges = dict.fromkeys(place.tensors(plan, model), (-3.0, 3.0))
+
+    placed = place.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
+
+    assert slow_here(model) is None
+    assert (slow_here(placed) is not None) == is_slow
+
+
+class Drawn(CalibrationDataReader):  # type: ignore[misc]
+    """Normal numbers for the input ``x``, drawn anew."""
+
+    def __init__(self) -> None:
+        draws = np.random.default_rng()
+        shape = (1, 8, 4, 4)
+        self._left = [{"x": draws.normal(size=shape).astype(np.float32)}] * 2
+
+    def get_next(self) -> dict[str, np.ndarray] | None:
+        return self._left.pop() if self._left else None
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        (QuantType.QUInt8, {}),
+        (QuantType.QInt8, {}),
+        (QuantType.QInt8, {"ActivationSymmetric": True}),
+    ],
+)
+def test_what_onnxruntimes_own_quantizer_writes_is_not_slow(
+    kind: QuantType, options: dict[str, bool], tmp_path: Path
+) -> None:
+    """It puts a pair behind every layer; sessions make its int8 uint8 by themselves."""
+    text = "m (float[1,8,4,4] x) => (float[1,8,4,4] y)"
+    text += f" <float[8,8,1,1] v = {{{FLOATS}}}>"
+    source = save_text(
+        tmp_path / "f.onnx", text + "{ c = Conv(x, v) r = Relu(c) y = Conv(r, v) }"
+    )
+    target = tmp_path / "q.onnx"
+    quantize_static(
+        source, target, Drawn(), quant_format=QuantFormat.QDQ, per_channel=True,
+        activation_type=kind, weight_type=QuantType.QInt8, extra_options=options,
+    )  # fmt: skip
+
+    assert slow_here(graph.load(target)) is None
+
+
+@pytest.mark.parametrize(("answered", "is_slow"), [(1, True), (2, False)])
+def test_half_of_the_layers_decide(answered: int, is_slow: bool) -> None:
+    pairs = "".join(
+        f" c{at} = Conv(d, v) a{at} = QuantizeLinear(c{at}, s, z)"
+        f" y{at} = DequantizeLinear(a{at}, s, z)"
+        for at in range(answered)
+    )
+    outputs = ",".join(f"float[1,8,4,4] y{at}" for at in range(answered))
+    model = ir.from_onnx_text(
+        '<ir_version: 10, opset_import: ["" : 17]>'
+        f"m (float[1,8,4,4] x) => (float[1,8,4,4] y, {outputs}) <float s = {{0.05}},"
+        f" uint8 z = {{0}}, int8[8,8,1,1] w = {{{INTEGERS}}}, int8 n = {{0}}>"
+        "{ q = QuantizeLinear(x, s, z) d = DequantizeLinear(q, s, z)"
+        f" v = DequantizeLinear(w, s, n) y = Conv(d, v) {pairs} }}"
+    )
+
+    assert (slow_here(model) is not None) == is_slow
+
+
+def test_a_weight_alone_is_not_slow() -> None:
+    """Its activation is float: such products have a kernel (MatMulNBits)."""
+    model = ir.from_onnx_text(
+        '<ir_version: 10, opset_import: ["" : 17]>'
+        f"m (float[4,8] x) => (float[4,8] y) <int8[8,8] w = {{{INTEGERS}}},"
+        " float s = {0.05}, int8 n = {0}>"
+        "{ v = DequantizeLinear(w, s, n) y = MatMul(x, v) }"
+    )
+
+    assert slow_here(model) is None
+
+
+def test_layers_of_a_function_count() -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 10, opset_import: ["" : 17, "own" : 1]>'
+        "m (float[1,8,4,4] x, int8[8,8,1,1] w) => (float[1,8,4,4] y)"
+        "{ y = own.Block(x, w) }"
+        '<domain: "own", opset_import: ["" : 17]>'
+        "Block (x, w) => (y) { s = Constant<value = float {0.05}>()"
+        " z = Constant<value = int8 {0}>() q = QuantizeLinear(x, s, z)"
+        " d = DequantizeLinear(q, s, z) v = DequantizeLinear(w, s, z) y = Conv(d, v) }"
+    )
+
+    assert "for 1 of 1 layers)" in (slow_here(model) or "")
