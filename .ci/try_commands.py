@@ -53,7 +53,7 @@ USES = (
     f"calibrate highway {FRAMES} -o ranges.json",
     "ranges ranges.json",
     f"compress highway -r feature-ext --frames {FRAMES} -o small.onnx",
-    "lint small.onnx --target tensorrt",
+    "lint small.onnx",
     "build small.onnx -o small.engine",
     f"sensitivity highway {FRAMES} -o sensitive.toml",
     f"search highway {FRAMES} --max-mb 5 -o found.toml",

@@ -55,7 +55,10 @@ PEERS = {
     "ModelOpt": "modelopt",
 }
 OURS: dict[str, tuple[str, Pass]] = {
-    "ours for TensorRT, rules paper": (FLOAT, QuantizeInt8(rules="paper")),
+    "ours for TensorRT, rules paper": (
+        FLOAT,
+        QuantizeInt8(rules="paper", target="tensorrt"),
+    ),
     "ours": (FLOAT, QuantizeInt8(target="onnxruntime")),
     "ours, weights to nearest": (
         FLOAT,

@@ -20,6 +20,7 @@ from typing import ClassVar
 import numpy as np
 import onnx_ir as ir
 
+from benchmarks.tensorrt_recipe import for_tensorrt
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.fidelity.compare import Reference
@@ -100,7 +101,7 @@ def compressed(folder: Path, name: str) -> Path:
     target = folder / f"{name}.onnx"
     if not target.exists():
         unchecked = CompressOptions(verify_frames=0, measure_frames=0)
-        compress(STACK, target, name, folder / "frames-0", unchecked)
+        compress(STACK, target, for_tensorrt(name), folder / "frames-0", unchecked)
     return target
 
 

@@ -169,7 +169,7 @@ def losses(
     reference: Reference,
 ) -> None:
     """Print the SQNR of every output under each method."""
-    step = QuantizeInt8()
+    step = QuantizeInt8(target="tensorrt")
     tensors = step.ranged_tensors(model, Context(modules))
     seen = Calibrator("mse").collect(model, tensors, frames)
     print(f"\n{title}: {len(tensors)} tensors, crest factors {_crests(seen)}\n")

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from time import process_time
 
+from benchmarks.tensorrt_recipe import for_tensorrt
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.fidelity.compare import Reference
@@ -63,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             unchecked = CompressOptions(
                 module_map="vad", verify_frames=0, measure_frames=0
             )
-            compress(source, target, name, seen, unchecked)
+            compress(source, target, for_tensorrt(name), seen, unchecked)
             report(name, target, reference, process_time() - start)
 
 

@@ -50,7 +50,7 @@ def rows(subject: subjects.Subject, count: int) -> Iterator[tuple[str, ...]]:
     model = graph.load(subject.model)
     graph.infer_shapes(model)
     context = Context(ModuleMap.load(str(subject.map)))
-    plan = QuantizeInt8().plan(model, context)
+    plan = QuantizeInt8(target="tensorrt").plan(model, context)
     axes = {e.output: e.axis for e in plan.chosen if e.weight is not None}
     nodes = [n for n in model.graph if axes.get(str(n.outputs[0].name)) is not None]
     nodes = [node for node in nodes if array_of(node.inputs[1]) is not None]

@@ -29,14 +29,14 @@ RUNS = """
 frames highway -n 4 --scene-length 2 -o frames
 frames highway -n 2 --scene-length 1 --seed 1 -o held-out
 compress highway -r exact --frames frames -o exact.onnx
-compress highway -r feature-ext --frames frames -o feature-ext.onnx
+compress highway -r feature-ext --target tensorrt --frames frames -o feature-ext.onnx
 compress highway -r full --target onnxruntime --frames frames -o full.onnx
 compress highway -r minus-occ --frames frames -o minus-occ.onnx
 compress seven.onnx -r exact -o seven.exact.onnx
-compress seven.onnx -r full --frames seven -o seven.full.onnx
+compress seven.onnx -r full --target tensorrt --frames seven -o seven.full.onnx
 calibrate seven.onnx seven -o seven.ranges.json --method percentile:99.9
-compress seven.onnx --scheme full --ranges seven.ranges.json --method percentile:99.9 \
--o seven.ranges.onnx
+compress seven.onnx --scheme full --target tensorrt --ranges seven.ranges.json \
+--method percentile:99.9 -o seven.ranges.onnx
 calibrate highway frames -o ranges.json --tensorrt-cache trt.cache \
 --onnxruntime-table table
 plan highway --scheme prediction -o prediction.plan.json
