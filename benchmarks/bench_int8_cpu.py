@@ -60,10 +60,7 @@ OURS: dict[str, tuple[str, Pass]] = {
         QuantizeInt8(rules="paper", target="tensorrt"),
     ),
     "ours": (FLOAT, QuantizeInt8(target="onnxruntime")),
-    "ours, weights to nearest": (
-        FLOAT,
-        QuantizeInt8(target="onnxruntime", rules="safe{balance=false}"),
-    ),
+    "ours, weights to nearest": (FLOAT, QuantizeInt8(rules="safe{balance=false}")),
     "ours, rules paper": (FLOAT, QuantizeInt8(target="onnxruntime", rules="paper")),
     "ModelOpt, lowered": ("ModelOpt", LowerInt8()),
 }

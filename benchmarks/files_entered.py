@@ -104,7 +104,16 @@ def compress(folder: Path) -> list[str]:
     model, frames = folder / "m.onnx", folder / "frames"
     seven_nodes.write_model(model)
     seven_nodes.write_frames(frames)
-    words = ["compress", model, "-r", "full", "--frames", frames]
+    words = [
+        "compress",
+        model,
+        "-r",
+        "full",
+        "--target",
+        "tensorrt",
+        "--frames",
+        frames,
+    ]
     return [*map(str, words), "-o", str(folder / "o.onnx")]
 
 

@@ -9,7 +9,9 @@ from benchmarks.written_files import differences, manifest
 from me2e_compress.cli import main
 
 PACKAGE = Path(written_files.__file__).parents[1] / "me2e_compress"
-COMPRESS = "me2e-compress compress m.onnx -r full --frames frames -o o.onnx"
+COMPRESS = (
+    "me2e-compress compress m.onnx -r full --target tensorrt --frames frames -o o.onnx"
+)
 
 
 def compressed(
