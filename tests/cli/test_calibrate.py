@@ -127,7 +127,8 @@ def test_a_cache_of_tensorrt_10_becomes_an_explicit_graph(
     assert "1 tensor not in c: p. What reads them stays float" in said
     assert "--overrides back.overrides.toml" in said
 
-    how = f"compress m.onnx --scheme full --rules paper {MAP} --ranges back.json"
+    how = f"compress m.onnx --scheme full --rules paper --target tensorrt {MAP}"
+    how += " --ranges back.json"
     refused = cli.refused(f"{how} -o int8.onnx")
     assert "back.json: lacks p and 0 more of" in refused
     assert "give the overrides that stand beside it" in refused
@@ -231,7 +232,8 @@ def write_net(folder: Path) -> None:
 def test_a_graph_that_is_lowered_takes_saved_ranges(cli: Cli, tmp_path: Path) -> None:
     write_net(tmp_path)
     (tmp_path / "lower.toml").write_text('[[pass]]\nname = "lower-int8"\n')
-    cli.done(f"compress m.onnx --scheme full --frames frames {MAP} -o int8.onnx")
+    int8 = f"compress m.onnx --scheme full --target tensorrt --frames frames {MAP}"
+    cli.done(f"{int8} -o int8.onnx")
 
     lower = f"compress int8.onnx -r lower.toml {MAP} --verify-frames 0"
     cli.done(f"calibrate int8.onnx frames -r lower.toml {MAP} -o r.json")

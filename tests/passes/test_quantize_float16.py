@@ -20,7 +20,7 @@ from me2e_compress.testing import check_pass
 from tests.frames import record
 from tests.nets import MODULES, conv_attention
 
-PAPER = QuantizeInt8(rules="paper")
+PAPER = QuantizeInt8(rules="paper", target="tensorrt")
 
 
 @pytest.fixture

@@ -185,7 +185,8 @@ def test_an_output_that_int8_freezes_is_an_alert(
     (cameras / "ranges.json").write_text(json.dumps(ranges))
     capsys.readouterr()
 
-    assert command(*PAPER, "--ranges", "ranges.json", "--floor", 0) == 0
+    how = ("--target", "tensorrt", "--ranges", "ranges.json", "--floor", 0)
+    assert command(*PAPER, *how) == 0
 
     said = capsys.readouterr().out
     assert "\nplan is constant: it moves 0.00% as far as before" in said
