@@ -4,15 +4,23 @@ from pathlib import Path
 
 import numpy as np
 import onnx_ir as ir
+import onnxruntime
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving import onnx_policy
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.manager import PassManager
+from me2e_compress.passes.base import Context
+from me2e_compress.passes.import_normalize import ImportNormalize
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.profile import TimedSession
 from me2e_compress.runtime.session import Session
-from tests.passes.small import read
+from tests.frames import record
+from tests.manager.transformer import transformer
+from tests.passes.small import EVERYTHING, read
 from tests.targets.onnxruntime.rewritten import Drawn
 
 
@@ -77,3 +85,24 @@ def test_sums_of_int8_do_not_overflow_on_any_processor(tmp_path: Path) -> None:
         by_nodes = Session(source, threads=1, optimize=False).run({"x": x})["y"]
         np.testing.assert_array_equal(by_kernels, by_nodes)
     assert (x @ large).min() > 32767  # where 16 bits end
+
+
+def test_a_written_file_opens_in_plain_onnxruntime_where_sums_must_not_overflow(
+    tmp_path: Path,
+) -> None:
+    frames = np.random.default_rng(1).normal(size=(3, 1, 64, 64)).astype(np.float32)
+    recording = CalibrationSet(record(tmp_path / "f", [{"x": each} for each in frames]))
+    passes = (ImportNormalize(), QuantizeInt8(target="onnxruntime"))
+    manager = PassManager(passes)
+    model = manager.run(transformer(), Context(EVERYTHING, recording)).model
+    options = onnxruntime.SessionOptions()
+    options.add_session_config_entry("session.x64quantprecision", "1")
+    options.intra_op_num_threads = 1
+
+    session = onnxruntime.InferenceSession(
+        ir.to_proto(model).SerializeToString(), options
+    )
+
+    (plain,) = session.run(None, {"x": frames[0]})
+    ours = Session(model, threads=1, int8_kernels=True).run({"x": frames[0]})["y"]
+    np.testing.assert_array_equal(np.asarray(plain), ours)
