@@ -21,6 +21,8 @@ from me2e_compress.targets.onnxruntime import (
 from tests.frames import record
 from tests.nets import MODULES, conv_attention, image, net
 
+FOR_TENSORRT = QuantizeInt8(rules="paper", target="tensorrt")
+
 
 @pytest.fixture
 def frames(tmp_path: Path) -> CalibrationSet:
@@ -36,9 +38,7 @@ def test_what_was_placed_for_tensorrt_is_lowered(
     context: Context, frames: CalibrationSet
 ) -> None:
     model = conv_attention()
-    placed = (
-        QuantizeInt8(rules="paper", target="tensorrt").run(model.clone(), context).model
-    )
+    placed = FOR_TENSORRT.run(model.clone(), context).model
 
     result = LowerInt8().run(placed, context)
 
@@ -49,9 +49,7 @@ def test_what_was_placed_for_tensorrt_is_lowered(
 
 
 def test_the_manager_takes_both_passes_in_a_row(context: Context) -> None:
-    manager = PassManager(
-        (QuantizeInt8(rules="paper", target="tensorrt"), LowerInt8()), verify_frames=0
-    )
+    manager = PassManager((FOR_TENSORRT, LowerInt8()), verify_frames=0)
 
     report = manager.run(conv_attention(), context)
 
@@ -72,11 +70,7 @@ def test_the_target_onnxruntime_needs_no_second_pass(context: Context) -> None:
 def test_saved_ranges_give_the_same_graph_without_frames(
     context: Context, frames: CalibrationSet, tmp_path: Path
 ) -> None:
-    placed = (
-        QuantizeInt8(rules="paper", target="tensorrt")
-        .run(conv_attention(), context)
-        .model
-    )
+    placed = FOR_TENSORRT.run(conv_attention(), context).model
     path = tmp_path / "r.json"
     Calibrator().run(placed, unranged(placed), frames).save(path)
 
@@ -87,11 +81,7 @@ def test_saved_ranges_give_the_same_graph_without_frames(
 
 
 def test_without_frames_there_is_no_calibration(context: Context) -> None:
-    placed = (
-        QuantizeInt8(rules="paper", target="tensorrt")
-        .run(conv_attention(), context)
-        .model
-    )
+    placed = FOR_TENSORRT.run(conv_attention(), context).model
 
     with pytest.raises(FramesError, match=r"lower-int8 needs recorded .* never made"):
         LowerInt8().run(placed, Context(MODULES))
@@ -112,9 +102,7 @@ def test_pairs_without_a_kernel_are_taken_out(context: Context) -> None:
     weight = np.random.default_rng(0).standard_normal((1, 3, 8, 4))
     model = net(text, {"w": weight})
 
-    manager = PassManager(
-        (QuantizeInt8(rules="paper", target="tensorrt"), LowerInt8()), verify_frames=0
-    )
+    manager = PassManager((FOR_TENSORRT, LowerInt8()), verify_frames=0)
     report = manager.run(model, context)
 
     assert [step.changes for step in report.steps] == [1, 1]

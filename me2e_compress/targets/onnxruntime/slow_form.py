@@ -71,7 +71,7 @@ def slow_here(model: ir.Model, provider: Provider = CPU) -> str | None:
 def _is_fast(layer: ir.Node) -> bool:
     """Return whether onnxruntime has a kernel for a layer that beats float."""
     pair, end, bias = dequantizer_of(layer.inputs[0]), layer.outputs[0], bias_of(layer)
-    typed = pair is not None and _kind_of(pair) in _LEAST
+    typed = pair is not None and _is_looked_at(pair)
     if layer.op_type == "ConvTranspose" or not typed or _is_activation(layer.inputs[1]):
         return False
     # a MatMul and its bias become one Gemm before pairs are looked for
@@ -86,6 +86,12 @@ def _is_fast(layer: ir.Node) -> bool:
     # a product may answer in float, unless a ReLU or a pair was to be taken in
     biased = merged or (bias is not None and not is_dequantized(bias))
     return layer.op_type not in CONVOLUTIONS and not biased and not pairs
+
+
+def _is_looked_at(pair: ir.Node) -> bool:
+    """Return whether sessions take a pair in: of uint8, or int8 with a zero point."""
+    kind = _kind_of(pair)
+    return kind in _LEAST and (kind == ir.DataType.UINT8 or len(pair.inputs) > 2)
 
 
 def _is_activation(value: ir.Value | None) -> bool:

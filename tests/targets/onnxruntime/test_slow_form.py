@@ -49,6 +49,8 @@ ENDS = {
     " y = DequantizeLinear(a, s, z)",
     "Tanh and a pair": "r = Tanh(c) a = QuantizeLinear(r, s, z)"
     " y = DequantizeLinear(a, s, z)",
+    "Unsqueeze and a pair": "r = Unsqueeze(c, at) a = QuantizeLinear(r, s, z)"
+    " f = DequantizeLinear(a, s, z) y = Squeeze(f, at)",
     "a pair and a float reader": "a = QuantizeLinear(c, s, z)"
     " f = DequantizeLinear(a, s, z) g = Tanh(c) y = Add(f, g)",
 }
@@ -56,7 +58,8 @@ TEXT = """
 <ir_version: 10, opset_import: ["" : 17]>
 m (float[%(read)s] x) => (float[%(answer)s] y)
 <int8[%(shape)s] w = {%(weight)s}, float s = {0.05}, float t = {0.0025},
- float zero = {0.0}, int8 n = {0}, int32 i = {0}, int32[8] k = {9,8,7,6,5,4,3,2},
+ float zero = {0.0}, int64[1] at = {0}, int8 n = {0}, int32 i = {0},
+ int32[8] k = {9,8,7,6,5,4,3,2},
  float[8] b = {1,2,3,4,5,6,7,8}, %(zero)s> {
     q = QuantizeLinear(x, s, z)
     d = DequantizeLinear(q, s, z)
@@ -239,6 +242,59 @@ def test_half_of_the_layers_decide(answered: int, is_slow: bool) -> None:
     )
 
     assert (slow_here(model) is not None) == is_slow
+
+
+PRODUCT = """
+<ir_version: 10, opset_import: ["" : 21]>
+m (float[4,8] x) => (float[4,8] y) <float s = {0.05}, int8 n = {0}, %s z = {0}, %s> {
+    q = QuantizeLinear(x, s, z) d = DequantizeLinear(q, s, z) %s y = MatMul(d, v)
+}
+"""
+
+
+@pytest.mark.parametrize("weights", [STORED, AS_FLOAT])
+@pytest.mark.parametrize(
+    ("kind", "is_slow"),
+    [("uint8", False), ("int8", False), ("uint16", True), ("int16", True)],
+)
+def test_a_lone_product_has_a_kernel_for_eight_bits(
+    kind: str, weights: str, is_slow: bool
+) -> None:
+    constant = f"int8[8,8] w = {{{INTEGERS}}}"
+    if weights == AS_FLOAT:
+        constant = f"float[8,8] w = {{{FLOATS}}}"
+    model = ir.from_onnx_text(PRODUCT % (kind, constant, weights))
+
+    runs = [each.rule for each in OnnxRuntime().read_back(model)]
+
+    assert (slow_here(model) is not None, "float-kernel" in runs) == (is_slow, is_slow)
+
+
+@pytest.mark.parametrize(("kind", "is_slow"), [(2, False), (3, True)])
+def test_int8_without_a_zero_point_is_not_looked_at(kind: int, is_slow: bool) -> None:
+    """ONNX says that it is 0; a session takes a pair of uint8 in without one."""
+    pair = f"QuantizeLinear<output_dtype={kind}>"
+    model = ir.from_onnx_text(
+        '<ir_version: 10, opset_import: ["" : 21]>'
+        "m (float[1,8,4,4] x) => (float[1,8,4,4] y) <float s = {0.05}, int8 n = {0},"
+        f" int8[8,8,1,1] w = {{{INTEGERS}}}> {{ q = {pair}(x, s)"
+        f" d = DequantizeLinear(q, s) {STORED} c = Conv(d, v) a = {pair}(c, s)"
+        " y = DequantizeLinear(a, s) }"
+    )
+
+    runs = [each.rule for each in OnnxRuntime().read_back(model)]
+
+    assert (slow_here(model) is not None, "float-kernel" in runs) == (is_slow, is_slow)
+
+
+def test_a_layer_whose_float_output_is_asked_for_is_slow() -> None:
+    model = quantized("Conv", "a pair", ("uint8", 0))
+    conv = next(node for node in model.graph if node.op_type == "Conv")
+    assert slow_here(model) is None
+
+    model.graph.outputs.append(conv.outputs[0])
+
+    assert slow_here(model) is not None
 
 
 def test_a_weight_alone_is_not_slow() -> None:
