@@ -30,9 +30,7 @@ Grids: TypeAlias = Mapping[str, tuple[np.float32, int]]
 MIDDLE = 128
 """The uint8 zero point of a signed tensor: int8 value plus 128."""
 
-Severity = Literal[
-    "error", "wrong", "reported refused", "reported wrong", "reported slow", "warning"
-]
+Severity = Literal["error", "wrong", "warning"]
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 """The worst first."""
 
@@ -43,7 +41,7 @@ class LintFinding:
 
     Attributes:
         severity: with ``error`` it is refused, with ``wrong`` computed otherwise, with
-            ``warning`` slow, or in float; with ``reported``, users say so of a version.
+            ``warning`` slow, or in float.
         rule: id of the rule.
         node: name of the node; empty for a finding about the whole graph.
         message: what was found; and what is expected.

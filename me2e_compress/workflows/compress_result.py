@@ -106,12 +106,10 @@ class CompressResult(Result):
         return (*lost, *filter(None, [empty]), *self._linted(), *first)
 
     def _linted(self) -> Iterator[str]:
-        """Yield what the target refuses, computes otherwise, or is reported to."""
-        found = self.lint
-        if found is None:
-            return
-        told = (found.refusal, found.miscomputed, found.misreported)
-        yield from (f"lint: {each}" for each in told if each is not None)
+        """Yield what the target refuses, or computes otherwise."""
+        if self.lint is not None:
+            lines = filter(None, (self.lint.refusal, self.lint.miscomputed))
+            yield from (f"lint: {line}" for line in lines)
 
     def verdict(self) -> Iterator[str]:
         """Yield what became int8, what is proven, and how far the outputs moved."""

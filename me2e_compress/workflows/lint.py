@@ -38,7 +38,8 @@ class LintOptions:
         sm: GPU generation that is built for.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         provider: what opens a graph for onnxruntime.
-        target_version: of TensorRT, such as ``10.13``; None tells of every version.
+        target_version: of TensorRT, such as ``10.13``, whose tables are asked; None
+            warns of what 10.1 did not take.
 
     Raises:
         RecipeError: An option is given for a target that it does not serve, or the
@@ -128,13 +129,6 @@ class LintResult(Result):
     def miscomputed(self) -> str | None:
         """What the target would run, and compute otherwise; None if nothing."""
         return self._first("wrong", f"{self.options.target} computes it otherwise")
-
-    @property
-    def misreported(self) -> str | None:
-        """What users report that the target computes wrongly; None if nothing."""
-        return self._first(
-            "reported wrong", f"{self.options.target} is reported to compute it wrongly"
-        )
 
     def _first(self, severity: Severity, what: str) -> str | None:
         """Count the findings of a severity, and tell the first."""

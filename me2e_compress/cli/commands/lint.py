@@ -15,7 +15,7 @@ TrtCheck = Annotated[
     bool, typer.Option("--trt-check", help="also parse and build it by TensorRT-RTX")
 ]
 TargetVersion = Annotated[
-    str | None, typer.Option(help="of tensorrt, as 10.13: only what it is reported for")
+    str | None, typer.Option(help="of tensorrt, as 10.13: refuses what came later")
 ]
 
 

@@ -49,8 +49,8 @@ class TensorRT(Target):
     Attributes:
         machine: ``orin``: layers that are predicted to be slower there in int8 than in
             float16 stay float (rule ``cost``); empty predicts nothing.
-        version: of TensorRT, such as ``10.13``, that :meth:`lint` asks; empty asks
-            every one and names them.
+        version: of TensorRT, such as ``10.13``, whose tables :meth:`lint` asks; empty
+            warns of what 10.1 did not take.
     """
 
     name: ClassVar[str] = "tensorrt"

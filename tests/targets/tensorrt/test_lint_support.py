@@ -153,6 +153,29 @@ def test_a_type_that_came_later(version: str, severity: str | None) -> None:
     assert [each.severity for each in findings] == ([severity] if severity else [])
 
 
+@pytest.mark.parametrize(
+    ("version", "severity"),
+    [("", "warning"), ("10.14", "error"), ("10.15", None), ("11.2", None)],
+)
+def test_an_operator_that_came_later(version: str, severity: str | None) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 10, opset_import: ["" : 23]>'
+        "m (float[2,4] x, float[4] s) => (float[2,4] y) { y = RMSNormalization(x, s) }"
+    )
+    findings = {
+        finding.severity
+        for finding in TensorRT(version=version).lint(model)
+        if finding.rule == "operator"
+    }
+    assert findings == ({severity} if severity else set())
+
+
+@pytest.mark.parametrize("text", ["10", "10.x", "ten", "10.13.3.9.1", "v10.13", "10."])
+def test_a_version_that_is_none(text: str) -> None:
+    with pytest.raises(ValueError, match="is no version of TensorRT, such as"):
+        TensorRT(version=text)
+
+
 def test_two_float_types_in_one_operator() -> None:
     (each,) = (
         each

@@ -127,10 +127,7 @@ def test_nothing_is_float64_and_no_shape_depends_on_data(
 
 
 def test_tensorrt_takes_every_node(traced: onnx.ModelProto) -> None:
-    found = TARGETS.parse("tensorrt").lint(ir.from_proto(traced))
-    assert [each for each in found if each.severity == "error"] == []
-    rules = {each.rule for each in found}  # what users report of some versions
-    assert rules == {"decomposed-attention", "broadcast-product"}
+    assert TARGETS.parse("tensorrt").lint(ir.from_proto(traced)) == ()
 
 
 @pytest.fixture(scope="module")

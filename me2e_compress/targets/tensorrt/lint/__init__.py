@@ -1,11 +1,7 @@
-"""Lint rules: does TensorRT's parser accept a graph, and is its int8 run as int8?
-
-And does a version of TensorRT, as users report, compute it wrongly or slowly?
-"""
+"""Lint rules: does TensorRT's parser accept a graph, and is its int8 run as int8?"""
 
 from me2e_compress.targets.base import LintRule, of_opset, valid
 from me2e_compress.targets.tensorrt.lint import qdq, support
-from me2e_compress.targets.tensorrt.lint.reported import reported
 from me2e_compress.targets.tensorrt.lint.support_matrix import Version
 
 _RULES: tuple[LintRule, ...] = (
@@ -29,7 +25,7 @@ _RULES: tuple[LintRule, ...] = (
 
 
 def rules(version: Version | None) -> tuple[LintRule, ...]:
-    """Return the rules for a version of TensorRT; None for any since 8.6."""
+    """Return the rules for a version of TensorRT; None for any since 10.1."""
     parser = support.Parser(version)
-    found = (parser.opset, parser.operators, parser.element_types)
-    return (valid, of_opset, *found, *_RULES, reported(version))
+    tables = (parser.opset, parser.operators, parser.element_types)
+    return (valid, of_opset, *tables, *_RULES)
