@@ -4,7 +4,8 @@ On outputs that a graph draws anew at every run nothing can be compared.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias
 
 import onnx_ir as ir
@@ -13,13 +14,17 @@ from me2e_compress.errors import FramesError, GraphError, Me2eError
 from me2e_compress.fidelity.first_difference import Source
 from me2e_compress.graph.nodes import DRAWS, bodies_of, reads_of
 from me2e_compress.manager import runtime_levels
-from me2e_compress.manager.bodies import body_errors
-from me2e_compress.manager.output_errors import errors, tolerances
-from me2e_compress.manager.pieces import Pieces
+from me2e_compress.manager.output_errors import (
+    TOLERANCES,
+    errors,
+    relative,
+    tolerances,
+)
+from me2e_compress.manager.pieces import Pieces, show
 from me2e_compress.manager.report import Verification
 from me2e_compress.manager.verification_inputs import Outputs, VerificationInputs
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.session import Session, replay
+from me2e_compress.runtime.session import Session, replay, run_once
 
 NUDGES = 3
 """How often inputs are nudged to see what rounding alone does to an output."""
@@ -29,6 +34,9 @@ Answers: TypeAlias = Sequence[Outputs]
 
 Known: TypeAlias = tuple[Answers | None, Answers | None]
 """What the graph before and the one after gave; None where they are to be run."""
+
+_BODY = "body"
+"""Domain in which a body is run: no kernel is registered for it."""
 
 TryFirst: TypeAlias = Callable[[ir.Model, str, Sequence[Frame]], Answers | None]
 """Opens a graph before this process does: returns what it answered, or refuses it."""
@@ -43,8 +51,7 @@ def verify(
 ) -> Verification:
     """Compare two graphs on the same inputs; one that no longer runs differs by inf.
 
-    A body that the passes attached is held against its kernel beside the outputs
-    (:mod:`me2e_compress.manager.bodies`).
+    A body that the passes attached is held against its kernel beside the outputs.
 
     ``known`` is what they answered before, who is then not run again.
 
@@ -57,7 +64,7 @@ def verify(
     """
     found = _verify_outputs(passes, before, after, inputs, known)
     gaps, allowed = dict(found.errors), dict(found.tolerances)
-    for op_type, error, tolerance in body_errors(before, after, inputs):
+    for op_type, error, tolerance in _body_errors(before, after, inputs):
         name = f"the body of {op_type}"
         gaps[name], allowed[name] = max(gaps.get(name, 0.0), error), tolerance
     return dataclasses.replace(found, errors=gaps, tolerances=allowed)
@@ -84,16 +91,19 @@ def _verify_outputs(
     )  # fmt: skip
     if passed(found):
         return found
-    decided = _by_pieces(found, before, after, inputs)
-    if decided is not None:
-        return decided
+    pieces = _by_pieces(found, before, after, inputs)
+    if pieces.proven is not None:
+        return pieces.proven
     rounding = unsteadiness(before, left, inputs)
     unsteady = tuple(
         name for name in found.judged if allowed[name] < gaps[name] <= rounding[name]
     )
-    found = dataclasses.replace(found, unsteady=unsteady)
-    if passed(found):
-        return found
+    steady = dataclasses.replace(found, unsteady=unsteady)
+    if pieces.breach:
+        return found if passed(steady) else steady
+    if passed(steady):
+        return steady
+    found = steady
     return _without_optimizations(found, before, after, inputs)
 
 
@@ -118,31 +128,40 @@ def unsteadiness(
     return worst
 
 
+@dataclasses.dataclass(frozen=True)
+class _ByPieces:
+    """What comparing pieces says: a proof, a breach, or neither."""
+
+    proven: Verification | None = None
+    breach: bool = False
+
+
 def _by_pieces(
     result: Verification, before: ir.Model, after: ir.Model, inputs: VerificationInputs
-) -> Verification | None:
-    """Judge each piece between steps; None where that does not decide.
+) -> _ByPieces:
+    """Judge each piece between steps.
 
     A piece that differs by more than rounding moves it is a breach of the promise,
-    however far rounding moves the outputs behind it: the verification is returned as
-    it is.
+    however far rounding moves the outputs behind it.
     """
     try:
         pieces = Pieces.of(before, after)
         if pieces is None:
-            return None
+            return _ByPieces()
         errors = pieces.errors(inputs)
         gaps = {name: errors.outputs[name] for name in result.judged} | errors.operands
         limits = result.tolerances | errors.tolerances
         wrong = [name for name, gap in gaps.items() if gap > limits[name]]
         if not wrong:
             remarks = (errors.remark,)
-            return dataclasses.replace(result, errors=errors.outputs, remarks=remarks)
+            return _ByPieces(
+                dataclasses.replace(result, errors=errors.outputs, remarks=remarks)
+            )
         moved = pieces.rounding(inputs, NUDGES)
     except (FramesError, GraphError):
-        return None
+        return _ByPieces()
     rounding = moved.outputs | moved.operands
-    return result if any(gaps[name] > rounding[name] for name in wrong) else None
+    return _ByPieces(breach=any(gaps[name] > rounding[name] for name in wrong))
 
 
 def _without_optimizations(
@@ -203,3 +222,85 @@ def _draws(node: ir.Node, model: ir.Model) -> bool:
     function = model.functions.get(node.op_identifier())
     bodies = bodies_of(node) if function is None else (function,)
     return any(_draws(each, model) for body in bodies for each in body)
+
+
+def _body_errors(
+    before: ir.Model, after: ir.Model, inputs: VerificationInputs
+) -> Iterator[tuple[str, float, float]]:
+    """Run the bodies that passes added, each on what its first call reads.
+
+    Sessions run a fused node by its compiled kernel: the body, which a file carries for
+    other runtimes, is opened alone.
+
+    Args:
+        before: the graph before the passes.
+        after: the graph after them, shapes inferred.
+        inputs: the first frame is run.
+
+    Yields:
+        An operator, max|a-b|/max|a| of what kernel and body give, which is infinite for
+        a body that does not run, and how large that may be, by the dtype.
+
+    Raises:
+        GraphError: onnxruntime cannot run the graph.
+    """
+    added = after.functions.keys() - before.functions.keys()
+    calls: dict[ir.OperatorIdentifier, ir.Node] = {}
+    for node in after.graph:
+        if node.op_identifier() in added:
+            calls.setdefault(node.op_identifier(), node)
+    if not calls:
+        return
+    # Without the functions every call runs as it did before: by its kernel
+    bare = after.clone()
+    for identifier in added:
+        del bare.functions[identifier]
+    made = {value.name: value for node in bare.graph for value in node.outputs}
+    for node in calls.values():
+        call = made[node.outputs[0].name].producer()
+        assert call is not None
+        for place, value in enumerate(call.inputs):
+            if value is not None:
+                show(bare, value, _name(node, place))
+        show(bare, call.outputs[0], _name(node, None))
+    first = dataclasses.replace(inputs, frames=inputs.frames[:1])
+    (values,) = first.run(bare)
+    for identifier, node in calls.items():
+        body = _alone(node, after.functions[identifier], after)
+        reads = {
+            str(value.name): values[_name(node, place)]
+            for place, value in enumerate(node.inputs)
+            if value is not None
+        }
+        by_kernel = values[_name(node, None)]
+        try:
+            error = relative(by_kernel, run_once(body, reads)["answer"])
+        except (FramesError, GraphError):
+            error = math.inf
+        yield node.op_type, error, TOLERANCES.get(by_kernel.dtype.name, 0.0)
+
+
+def _name(node: ir.Node, place: int | None) -> str:
+    return f"call/{node.outputs[0].name}/{'answer' if place is None else place}"
+
+
+def _alone(node: ir.Node, function: ir.Function, model: ir.Model) -> ir.Model:
+    """Return a graph of one call, whose body no kernel stands in for."""
+    reads = [
+        value and ir.Value(name=value.name, type=value.type, shape=value.shape)
+        for value in node.inputs
+    ]
+    function = function.clone()
+    function.domain = _BODY
+    attributes = list(node.attributes.values())
+    call = ir.Node(
+        _BODY, node.op_type, reads, attributes, overload=node.overload, name="call"
+    )
+    call.outputs[0].name, call.outputs[0].type = "answer", node.outputs[0].type
+    body = ir.Graph(
+        list({value.name: value for value in reads if value is not None}.values()),
+        call.outputs,
+        nodes=[call],
+        opset_imports={**model.opset_imports, _BODY: 1},
+    )
+    return ir.Model(body, ir_version=model.ir_version, functions=[function])

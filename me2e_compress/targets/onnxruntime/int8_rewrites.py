@@ -211,13 +211,19 @@ def _misread(layer: _Layer, constants: Constants) -> str:
 
 
 def _becomes_gemm(layer: _Layer) -> bool:
-    """Return whether onnxruntime makes a QGemm of a product: 8 bits, no factors."""
+    """Return whether onnxruntime makes a QGemm of a product: 8 bits, no factors.
+
+    The weight's zero point must be written, even 0.
+    """
     node, integers = layer.node, layer.pair.inputs[0]
     factors = [node.attributes.get_float(name, 1.0) for name in ("alpha", "beta")]
     kind = None if integers is None else integers.dtype
     if node.op_type not in ("Gemm", "MatMul") or factors != [1.0, 1.0]:
         return False
     if kind not in (ir.DataType.INT8, ir.DataType.UINT8, None):
+        return False
+    stored = maker(layer.weight, DEQUANTIZE)
+    if stored is not None and input_at(stored, 2) is None:
         return False
     # A quantizer beside other readers hides the product
     readers = [] if layer.is_reshaped else list(layer.end.consumers())

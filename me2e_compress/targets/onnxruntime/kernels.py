@@ -105,12 +105,12 @@ def is_average(node: ir.Node) -> bool:
 def has_average_kernel(node: ir.Node) -> bool:
     """Return whether the int8 kernel of an average computes what ONNX defines.
 
-    onnxruntime 1.31 refuses a QLinearAveragePool with dilations. With
+    onnxruntime 1.31 refuses a QLinearAveragePool with dilations, of 1 too. With
     ``count_include_pad`` and ``ceil_mode``, windows that reach beyond the padding are
     divided by all their places; ONNX leaves those out that are beyond.
     """
     options = node.attributes
-    dilated = set(options.get_ints("dilations", [1])) != {1}
+    dilated = "dilations" in options
     beyond = all(options.get_int(n, 0) for n in ("ceil_mode", "count_include_pad"))
     return is_average(node) and not dilated and not beyond
 

@@ -31,6 +31,7 @@ class Drawn:
         answered: whether a pair follows; else the output is float.
         transposed: whether a Gemm's weight is.
         rows: whether a MatMul's input is [4, 16, SIZE].
+        without_zero: the zero points that are not written: of ``input``, ``weight``.
     """
 
     op: str = "Conv"
@@ -42,6 +43,7 @@ class Drawn:
     answered: bool = True
     transposed: bool = False
     rows: bool = False
+    without_zero: str = ""
     kind: str = "uint8"
     opset: int = 17
     seed: int = 0
@@ -63,9 +65,10 @@ class Drawn:
         zero = np.array(128 if self.kind == "uint8" else 0, self.kind)
         constants: dict[str, Any] = {"s": np.float32(STEP), "z": zero}
         constants["t"] = np.float32(0.06)
+        zeros = [] if self.without_zero == "input" else ["z"]
         nodes = [
             helper.make_node("QuantizeLinear", ["x", "s", "z"], ["xq"]),
-            helper.make_node("DequantizeLinear", ["xq", "s", "z"], ["xd"]),
+            helper.make_node("DequantizeLinear", ["xq", "s", *zeros], ["xd"]),
             *self._operands(constants),
             *self._layer(),
         ]
@@ -110,9 +113,8 @@ class Drawn:
         # small integers of 7 bits do not overflow 16 on any processor
         integers = random.integers(-63, 64, size).astype(np.int8)
         constants |= {"w": integers, "ws": scales, "wz": np.zeros(scales.shape, "i1")}
-        nodes = [
-            helper.make_node("DequantizeLinear", ["w", "ws", "wz"], ["wd"], **along)
-        ]
+        stored = ["w", "ws"] if self.without_zero == "weight" else ["w", "ws", "wz"]
+        nodes = [helper.make_node("DequantizeLinear", stored, ["wd"], **along)]
         if self.weight == "float":
             constants["w"] = random.normal(0, 0.2, size).astype(np.float32)
             nodes = [helper.make_node("Identity", ["w"], ["wd"])]

@@ -130,6 +130,7 @@ def test_an_average_that_is_read_as_float_is_not_rounded(
     "options",
     [
         "kernel_shape=[3,3], dilations=[2,2]",
+        "kernel_shape=[3,3], dilations=[1,1]",
         "kernel_shape=[4,4], strides=[3,3], ceil_mode=1, count_include_pad=1",
         f"{PAD.replace('2,2', '3,3')}, ceil_mode=1, count_include_pad=1",
     ],

@@ -175,3 +175,17 @@ def test_a_layer_that_stays_float_keeps_its_weight(bias: str) -> None:
     (up,) = (n for n in optimized(placed).graph if n.op_type == "ConvTranspose")
     assert up.inputs[1] is not None
     assert array_of(up.inputs[1]) is not None  # not behind a DequantizeLinear
+
+
+@pytest.mark.parametrize("op", ["Gemm", "Add"])
+@pytest.mark.parametrize(
+    ("without", "rules"),
+    [("", ["bias-scale"]), ("weight", []), ("input", ["bias-scale"])],
+)
+def test_a_product_becomes_int8_where_the_zero_point_of_its_weight_is_written(
+    op: str, without: str, rules: list[str]
+) -> None:
+    drawn = Drawn(op, bias="own", kind="int8", without_zero=without)
+
+    assert [each.rule for each in int8_rewrites(drawn.model())] == rules
+    assert (sqnr(drawn, stock=True) < FAR_DB) == bool(rules)
