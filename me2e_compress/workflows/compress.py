@@ -58,7 +58,7 @@ class CompressOptions:
         scheme: int8 after the recipe's passes: ``feature-ext``, ``prediction``,
             ``full``.
         rules: rules of the int8 plan: ``safe``, ``paper``, or a set of yours.
-        target: runtime of the int8 graph: ``tensorrt`` or ``onnxruntime``.
+        target: runtime of the int8 graph: ``onnxruntime`` or ``tensorrt``.
         overrides: TOML file of exceptions to the int8 plan.
         ranges: file of saved ranges, instead of frames.
         method: how ranges are read from frames, or were for ``ranges``.

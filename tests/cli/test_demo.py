@@ -35,6 +35,10 @@ def test_the_demo_compresses_drives_and_reports(cli: Cli, tmp_path: Path) -> Non
     assert steps == ["compress", "weigh", "compare", "drive"]
     assert len(shown.splitlines()) <= 25
     assert "on the road: too few routes; 0 of 1 routes differ" in shown
+    assert "compress highway -r full --target tensorrt --frames" in " ".join(
+        shown.split()
+    )
+    assert "slow in onnxruntime's CPU" not in shown
     assert (
         "1 route cannot show a difference below 25 points, all 220 (--routes all) n"
         in shown

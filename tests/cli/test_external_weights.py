@@ -17,7 +17,7 @@ FROM_ELSEWHERE = (
     f"calibrate {M} ../models/frames -o r.json",
     f"compare {M} {M} ../models/frames",
     f"profile {M} ../models/frames -o t.json",
-    f"compress {M} -r full --frames ../models/frames -o small.onnx",
+    f"compress {M} -r full --target tensorrt --frames ../models/frames -o small.onnx",
 )
 
 

@@ -13,6 +13,7 @@ from me2e_compress.study.prepared import PreparedVariant, prepare_variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.listener import SILENT
 from tests.command import write_frames
+from tests.evaluators.highway.drivers import straight_on
 from tests.stand_in import write_model
 from tests.study.conftest import Make
 
@@ -224,3 +225,25 @@ def test_what_made_a_file_is_read_from_the_report_beside_it(
     assert (found.source, found.pipeline) == ("m.onnx", first.pipeline)
     write_model(first.model, seed=3)
     assert made(plain, tmp_path).pipeline == ""
+
+
+TURNED = """
+    q = QuantizeLinear(ahead, s, z) d = DequantizeLinear(q, s, z)
+    v = DequantizeLinear(w, s, z) m = MatMul(d, v) plan = Add(m, b)"""
+GRID = ", float s = {0.1}, int8 z = {0}, int8[2,2] w = {10,0,0,10}, float[2] b = {0,0}"
+
+
+def test_a_variant_in_tensorrts_form_is_warned_of(make: Make, tmp_path: Path) -> None:
+    straight_on(tmp_path / "slow.onnx", body=TURNED, initializers=GRID)
+    straight_on(tmp_path / "float.onnx")
+    variants = tuple(
+        Variant(name, str(tmp_path / f"{name}.onnx")) for name in ("float", "slow")
+    )
+    study, heard = make(variants=variants, baseline="float"), list[str]()
+    listener = dataclasses.replace(SILENT, on_warning=heard.append)
+
+    for variant in variants:
+        prepare_variant(study, variant, Workspace(tmp_path), listener)
+
+    (warning,) = heard
+    assert warning.startswith("variant slow: it is quantized in TensorRT's form")

@@ -152,7 +152,8 @@ def test_schemes_shrink_the_file_and_keep_the_plan(
     context: Context,
     ranges: Path,
 ) -> None:
-    result = QuantizeInt8(scheme=scheme, ranges=ranges).run(folded.clone(), context)
+    quantize = QuantizeInt8(scheme=scheme, target="tensorrt", ranges=ranges)
+    result = quantize.run(folded.clone(), context)
     session = seeing(result.model, reference, context)
     found = reference.compare(session)
 
@@ -200,7 +201,8 @@ def test_schemes_are_built_with_int8_kernels(
     scheme: str, folded: ir.Model, context: Context, ranges: Path
 ) -> None:
     pytest.importorskip("tensorrt_rtx")
-    result = QuantizeInt8(scheme=scheme, ranges=ranges).run(folded.clone(), context)
+    quantize = QuantizeInt8(scheme=scheme, target="tensorrt", ranges=ranges)
+    result = quantize.run(folded.clone(), context)
 
     found = check(result.model)
 
@@ -212,7 +214,7 @@ def test_close_layers_are_decided_as_they_should(
     folded: ir.Model, context: Context, vad_size: VadSize
 ) -> None:
     """The traps of this stack: long attention, one ego query, sampling offsets."""
-    options = QuantizeInt8()
+    options = QuantizeInt8(target="tensorrt")
     plan = options.plan(folded, context)
     rules = {each.node.removeprefix("/pts_bbox_head/"): each for each in plan.decisions}
 
