@@ -14,7 +14,6 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import FLOAT, Decision, QuantPlan, plan_of
 from me2e_compress.runtime.providers import CPU
-from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.result import Table, counted, megabytes, table
 
 LEAST_BYTES = 1024
@@ -110,8 +109,8 @@ class Int8Outcome:
         kept: layers left float, by rule and reason; most first.
         weights: the largest that stayed float; at most `LISTED`.
         float_bytes: weights that stayed float, by rule; most first.
-        slow_here: that this CPU runs it slowly, and what is fast; None where it is
-            written for onnxruntime, or another provider runs it.
+        slow_here: that this CPU runs it slowly, and what is fast; None where it is not
+            for TensorRT, or another provider runs it.
     """
 
     by: str
@@ -137,6 +136,7 @@ class Int8Outcome:
         placed = {each.output for each in plan.placed}
         left = [each for each in layers if each.output not in placed]
         weights = float_weights(quantizer.before, plan)
+        slow = plan.target == "tensorrt" and context.provider.native == CPU.native
         return cls(
             name,
             changes,
@@ -144,7 +144,7 @@ class Int8Outcome:
             dict(Counter(f"{e.rule}: {e.reason}" for e in left).most_common()),
             weights[:LISTED],
             _by_rule(weights),
-            _slow(report, plan, context) if changes else None,
+            _FOR_TENSORRT if changes and slow else None,
         )
 
     @property
@@ -198,12 +198,6 @@ def _by_rule(weights: Iterable[FloatWeight]) -> dict[str, int]:
     for each in weights:
         found[each.rule] += each.bytes
     return dict(found.most_common())
-
-
-def _slow(report: Report, plan: QuantPlan, context: Context) -> str | None:
-    said = slow_here(report.model, context.provider)
-    here = context.provider.native == CPU.native
-    return _FOR_TENSORRT if not said and here and plan.target == "tensorrt" else said
 
 
 def _plan(report: Report, quantizer: LossyPass, context: Context) -> QuantPlan | None:
