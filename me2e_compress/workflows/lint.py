@@ -54,7 +54,7 @@ class LintOptions:
     target_version: str | None = None
 
     def __post_init__(self) -> None:
-        if (option := self._of_tensorrt) and self.target not in (None, "tensorrt"):
+        if self.target not in (None, "tensorrt") and (option := self._of_tensorrt):
             raise RecipeError(f"--{option} is for tensorrt, not for {self.target}")
         if self.provider != CPU and self.target and not self.judge.opens:
             raise RecipeError(
@@ -172,16 +172,13 @@ class LintResult(Result):
 
     def summary(self) -> tuple[RuleSummary, ...]:
         """Return one row per rule."""
+        rows: dict[tuple[Severity, str], list[LintFinding]] = {}
+        for each in self.findings:
+            rows.setdefault((each.severity, each.rule), []).append(each)
         return tuple(
             RuleSummary(*key, len(found), found[0].node, found[0].message)
-            for key, found in self._by_rule().items()
+            for key, found in rows.items()
         )
-
-    def _by_rule(self) -> dict[tuple[Severity, str], list[LintFinding]]:
-        rules: dict[tuple[Severity, str], list[LintFinding]] = {}
-        for each in self.findings:
-            rules.setdefault((each.severity, each.rule), []).append(each)
-        return rules
 
     def lines(self) -> tuple[str, ...]:
         """Return the headline, and TensorRT-RTX's answer."""
@@ -193,13 +190,13 @@ class LintResult(Result):
         if not self.findings:
             return ()
         # a rule that fails everywhere would bury the others
-        rules = self._by_rule().items()
-        rows = [(*key, e.node, e.message) for key, own in rules for e in own[:shown]]
-        more = (
-            f"{severity} {rule}: {len(own) - shown} more"
-            for (severity, rule), own in rules
-            if len(own) > shown
-        )
+        rows, more = list[tuple[str, ...]](), list[str]()
+        for row in self.summary():
+            key = row.severity, row.rule
+            own = [each for each in self.findings if (each.severity, each.rule) == key]
+            rows += [(*key, each.node, each.message) for each in own[:shown]]
+            if row.nodes > shown:
+                more.append(f"{row.severity} {row.rule}: {row.nodes - shown} more")
         columns = ("", "rule", "node", "what")
         return (table("Findings", columns, rows, "\n".join(more), words=4),)
 
