@@ -181,7 +181,7 @@ def test_the_cpu_runs_every_convolution_and_most_products_in_int8(
     result = options.run(folded.clone(), context).model
 
     rewritten = tmp_path / "rewritten.onnx"
-    session = Session(result, threads=1, rewritten=rewritten)
+    session = Session(result, threads=1, int8_kernels=True, rewritten=rewritten)
     kernels = Counter(node.op_type for node in graph.load(rewritten).graph)
     found = reference.compare(session)
 
