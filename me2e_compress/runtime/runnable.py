@@ -94,8 +94,10 @@ def runnable(
             custom_ops.register(options, needed)
         except (ImportError, OSError):
             made, _ = compiled_or_expanded(model, compiled=False, theirs=theirs)
+    if provider.native != CPU.native or not _by_int8(options):
+        return made
     # Files without fused nodes are opened unread, so their products stay, too.
-    if made is not model and provider.native == CPU.native and _by_int8(options):
+    if made is not model:
         write_float_products(made.graph)
     return _with_own_weights(made)
 

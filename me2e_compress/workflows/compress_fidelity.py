@@ -160,11 +160,11 @@ class _Measurement:
         alive = self.floor.alive
         lively = LivenessTally(reference.session, session) if alive else None
         kernels = self._kernels(model)
-        watching = [each.add for each in (lively, kernels) if each is not None]
 
         def watch(a: dict[str, Array], b: dict[str, Array], frame: Frame) -> None:
-            for add in watching:
-                add(a, b, frame)
+            for tally in (lively, kernels):
+                if tally is not None:
+                    tally.add(a, b, frame)
 
         fidelity = reference.compare(session, watch=watch)
         ablated = not all(each.applied.quantizes for each in self.report.lossy)
@@ -180,12 +180,12 @@ class _Measurement:
     def _kernels(self, model: ir.Model) -> RuntimeTally | None:
         """Return what runs a graph that was written for onnxruntime as it runs it."""
         provider = self.context.provider
-        written = any(
-            TARGETS.parse(each.target).opens
-            if isinstance(each, QuantizeInt8)
-            else isinstance(each, LowerInt8)
-            for each in (lossy.applied for lossy in self.report.lossy)
-        )
+        written = False
+        for lossy in self.report.lossy:
+            current = lossy.applied
+            written |= isinstance(current, LowerInt8)
+            if isinstance(current, QuantizeInt8):
+                written |= TARGETS.parse(current.target).opens
         if not written or not has_int8_kernels(model, provider):
             return None
         session = Session(model, stock=True, release=True, provider=provider)
