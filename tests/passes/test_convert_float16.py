@@ -204,3 +204,17 @@ def test_no_scale_becomes_zero_or_loses_its_digits(faint: float) -> None:
     assert off.max() <= 0.5 + 127 * 2.0**-11
     others = np.arange(32) % 4 != 0
     np.testing.assert_array_equal(held[others], integers[others])
+
+
+def test_no_two_nodes_have_one_name() -> None:
+    """As behind int8 for onnxruntime, whose pairs are called like Casts."""
+    model = conv_attention()
+    for value in model.graph.outputs:
+        producer = value.producer()
+        assert producer is not None
+        producer.name = f"{value.name}_float"
+
+    made = ConvertFloat16().run(model, Context(MODULES)).model
+
+    names = [node.name for node in made.graph]
+    assert len(set(names)) == len(names)

@@ -107,6 +107,8 @@ class Retyping:
         self._types = types
         self._by = by
         self._names = rewrite.value_names(model.graph)
+        # onnxruntime refuses two nodes of one name
+        self._names.update(node.name or "" for node in model.graph)
         self._casts: dict[tuple[ir.Value, ir.DataType], ir.Value] = {}
         self.changed = 0
 
