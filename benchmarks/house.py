@@ -1,13 +1,15 @@
-"""How large the package is, held against its budget: `house.toml`.
+"""How large the project is, held against `house.toml`.
 
-    python -m benchmarks.house [--entered]
+    python -m benchmarks.house [--entered] [--write]
 
-Prints lines by room, options, circles of files and files with one reader, each beside
-its budget; ``--entered`` runs three calls and counts the files and functions that they
-enter (a minute). Raising a budget is a line of `house.toml` that a reviewer sees.
+Prints lines by room, lines of tests, words of docs, options and circles of files, each
+beside today's count and its ceiling; ``--entered`` runs three calls and counts the
+files and functions that they enter (a minute). ``--write`` notes lower counts as
+today's: a count may only fall, and a test holds it against the last commit's.
 """
 
 import argparse
+import re
 import subprocess
 import sys
 import tomllib
@@ -33,17 +35,27 @@ class House:
     Attributes:
         lines: of Python, by room; files beside the rooms are ``.``.
         options: of all commands.
+        tests: lines of Python below ``tests``.
+        words: of the pages below ``docs``.
         circles: imports within a room that lead back, ``FILE -> FILE``.
     """
 
     lines: Mapping[str, int]
     options: int
+    tests: int
+    words: int
     circles: frozenset[str]
 
     @property
     def total(self) -> int:
         """Lines of all rooms."""
         return sum(self.lines.values())
+
+    def counts(self) -> dict[str, int]:
+        """Return every count by its name in `house.toml`."""
+        whole = {"total": self.total, "options": self.options}
+        beside = {"tests": self.tests, "words": self.words}
+        return {**whole, **beside, **{f"lines.{n}": k for n, k in self.lines.items()}}
 
 
 def measure(root: Path = ROOT) -> House:
@@ -52,6 +64,8 @@ def measure(root: Path = ROOT) -> House:
     return House(
         lines_by_room(root / PACKAGE),
         sum(1 for _ in options()),
+        sum(lines_by_room(root / "tests").values()),
+        sum(len(page.read_text("utf-8").split()) for page in pages(root)),
         frozenset(circles(graph)),
     )
 
@@ -63,6 +77,11 @@ def lines_by_room(package: Path) -> dict[str, int]:
         room = path.relative_to(package).parent.parts[:1]
         found[room[0] if room else "."] += path.read_bytes().count(b"\n")
     return dict(found)
+
+
+def pages(root: Path) -> Iterator[Path]:
+    """List the pages of the docs."""
+    return (root / "docs").glob("*.md")
 
 
 def options() -> Iterator[str]:
@@ -90,17 +109,98 @@ def entered(call: str) -> tuple[int, int]:
     return int(files), int(functions.split()[0])
 
 
-def budget(path: Path = ROOT / "house.toml") -> dict[str, Any]:
+@dataclass(frozen=True)
+class Budget:
+    """What `house.toml` says; names are those of `House.counts` and of calls.
+
+    Attributes:
+        ceilings: where the project goes.
+        today: what it had at the last count; only ever lower than the commit before.
+        ceilings_bind: whether a count above its ceiling is an error by now.
+        circles: imports within a room that lead back and are to go.
+    """
+
+    ceilings: Mapping[str, Any]
+    today: Mapping[str, Any]
+    ceilings_bind: bool
+    circles: list[str]
+
+    @classmethod
+    def parse(cls, text: str) -> "Budget":
+        """Read the text of a `house.toml`."""
+        document = tomllib.loads(text)
+        return cls(
+            _flat(document["ceilings"]),
+            _flat(document["today"]),
+            document["ceilings_bind"],
+            document["kept"]["circles"],
+        )
+
+
+def budget(path: Path = ROOT / "house.toml") -> Budget:
     """Read what is allowed.
 
     Raises:
         ValueError: a room is not there.
     """
-    found = tomllib.loads(path.read_text(encoding="utf-8"))
-    rooms = {each.name for each in (ROOT / PACKAGE).iterdir() if each.is_dir()} | {"."}
-    if unknown := found["lines"].keys() - rooms:
-        raise ValueError(f"{path.name}: no room {', '.join(sorted(unknown))}")
-    return found
+    budget = Budget.parse(path.read_text(encoding="utf-8"))
+    rooms = {folder.name for folder in (ROOT / PACKAGE).iterdir() if folder.is_dir()}
+    known = {f"lines.{room}" for room in rooms | {"."}}
+    named = {name for name in budget.today if name.startswith("lines.")}
+    if unknown := sorted(named - known):
+        rooms_named = ", ".join(name.removeprefix("lines.") for name in unknown)
+        raise ValueError(f"{path.name}: no room {rooms_named}")
+    return budget
+
+
+def committed_before(root: Path = ROOT) -> str | None:
+    """Return the `house.toml` before this one; None outside a checkout with history.
+
+    In a tree where the file was edited it is the last commit's, else that of the
+    commit before.
+    """
+    text = (root / "house.toml").read_text(encoding="utf-8")
+    for commit in ("HEAD", "HEAD^"):
+        words = ["git", "show", f"{commit}:house.toml"]
+        shown = subprocess.run(
+            words, cwd=root, capture_output=True, text=True, check=False
+        )
+        if shown.returncode:
+            return None
+        if shown.stdout != text:
+            return shown.stdout
+    return text
+
+
+def write_lower(house: House, path: Path = ROOT / "house.toml") -> None:
+    """Note every count that fell as today's, in place."""
+    counts, text = house.counts(), path.read_text(encoding="utf-8")
+    head, _, today = text.partition("[today]")
+    for name, count in counts.items():
+        key = name.removeprefix("lines.")
+        written = f'"{key}"' if name.startswith("lines.") else key
+        match = re.search(rf"^{re.escape(written)} = (\d+)$", today, re.MULTILINE)
+        if match and int(match[1]) > count:
+            today = today.replace(match[0], f"{written} = {count}")
+    gone = {name for name in budget(path).today if name.startswith("lines.")}
+    for name in gone - counts.keys():
+        today = re.sub(
+            rf'^"{name.removeprefix("lines.")}" = \d+\n', "", today, flags=re.MULTILINE
+        )
+    path.write_text(f"{head}[today]{today}", encoding="utf-8")
+
+
+def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``[lines] passes = 1`` as ``lines.passes``, other tables as they are."""
+    flat: dict[str, Any] = {}
+    for name, value in table.items():
+        if name == "lines":
+            flat |= {f"lines.{room}": count for room, count in value.items()}
+        elif isinstance(value, Mapping):
+            flat |= value
+        else:
+            flat[name] = value
+    return flat
 
 
 def _short(module: str) -> str:
@@ -111,17 +211,19 @@ def main() -> None:
     """Print what there is beside what is allowed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--entered", action="store_true")
+    parser.add_argument("--write", action="store_true")
     asked = parser.parse_args()
     house, allowed = measure(), budget()
-    lines, entries = allowed["lines"], allowed["entered"]
-    for room, count in sorted(house.lines.items(), key=lambda each: -each[1]):
-        print(f"{count:7,} of {lines.get(room, 0):7,}  {room}")
-    print(f"{house.total:7,} of {allowed['total']:7,}  in all")
-    print(f"{house.options:7,} of {allowed['options']:7,}  options")
+    print(f"{'count':>7} {'today':>7} {'ceiling':>7}")
+    for name, count in sorted(house.counts().items(), key=lambda pair: -pair[1]):
+        limits = (allowed.today.get(name, 0), allowed.ceilings.get(name, 0))
+        print(f"{count:7,} {limits[0]:7,} {limits[1]:7,}  {name}")
     print(f"circles: {', '.join(sorted(house.circles)) or 'none'}")
     for call in CALLS if asked.entered else ():
         files, functions = entered(call)
-        print(f"{call}: {files} files, {functions} functions of {entries[call]}")
+        print(f"{call}: {files} files, {functions} functions of {allowed.today[call]}")
+    if asked.write:
+        write_lower(house)
 
 
 if __name__ == "__main__":
