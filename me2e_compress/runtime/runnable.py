@@ -103,7 +103,7 @@ def runnable(
 
 
 def _with_own_weights(model: ir.Model) -> ir.Model:
-    """Return a graph in which no two nodes dequantize one int8 weight or zero point.
+    """Return a graph in which no two nodes read one int8 weight or zero point.
 
     With :data:`NO_OVERFLOW` onnxruntime (1.31) writes each as uint8 under one new name,
     and refuses the second. A graph that shares none is returned itself.
@@ -123,15 +123,20 @@ def _with_own_weights(model: ir.Model) -> ir.Model:
 
 def _shared_weights(model: ir.Model) -> Iterator[tuple[ir.Node, int]]:
     for node in model.graph:
-        weight = input_at(node, 0)
-        if node.op_type != "DequantizeLinear" or weight is None:
+        indices = _WEIGHT_INPUTS.get(node.op_type, ())
+        weight = input_at(node, indices[0]) if indices else None
+        if weight is None or weight.dtype != ir.DataType.INT8:
             continue
-        if weight.dtype != ir.DataType.INT8 or not weight.is_initializer():
+        if not weight.is_initializer():
             continue
-        for index in (0, 2):
+        for index in indices:
             value = input_at(node, index)
             if value is not None and value.const_value and len(value.uses()) > 1:
                 yield node, index
+
+
+_WEIGHT_INPUTS = {"DequantizeLinear": (0, 2), "MatMulIntegerToFloat": (1, 5)}
+"""Where nodes read an int8 weight and its zero point."""
 
 
 def _by_int8(options: ort.SessionOptions) -> bool:
