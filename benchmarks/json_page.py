@@ -27,7 +27,6 @@ from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import TimeShare
 from me2e_compress.sensitivity import Candidate, Sensitivity
-from me2e_compress.sensitivity.remedy import Remedy
 from me2e_compress.study.on_road.halving import Rung
 from me2e_compress.targets.base import LintFinding
 from me2e_compress.workflows.check_model import ModelCheck
@@ -54,7 +53,7 @@ NAMED = (
         Decision,
         QuantPlan,
     ),
-    *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity, Remedy, Rung),
+    *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity, Rung),
     *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
     *(Int8Outcome, RuleSummary, WeightsRecord, RangeFinding, DumpResult),
     *(FirstDifference, RuntimeLoss),

@@ -27,6 +27,7 @@ FORMER = {
     "calibration method moving-average": f"moving-average {_NOW} max-min",
     "quantize-int8 weight_only_gemv": f"weight_only_gemv {_NOW} without=[gemv]",
     "--weight-only-gemv": f"--weight-only-gemv {_NOW} --rules 'safe{{without=[gemv]}}'",
+    "--no-remedy": "--no-remedy is gone since 0.3.0: compress searches no nodes",
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""
 

@@ -88,7 +88,7 @@ _PANELS = {
         ),
         "build": "Build a TensorRT engine of a graph, for the GPU of this machine.",
         "sensitivity": (
-            "Measure what int8 costs per module and node, and write a recipe within a"
+            "Measure what int8 costs module by module, and write a recipe within a"
             " limit."
         ),
         "search": (

@@ -1,14 +1,13 @@
 """The floor of fidelity: what falls below it, and which outputs it cannot judge."""
 
 import dataclasses
-import math
 from collections.abc import Collection, Iterator, Mapping
 from typing import Self
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.fidelity.compare import Fidelity, Reference
+from me2e_compress.fidelity.compare import Fidelity, OutputFidelity, Reference
 from me2e_compress.graph.nodes import (
     FLOATS,
     makers_of,
@@ -69,24 +68,13 @@ class Floor:
     plan_m: float = PLAN_FLOOR_M
     alive: float = ALIVE
 
-    def excess(self, found: Fidelity, output: str) -> float:
-        """Return an output's noise over what is allowed: above 1 is too much.
-
-        An output that was not compared has no noise.
-        """
-        if found.plan is not None and output == found.plan_output:
-            return found.plan.mean_m / self.plan_m
-        names = {each.name: each.sqnr_db for each in found.outputs}
-        sqnr = names.get(output, math.inf)
-        return float(min(10 ** ((self.sqnr_db - sqnr) / 20), MOST_EXCESS))
-
     def shortfalls(
         self, found: Fidelity, unsteady: Collection[str] = ()
     ) -> tuple[Shortfall, ...]:
         """List what is below the floor, the worst first, without unsteady outputs."""
         below = []
         for each in found.outputs:
-            excess = self.excess(found, each.name)
+            excess = self._excess(found, each)
             if excess <= 1 or each.discrete or each.name in unsteady:
                 continue
             value, unit = each.sqnr_db, "dB"
@@ -94,6 +82,12 @@ class Floor:
                 value, unit = found.plan.mean_m, "m"
             below.append(Shortfall(each.name, value, unit, excess))
         return tuple(sorted(below, key=lambda each: -each.excess))
+
+    def _excess(self, found: Fidelity, output: OutputFidelity) -> float:
+        """Return an output's noise over what is allowed: above 1 is too much."""
+        if found.plan is not None and output.name == found.plan_output:
+            return found.plan.mean_m / self.plan_m
+        return float(min(10 ** ((self.sqnr_db - output.sqnr_db) / 20), MOST_EXCESS))
 
     def __str__(self) -> str:
         return f"{self.sqnr_db:g} dB, {self.plan_m:g} m of plan"

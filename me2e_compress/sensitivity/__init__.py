@@ -1,7 +1,6 @@
 """Which modules and nodes int8 hurts, and which assignment fits a budget."""
 
 from me2e_compress.sensitivity.analysis import ModuleSensitivity, Sensitivity, analyse
-from me2e_compress.sensitivity.estimate import NodeCost
 from me2e_compress.sensitivity.recipes import advise, write_recipe
 from me2e_compress.sensitivity.search import Budget, Candidate, search
 from me2e_compress.sensitivity.trials import Drive, Int8Choice, Score, Trials
@@ -12,7 +11,6 @@ __all__ = [
     "Drive",
     "Int8Choice",
     "ModuleSensitivity",
-    "NodeCost",
     "Score",
     "Sensitivity",
     "Trials",

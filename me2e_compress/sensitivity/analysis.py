@@ -1,11 +1,9 @@
 """Measure the loss of int8 module by module, and find the nodes to blame."""
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 
 from me2e_compress.quantization.plan import RESIDUAL
-from me2e_compress.sensitivity.estimate import NodeCost
 from me2e_compress.sensitivity.trials import Int8Choice, Score, Trials
 
 BLAME = 0.5
@@ -19,8 +17,8 @@ class ModuleSensitivity:
     Attributes:
         nodes: int8 nodes then.
         driving: driving score; None if nothing is driven.
-        blamed: nodes that are costly alone, with their measured losses, worst first;
-            empty if the loss is spread over the module.
+        blamed: of the worst module the nodes that are costly alone, with their measured
+            losses, worst first; empty if the loss is spread over the module.
     """
 
     module: str
@@ -38,7 +36,6 @@ class Sensitivity:
         findings: modules, worst first.
         together: of all modules.
         trials: number of variants.
-        nodes: what each int8 node costs each output, as estimated, in graph order.
         float_driving: driving score of the float model; None if nothing is driven.
         driving: of all modules in int8; likewise.
     """
@@ -48,38 +45,39 @@ class Sensitivity:
     trials: int
     float_driving: float | None = None
     driving: float | None = None
-    nodes: tuple[NodeCost, ...] = ()
 
 
 def analyse(
     trials: Trials,
     modules: Sequence[str],
     *,
-    node_trials: int = 4,
+    node_trials: int = 16,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Sensitivity:
-    """Score every module alone, and those of its nodes that are estimated to cost most.
+    """Score every module alone, then halves of the worst one's nodes.
 
-    Modules are driven if the trials have a hook for that; nodes are not. At most
-    ``node_trials`` nodes of a module are scored alone, 0 estimates none either;
-    ``progress`` is called as ``progress(modules done, modules, module)``.
+    Modules are driven if the trials have a hook for that; nodes are not. Halving runs
+    at most ``node_trials`` variants; ``progress`` is called as ``progress(steps done,
+    steps, module)``.
     """
     active = [name for name in modules if names_of(trials, name)]
-    costs = trials.costs(Int8Choice(tuple(active))) if node_trials and active else ()
-    # every module alone, then the nodes that may be to blame
+    # every module alone
     findings = []
     for done, module in enumerate(active):
         if progress:
-            progress(done, len(active), module)
-        names = names_of(trials, module)
-        score = trials.score(Int8Choice((module,)))
-        blamed: tuple[tuple[str, float], ...] = ()
-        if score.loss > 0 and len(names) > 1:
-            suspects = _suspects(names, costs, score.output)[:node_trials]
-            blamed = _blamed(trials, module, names, suspects, score.loss)
-        driving = trials.driving(Int8Choice((module,)))
-        findings.append(ModuleSensitivity(module, len(names), score, driving, blamed))
+            progress(done, len(active) + 1, module)
+        choice = Int8Choice((module,))
+        score, driving = trials.score(choice), trials.driving(choice)
+        nodes = len(names_of(trials, module))
+        findings.append(ModuleSensitivity(module, nodes, score, driving))
     findings.sort(key=lambda each: -each.score.loss)
+    # halves of the worst
+    worst = findings[0] if findings else None
+    if worst is not None and worst.score.loss > 0 and worst.nodes > 1:
+        if progress:
+            progress(len(active), len(active) + 1, f"nodes of {worst.module}")
+        blamed = _blamed(trials, worst.module, worst.score.loss, node_trials)
+        findings[0] = dataclasses.replace(worst, blamed=blamed)
     # all modules together, beside the float model
     every = Int8Choice(tuple(active))
     together = trials.score(every)
@@ -89,7 +87,6 @@ def analyse(
         trials.done,
         float_driving=trials.driving(Int8Choice(())),
         driving=trials.driving(every),
-        nodes=costs,
     )
 
 
@@ -102,34 +99,31 @@ def names_of(trials: Trials, module: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(each.node for each in chosen if each.rule != RESIDUAL))
 
 
-def _suspects(
-    names: Sequence[str], costs: Sequence[NodeCost], output: str
-) -> list[str]:
-    """List the nodes of a module that may make much of its noise, the worst first.
-
-    Those without an estimate come last.
-    """
-    told = {each.node: (each.noise or {}).get(output) for each in costs}
-    known = {name: noise for name in names if (noise := told.get(name)) is not None}
-    whole = math.hypot(*known.values())
-    order = sorted(known, key=lambda name: -known[name])
-    loud = [name for name in order if known[name] > 0 and known[name] >= BLAME * whole]
-    return [*loud, *(name for name in names if name not in known)]
-
-
 def _blamed(
-    trials: Trials,
-    module: str,
-    names: Sequence[str],
-    suspects: Sequence[str],
-    loss: float,
+    trials: Trials, module: str, loss: float, most: int
 ) -> tuple[tuple[str, float], ...]:
-    """Score suspects alone, and return those that cost much, the worst first."""
-    found = {
-        name: trials.score(
-            Int8Choice((module,), tuple(other for other in names if other != name))
-        ).loss
-        for name in suspects
-    }
-    costly = [(name, own) for name, own in found.items() if own >= BLAME * loss]
-    return tuple(sorted(costly, key=lambda each: -each[1]))
+    """Halve a module's nodes until those that cost much stand alone, worst first.
+
+    The costliest part is halved next, each half int8 with the rest of the module in
+    float; parts that cost less than `BLAME` of the module are left. Two costly nodes in
+    one half are found one by one, nodes that cost little each never. At most ``most``
+    variants are run.
+    """
+    names = names_of(trials, module)
+    parts, blamed = [(loss, names)], list[tuple[str, float]]()
+    while parts:
+        parts.sort(key=lambda each: each[0])
+        own, part = parts.pop()
+        if len(part) == 1:
+            blamed.append((part[0], own))
+            continue
+        if most < 2:  # no two halves more
+            break
+        most -= 2
+        middle = len(part) // 2
+        for half in (part[:middle], part[middle:]):
+            rest = tuple(name for name in names if name not in half)
+            cost = trials.score(Int8Choice((module,), rest)).loss
+            if cost >= BLAME * loss:
+                parts.append((cost, half))
+    return tuple(sorted(blamed, key=lambda each: -each[1]))

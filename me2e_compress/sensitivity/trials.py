@@ -18,7 +18,6 @@ from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
-from me2e_compress.sensitivity.estimate import NodeCost, estimate
 from me2e_compress.targets import Target
 
 
@@ -60,13 +59,6 @@ class Score:
         return float(10 ** (-worst / 20))
 
     @property
-    def output(self) -> str:
-        """The output whose loss it is."""
-        if self.fidelity.plan is not None:
-            return self.fidelity.plan_output
-        return min(self.fidelity.outputs, key=lambda each: each.sqnr_db).name
-
-    @property
     def unit(self) -> str:
         """Unit of the loss."""
         return "m" if self.fidelity.plan is not None else "of the signal"
@@ -103,7 +95,6 @@ class Trials:
         self._target = target
         self.ranges = ranges
         self._drive = drive
-        self._threads, self._provider = threads, provider
         self._session = partial(
             Session, threads=threads, release=True, provider=provider
         )
@@ -123,19 +114,6 @@ class Trials:
             pins,
             target.costs,
             target.fused_objection,
-        )
-
-    def costs(self, choice: Int8Choice) -> tuple[NodeCost, ...]:
-        """Estimate what each int8 node of a choice costs each output."""
-        plan = self.plan(choice)
-        kept = self._target.kept_float(plan, self.model)
-        return estimate(
-            self.model,
-            dataclasses.replace(plan, kept_float=kept),
-            self._target.grids(plan, self.model, self.ranges),
-            self.reference.frames,
-            threads=self._threads,
-            provider=self._provider,
         )
 
     def variant(self, choice: Int8Choice) -> ir.Model:

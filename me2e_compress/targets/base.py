@@ -2,15 +2,13 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import ClassVar, Literal, TypeAlias, get_args
 
-import numpy as np
 import onnx
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import is_standard, opset_of
@@ -19,16 +17,8 @@ from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import (
     KeptFloat,
     QuantPlan,
-    share_scales,
-    tensors_of,
 )
 from me2e_compress.runtime.providers import CPU, Provider
-
-Grids: TypeAlias = Mapping[str, tuple[np.float32, int]]
-"""Step of an activation, and its zero point as uint8, by the tensor's name."""
-
-MIDDLE = 128
-"""The uint8 zero point of a signed tensor: int8 value plus 128."""
 
 Severity = Literal["error", "wrong", "warning"]
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
@@ -145,12 +135,6 @@ class Target(abc.ABC):
                 without int8 here, or a planned weight is not constant.
             FramesError: the range of a tensor is missing.
         """
-
-    def grids(self, plan: QuantPlan, model: ir.Model, ranges: Ranges) -> Grids:
-        """Return the grid of every activation that the plan's nodes read as int8."""
-        shared = share_scales(plan, ranges).tensors
-        names = tensors_of(plan, model)
-        return {name: (scale_of(*shared[name]), MIDDLE) for name in names}
 
     def kept_float(self, plan: QuantPlan, model: ir.Model) -> tuple[KeptFloat, ...]:
         """List the plan's nodes that stay float in that copy, with the reasons."""

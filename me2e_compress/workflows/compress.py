@@ -70,7 +70,6 @@ class CompressOptions:
             passes on; 0 measures nothing and calibrates on all.
         floor: SQNR in dB below which an output is warned of.
         alive: share of an output's movement below which it is dead; 0 does not ask.
-        no_remedy: do not search the nodes that put an output below the floor.
         allow_empty: write the graph although nothing in it became int8.
         smaller: add no weights to remove nodes: fewer bytes instead of fewer nodes.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
@@ -92,7 +91,6 @@ class CompressOptions:
     measure_frames: int = 8
     floor: float = SQNR_FLOOR_DB
     alive: float = ALIVE
-    no_remedy: bool = False
     allow_empty: bool = False
     smaller: bool = False
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -268,8 +266,7 @@ class Compression:
         if report.lossy and frames.measured is not None:
             first(report.model, self.output.name)
         floor = Floor(options.floor, alive=options.alive)
-        search = not options.no_remedy
-        loss = measure_loss(report, context, frames, floor, listener, search)
+        loss = measure_loss(report, provider, frames, floor, listener)
         linted = lint_written(report.model, passes, self.output, options.target)
         seconds = cpu_seconds() - start
         return write_result(report, loaded, self.output, int8, loss, seconds, linted)

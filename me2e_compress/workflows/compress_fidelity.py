@@ -2,9 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import onnx_ir as ir
 
@@ -12,24 +10,19 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.sample import hold_out
 from me2e_compress.calibration.stack_frames import recording_of
 from me2e_compress.calibration.stream import Recording
-from me2e_compress.errors import EvaluationError, FramesError, GraphError, Me2eError
-from me2e_compress.fidelity.compare import Fidelity, Reference
+from me2e_compress.errors import EvaluationError, FramesError, GraphError
+from me2e_compress.fidelity.compare import Reference
 from me2e_compress.fidelity.floor import Floor, Rounding
 from me2e_compress.fidelity.liveness import LivenessTally
 from me2e_compress.graph import LoadedModel
 from me2e_compress.manager import Report
-from me2e_compress.manager.report import LossyPass
-from me2e_compress.passes import Context, Pass
+from me2e_compress.passes import Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.plan import QuantPlan, plan_of
-from me2e_compress.quantization.plan.overrides import Override, overrides_text
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.others_load import cpu_seconds
 from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
-from me2e_compress.sensitivity.estimate import estimate
-from me2e_compress.sensitivity.remedy import MOST_TRIALS, RemedySearch
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.workflows.measured_loss import NOT_ASKED, MeasuredLoss
@@ -40,6 +33,7 @@ KEPT_OUT = "kept out of calibration"
 SHARED = "calibrated on as well: there is no other"
 PERHAPS_SHARED = "that the saved ranges may have been measured on"
 SHIPPED_FRAMES = "that ship with the model"
+ADVICE = "me2e-compress sensitivity MODEL FRAMES -o RECIPE.toml"
 
 
 def open_frames(
@@ -91,16 +85,15 @@ class SplitFrames:
 
 def measure_loss(
     report: Report,
-    context: Context,
+    provider: Provider,
     frames: SplitFrames,
     floor: Floor,
     listener: Listener,
-    search: bool = True,
 ) -> MeasuredLoss | None:
     """Compare the graph with that before the first lossy pass; None if all are exact.
 
-    Below the floor, the outputs that choose between near-equal candidates are set
-    aside, and, with ``search``, the nodes of the int8 plan that cause the loss found.
+    Of what is below the floor, the outputs that choose between near-equal candidates
+    are set aside.
     """
     if not report.lossy:
         return None
@@ -109,9 +102,7 @@ def measure_loss(
     start = cpu_seconds()
     listener.on_progress("fidelity", 0, 1, "")
     # a graph that does not run or compare is a finding, not a failure
-    measurement = _Measurement(
-        report, context, frames.measured, floor, listener, search
-    )
+    measurement = _Measurement(report, provider, frames.measured, floor)
     found = MeasuredLoss(None, frames.kind, floor)
     try:
         found = measurement.judge(found)
@@ -125,16 +116,14 @@ def measure_loss(
 @dataclasses.dataclass(frozen=True)
 class _Measurement:
     report: Report
-    context: Context
+    provider: Provider
     frames: Frames
     floor: Floor
-    listener: Listener
-    search: bool
 
     def judge(self, found: MeasuredLoss) -> MeasuredLoss:
-        """Measure; below the floor, find out which outputs, passes and nodes."""
+        """Measure; of what is below the floor, tell which outputs are judged."""
         before = self.report.lossy[0].before
-        reference = self._reference(self.report.lossy[0])
+        reference = Reference.of(self._session(before), self.frames)
         found = self._answers(found, reference)
         fidelity = found.fidelity
         assert fidelity is not None
@@ -148,7 +137,15 @@ class _Measurement:
         found = dataclasses.replace(
             found, unsteady=unsteady, rounding=rounding, shortfalls=below
         )
-        return self._blame(found, reference) if below else found
+        if not below:
+            return found
+        passes = [each.applied for each in self.report.lossy]
+        int8 = any(isinstance(each, QuantizeInt8) for each in passes)
+        return dataclasses.replace(
+            found,
+            guilty=tuple(each.name for each in passes),
+            advice=ADVICE if int8 else "",
+        )
 
     def _answers(self, found: MeasuredLoss, reference: Reference) -> MeasuredLoss:
         """Compare the result with the graph before, and how both answer their inputs.
@@ -179,99 +176,16 @@ class _Measurement:
 
     def _kernels(self, model: ir.Model) -> RuntimeTally | None:
         """Return what runs a graph that was written for onnxruntime as it runs it."""
-        provider = self.context.provider
         written = False
         for lossy in self.report.lossy:
             current = lossy.applied
             written |= isinstance(current, LowerInt8)
             if isinstance(current, QuantizeInt8):
                 written |= TARGETS.parse(current.target).opens
-        if not written or not has_int8_kernels(model, provider):
+        if not written or not has_int8_kernels(model, self.provider):
             return None
-        session = Session(model, stock=True, release=True, provider=provider)
+        session = Session(model, stock=True, release=True, provider=self.provider)
         return RuntimeTally(session, self.frames)
 
-    def _blame(self, found: MeasuredLoss, reference: Reference) -> MeasuredLoss:
-        """Name the passes, and where int8 is to blame, the nodes."""
-        lossy = self.report.lossy
-        names = tuple(each.applied.name for each in lossy)
-        # without a quantizer all lossy passes share the blame
-        quantizer = next((each for each in lossy if each.applied.quantizes), None)
-        if quantizer is None:
-            return dataclasses.replace(found, guilty=names)
-        assert found.fidelity is not None
-        added = found.fidelity
-        if quantizer is not lossy[0]:  # it is judged by what it adds to the others
-            reference = self._reference(quantizer)
-            added = reference.compare(self._session(self.report.model))
-            if not self.floor.shortfalls(added, found.unsteady):
-                others = tuple(each for each in names if each != quantizer.applied.name)
-                return dataclasses.replace(found, guilty=others)
-        guilty = dataclasses.replace(found, guilty=(quantizer.applied.name,))
-        applied, plan = quantizer.applied, plan_of(self.report.model)
-        # only what the toolkit's own pass decides can be varied node by node
-        if not self.search or plan is None or not isinstance(applied, QuantizeInt8):
-            return guilty
-        begun = cpu_seconds()
-        try:
-            search = self._search(quantizer, applied, plan, reference, guilty)
-            remedy = search.run(added)
-        except Me2eError:  # a variant that cannot be made or compared ends the search
-            remedy = None
-        seconds = cpu_seconds() - begun
-        return dataclasses.replace(guilty, remedy=remedy, search_seconds=seconds)
-
-    def _search(
-        self,
-        quantizer: LossyPass,
-        applied: QuantizeInt8,
-        plan: QuantPlan,
-        reference: Reference,
-        found: MeasuredLoss,
-    ) -> RemedySearch:
-        """Estimate what each int8 node costs the outputs that are below the floor."""
-        before, target = quantizer.before, TARGETS.parse(applied.target)
-        ranges = self.context.ranges(
-            applied.name,
-            before,
-            target.tensors(plan, before),
-            method=applied.method_of_ranges,
-            saved=applied.ranges,
-        )
-        progress = partial(self.listener.on_progress, "search")
-        progress(0, MOST_TRIALS, "the nodes that lose it (--no-remedy: none)")
-        # as many outputs as frames, so that it takes three inferences a frame
-        low = [each.output for each in found.shortfalls][: len(reference.frames)]
-        costs = estimate(
-            before,
-            plan,
-            target.grids(plan, before, ranges),
-            reference.frames,
-            outputs=low,
-            seed=self.context.seed,
-            provider=self.context.provider,
-        )
-
-        def measure(more: Sequence[Override]) -> Fidelity:
-            varied = self._with_overrides(quantizer, more)
-            return reference.compare(self._session(varied))
-
-        return RemedySearch(costs, low, measure, self.floor, found.unsteady, progress)
-
-    def _with_overrides(
-        self, quantizer: LossyPass, more: Sequence[Override]
-    ) -> ir.Model:
-        """Run the pass that quantized again; what the user decided still holds."""
-        asked = getattr(quantizer.applied, "overrides", None)
-        text = "" if asked is None else Path(asked).read_text(encoding="utf-8")
-        with TemporaryDirectory(prefix="me2e-trial-") as folder:
-            path = Path(folder) / "overrides.toml"
-            path.write_text(f"{text}\n{overrides_text(more)}", encoding="utf-8")
-            again = quantizer.applied.with_options({"overrides": path})
-            return again.run(quantizer.before.clone(), self.context).model
-
-    def _reference(self, first: LossyPass) -> Reference:
-        return Reference.of(self._session(first.before), self.frames)
-
     def _session(self, model: ir.Model) -> Session:
-        return Session(model, release=True, provider=self.context.provider)
+        return Session(model, release=True, provider=self.provider)

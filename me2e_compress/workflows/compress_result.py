@@ -144,9 +144,6 @@ class CompressResult(Result):
         said = f"took {self.seconds:.0f} CPU s"
         if self.loss is not None and self.loss.fidelity is not None:
             said += f", {self.loss.seconds:.0f} of them to measure"
-            if self.loss.search_seconds:
-                spent = f"{self.loss.search_seconds:.0f} s"
-                said += f" ({spent} to find the nodes to blame: --no-remedy)"
         return said
 
     def records(self) -> list[dict[str, object]]:

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.floor import Floor, Rounding, Shortfall, shown
 from me2e_compress.fidelity.output_liveness import Liveness
-from me2e_compress.sensitivity.remedy import Remedy
 from me2e_compress.workflows.result import Table, counted, table
 from me2e_compress.workflows.runtime_loss import RuntimeLoss
 
@@ -30,13 +29,12 @@ class MeasuredLoss:
         rounding: outputs below the floor that fall below it, uncompressed, when the
             largest input alone is rounded; None if nothing is below.
         shortfalls: outputs below the floor, the worst first.
-        guilty: the passes that cause the shortfalls.
-        remedy: what would restore the quality; None if nothing was searched, because
-            another pass is guilty, or the one that quantizes takes no overrides.
+        guilty: the lossy passes, which cause the shortfalls between them.
+        advice: the command that measures int8 module by module; empty where nothing is
+            below the floor, or nothing is int8.
         liveness: which outputs still answer their inputs; None if not asked.
         runtime: what onnxruntime's int8 answers otherwise; None if it is not for it.
-        seconds: CPU time of measuring and searching.
-        search_seconds: CPU time of the search for a remedy.
+        seconds: CPU time of measuring.
     """
 
     fidelity: Fidelity | None
@@ -48,9 +46,8 @@ class MeasuredLoss:
     runtime: RuntimeLoss | None = None
     shortfalls: tuple[Shortfall, ...] = ()
     guilty: tuple[str, ...] = ()
-    remedy: Remedy | None = None
+    advice: str = ""
     seconds: float = 0.0
-    search_seconds: float = 0.0
     incomparable: bool = False
 
     def lines(self) -> Iterator[str]:
@@ -81,8 +78,8 @@ class MeasuredLoss:
         if self.shortfalls:
             low, guilty = ", ".join(map(str, self.shortfalls)), ", ".join(self.guilty)
             yield f"below the floor ({self.floor}): {low}; lost in {guilty}"
-            if self.remedy is not None:
-                yield from self._cure(self.remedy)
+        if self.advice:
+            yield f"{self.advice} measures which modules lose it"
 
     def table(self) -> Table | None:
         """Return the SQNR and largest error of every output; None if not measured."""
@@ -114,13 +111,8 @@ class MeasuredLoss:
 
     def record(self) -> dict[str, object]:
         """Return what the report says of it: all but the time."""
-        names = [each.name for each in dataclasses.fields(self)]
-        names = [each for each in names if each not in ("seconds", "search_seconds")]
-        said = {name: getattr(self, name) for name in names}
-        if self.remedy is not None:
-            overrides = {"overrides": self.remedy.overrides()}
-            said["remedy"] = dataclasses.asdict(self.remedy) | overrides
-        return said
+        names = (each.name for each in dataclasses.fields(self))
+        return {name: getattr(self, name) for name in names if name != "seconds"}
 
     def _summary(self, found: Fidelity) -> str:
         """Return how far the plan moved, and which output is the noisiest."""
@@ -160,33 +152,3 @@ class MeasuredLoss:
                 else f"judged, though int8 may be too coarse for it: {alone}, and"
                 " nothing picks on the way"
             )
-
-    def _cure(self, remedy: Remedy) -> Iterator[str]:
-        found = remedy.fidelity
-        runs = f"{counted(remedy.trials, 'variant')} run on"
-        runs += f" {counted(found.frames, 'frame')}"
-        # name the nodes to blame, or say that none can be
-        blamed = [
-            *map(str, remedy.nodes),
-            *(f"many nodes of module {name}" for name in remedy.modules),
-        ]
-        if not blamed:
-            yield f"no few nodes or modules are to blame ({runs})"
-            return
-        yield f"lost at {'; '.join(blamed)}"
-        # show the overrides with what they achieve
-        left = ", ".join(map(str, remedy.shortfalls))
-        after = (
-            f"{left}, still below the floor"
-            if left
-            else _figure(found, self.shortfalls[0].output)
-        )
-        yield f"with --overrides of these lines: {after} ({runs})"
-        yield remedy.overrides().rstrip()
-
-
-def _figure(found: Fidelity, output: str) -> str:
-    if found.plan is not None and output == found.plan_output:
-        return f"{output} {shown(found.plan.mean_m, 'm')}"
-    (value,) = (each.sqnr_db for each in found.outputs if each.name == output)
-    return f"{output} {shown(value, 'dB')}"

@@ -1,4 +1,4 @@
-"""Measure what int8 costs per module and node, and write a recipe within a limit."""
+"""Measure what int8 costs module by module, and write a recipe within a limit."""
 
 import dataclasses
 from functools import partial
@@ -37,9 +37,6 @@ from me2e_compress.workflows.result import (
     table,
 )
 
-SHOWN = 10
-"""Nodes in the table."""
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SensitivityOptions(TrialOptions):
@@ -52,14 +49,15 @@ class SensitivityOptions(TrialOptions):
             ``ID,ID`` or a file.
         drive_limit: most points of driving score that the recipe may lose.
         workers: routes at a time.
-        node_trials: most nodes of a module that are tried alone; 0 leaves nodes out.
+        node_trials: most variants that halve the worst module's nodes; 0 leaves nodes
+            out.
     """
 
     limit: float = 0.1
     drive: str | None = None
     drive_limit: float | None = None
     workers: int = 1
-    node_trials: int = 4
+    node_trials: int = 16
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -110,38 +108,7 @@ class SensitivityResult(Result):
         return *blamed, self.written, *cost
 
     def tables(self) -> tuple[Table, ...]:
-        """Return what int8 costs module by module, and at most of its nodes."""
-        return tuple(filter(None, [self._modules(), self._nodes()]))
-
-    def _nodes(self) -> Table | None:
-        """Return the nodes that are estimated to cost most."""
-        output, nodes = self.found.together.output, self.found.nodes
-        known = [(each, each.noise) for each in nodes if each.noise]
-        if not known:
-            return None
-        known.sort(key=lambda each: -each[1].get(output, 0.0))
-        rows = []
-        for cost, noise in known[:SHOWN]:
-            worst = max(noise, key=lambda name: noise[name])
-            own = noise.get(output)
-            rows.append(
-                (
-                    cost.node or cost.output,
-                    cost.module,
-                    "" if own is None else significant(own),
-                    f"{worst} {significant(noise[worst])}",
-                )
-            )
-        # say of how many nothing is known, and why
-        note = f"{counted(len(nodes), 'node')}; choices between candidates are left out"
-        missing = [each.reason for each in nodes if each.noise is None]
-        if missing:
-            note += f"\n{len(missing)} not estimated, the first since: {missing[0]}"
-        columns = ("node", "module", f"noise of {output}", "noisiest output")
-        title = "Int8 node by node, as estimated: noise relative to the signal"
-        return table(title, columns, rows, note)
-
-    def _modules(self) -> Table:
+        """Return what int8 costs module by module."""
         found, driven = self.found, self.found.float_driving is not None
         rows = [
             (each.module, str(each.nodes), *_cells(each.score, each.driving))
@@ -156,12 +123,9 @@ class SensitivityResult(Result):
         columns = ("module", "nodes", f"loss {found.together.unit}", "worst dB", "DS")
         width = len(columns) if driven else len(columns) - 1
         size = megabytes(found.together.weight_bytes)
-        return table(
-            "Int8 module by module",
-            columns[:width],
-            [row[:width] for row in rows],
-            f"{counted(found.trials, 'variant')} run; all together {size} MB",
-        )
+        note = f"{counted(found.trials, 'variant')} run; all together {size} MB"
+        cells = [row[:width] for row in rows]
+        return (table("Int8 module by module", columns[:width], cells, note),)
 
     def records(self) -> list[dict[str, object]]:
         """Return one row per module."""
@@ -189,11 +153,12 @@ def measure_sensitivity(
     options: SensitivityOptions | None = None,
     listener: Listener = SILENT,
 ) -> SensitivityResult:
-    """Measure what int8 costs per module and node, and write a recipe within a limit.
+    """Measure what int8 costs module by module, and write a recipe within a limit.
 
-    The model is a float ONNX file or the name of one that ships; overrides lie beside
-    the recipe where nodes stay float. Where modules are driven, the episodes stay in
-    ``RECIPE.drives``; run again, it goes on from them.
+    The nodes of the worst module are halved to find those to blame. The model is a
+    float ONNX file or the name of one that ships; overrides lie beside the recipe where
+    nodes stay float. Where modules are driven, the episodes stay in ``RECIPE.drives``;
+    run again, it goes on from them.
 
     Raises:
         GraphError: The model does not exist, or an output would harm an input.

@@ -1,4 +1,4 @@
-"""``compress`` measures what it did, warns, and says what gives the quality back."""
+"""``compress`` measures what it did, warns, and names the command that finds why."""
 
 import json
 from pathlib import Path
@@ -11,6 +11,7 @@ import pytest
 import me2e_compress as me2e
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.workflows.compress_fidelity import ADVICE
 from tests.command import Command
 from tests.frames import record
 from tests.nets import conv_attention, net
@@ -46,7 +47,6 @@ MAP = "".join(
         ("plan_head", "prediction"),
     )
 )
-GUILTY = "/bev_encoder/project"
 
 
 def projection() -> ir.Model:
@@ -87,7 +87,7 @@ PAPER = (
 )
 
 
-def test_lost_quality_is_found_named_and_given_back(
+def test_lost_quality_is_named_with_the_command_that_finds_where(
     command: Command, cameras: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The camera projection in int8: depths of metres on a scale of pixels."""
@@ -95,30 +95,24 @@ def test_lost_quality_is_found_named_and_given_back(
 
     said = capsys.readouterr().out
     assert "below the floor (20 dB, 0.5 m of plan): bev" in said
-    assert f"lost at {GUILTY} (MatMul, module bev_encoder)" in said
-    (cameras / "more.toml").write_text(said[said.index("[[override]]") :])
+    assert "; lost in quantize-int8\n" in said
+    assert f"\n{ADVICE} measures which modules lose it\n" in said
 
+    how = ("--rules", "paper", "--map", "map.toml", "-o", "r.toml")
+    assert command("sensitivity", "in.onnx", "frames", *how) == 0
+    table = capsys.readouterr().out
+    (row,) = (line for line in table.splitlines() if line.startswith("bev_encoder"))
+    assert float(row.split()[-1]) < 20
+    override = '[[override]]\nmodule = "bev_encoder"\ndtype = "float"\n'
+    (cameras / "more.toml").write_text(override)
     assert command(*PAPER, "--overrides", "more.toml") == 0
     assert "below the floor" not in capsys.readouterr().out
 
 
-def test_the_search_says_what_it_takes_and_how_to_leave_it_out(
-    command: Command, cameras: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command(*PAPER) == 0
-    assert "to find the nodes to blame: --no-remedy)" in capsys.readouterr().out
-
-    assert command(*PAPER, "--no-remedy") == 0
-    said = capsys.readouterr().out
-    assert "below the floor (20 dB, 0.5 m of plan): bev" in said
-    assert "lost at" not in said
-    assert "--no-remedy" not in said
-
-
-def test_the_report_holds_the_measurement_and_the_remedy(
+def test_the_report_holds_the_measurement_and_the_command(
     cameras: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One calibration of the frames, however many variants are tried."""
+    """One calibration of the frames, and of those kept out no second."""
     options = me2e.CompressOptions(
         scheme="full", rules="paper", module_map="map.toml", verify_frames=0
     )
@@ -133,13 +127,12 @@ def test_the_report_holds_the_measurement_and_the_remedy(
 
     assert len(ran) == 1
     assert found.loss is not None
-    assert found.loss.remedy is not None
-    assert not found.loss.remedy.shortfalls
     assert [each.output for each in found.loss.shortfalls] == ["bev"]
     told = json.loads((cameras / "out.report.json").read_text())
     assert told["fidelity"]["on"] == "kept out of calibration"
     assert told["fidelity"]["fidelity"]["frames"] == 2
-    assert told["fidelity"]["remedy"]["nodes"][0]["name"] == GUILTY
+    assert told["fidelity"]["guilty"] == ["quantize-int8"]
+    assert told["fidelity"]["advice"] == ADVICE
     floor = {"sqnr_db": 20.0, "plan_m": 0.5, "alive": 0.01}
     assert told["fidelity"]["floor"] == floor
     assert told["verdict"] == [*found.lines()[:-2], *found.alerts()]
@@ -147,7 +140,7 @@ def test_the_report_holds_the_measurement_and_the_remedy(
     assert note.endswith("calibrated on 6 frames")
 
 
-def test_a_lower_floor_warns_of_nothing_and_searches_nothing(
+def test_a_lower_floor_warns_of_nothing(
     command: Command, cameras: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command(*PAPER, "--floor", 0) == 0

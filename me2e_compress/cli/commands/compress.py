@@ -24,9 +24,6 @@ Unproven = Annotated[
 ]
 Measure = Annotated[int, typer.Option(min=0, help="most frames kept to measure on")]
 Floor = Annotated[float, typer.Option(help="warn of an output below this SQNR, in dB")]
-NoRemedy = Annotated[
-    bool, typer.Option("--no-remedy", help="do not search the nodes below the floor")
-]
 AllowEmpty = Annotated[
     bool, typer.Option("--allow-empty", help="write it although nothing became int8")
 ]
@@ -55,7 +52,6 @@ def compress(
     measure_frames: Measure = 8,
     floor: Floor = SQNR_FLOOR_DB,
     alive: given.Alive = ALIVE,
-    no_remedy: NoRemedy = False,
     allow_empty: AllowEmpty = False,
     smaller: Smaller = False,
     set_dim: given.SetDim = None,
@@ -77,7 +73,6 @@ def compress(
         measure_frames=measure_frames, floor=floor, alive=alive, smaller=smaller,
         force=force, dims=sizes(set_dim or ()),
         adapter=adapter, unproven=unproven, allow_empty=allow_empty,
-        no_remedy=no_remedy,
         provider=provider_named(provider, plugins or ()),
     )  # fmt: skip
     with listening() as listener:

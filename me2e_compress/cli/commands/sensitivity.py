@@ -22,7 +22,7 @@ DriveLimit = Annotated[
     float | None, typer.Option(help="with --drive: most points of DS that may be lost")
 ]
 NodeTrials = Annotated[
-    int, typer.Option(min=0, help="most nodes of a module to try alone; 0: none")
+    int, typer.Option(min=0, help="most variants of the worst module's nodes; 0: none")
 ]
 
 
@@ -38,7 +38,7 @@ def sensitivity(
     drive_limit: DriveLimit = None,
     adapter: given.Adapter = None,
     workers: given.Workers = 1,
-    node_trials: NodeTrials = 4,
+    node_trials: NodeTrials = 16,
     ranges: given.SavedRanges = None,
     module_map: given.ModuleMap = None,
     set_dim: given.SetDim = None,
@@ -48,8 +48,9 @@ def sensitivity(
     plugins: given.Plugins = None,
     force: given.Force = False,
 ) -> None:
-    """Measure what int8 costs per module and node, and write a recipe within a limit.
+    """Measure what int8 costs module by module, and write a recipe within a limit.
 
+    Halves of the worst module's nodes are tried next, to find those to blame.
     The loss is how far the plan moves, metres, mean over the frames; of a model
     whose plan is not known, the noise of its worst output relative to the signal.
     With --drive every module, all together and the float model drive the routes

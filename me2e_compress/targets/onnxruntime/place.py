@@ -15,7 +15,6 @@ from me2e_compress.quantization.plan import Decision, KeptFloat, QuantPlan
 from me2e_compress.runtime.optimized import optimized, origins, with_unique_names
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets.base import (
-    Grids,
     LintFinding,
     LintRule,
     Target,
@@ -27,7 +26,7 @@ from me2e_compress.targets.onnxruntime.costs import costs_of
 from me2e_compress.targets.onnxruntime.kernels import objection
 from me2e_compress.targets.onnxruntime.lint_rules import RULES
 from me2e_compress.targets.onnxruntime.lower import Draft, lower
-from me2e_compress.targets.onnxruntime.region import Grid, Region, find_region
+from me2e_compress.targets.onnxruntime.region import Region, find_region
 from me2e_compress.targets.weights import weights_of
 
 
@@ -53,13 +52,6 @@ class OnnxRuntime(Target):
         reach = {name: max(-low, high) for name, (low, high) in ranges.tensors.items()}
         sampled = [each.output for each in _sampling(plan)]
         return lower(Draft(model.clone(), weights, reach, sampled))
-
-    def grids(self, plan: QuantPlan, model: ir.Model, ranges: Ranges) -> Grids:
-        """Return the grid of every tensor that is uint8."""
-        found = _region(plan, model).grids.items()
-        reach = {name: max(-low, high) for name, (low, high) in ranges.tensors.items()}
-        made = {v: Grid.of(origin, reach[str(origin.name)]) for v, origin in found}
-        return {str(v.name): (each.scale, each.zero) for v, each in made.items()}
 
     def kept_float(self, plan: QuantPlan, model: ir.Model) -> tuple[KeptFloat, ...]:
         """List the plan's nodes that :meth:`place` leaves in float, and why."""

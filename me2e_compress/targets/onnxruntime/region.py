@@ -10,7 +10,6 @@ import onnx_ir as ir
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.graph import is_standard, producer_of
 from me2e_compress.operators import int8_inputs
-from me2e_compress.targets.base import MIDDLE
 from me2e_compress.targets.onnxruntime.kernels import (
     JOINS,
     end_of,
@@ -21,6 +20,9 @@ from me2e_compress.targets.onnxruntime.kernels import (
     is_move,
     reads_one_pixel,
 )
+
+MIDDLE = 128
+"""The uint8 zero point of a signed tensor: int8 value plus 128."""
 
 _UNSIGNED = frozenset(
     {"Abs", "Exp", "HardSigmoid", "Sigmoid", "Softmax", "Softplus", "Sqrt"}
