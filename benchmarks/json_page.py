@@ -20,13 +20,13 @@ from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.first_difference import FirstDifference
 from me2e_compress.fidelity.open_loop import OpenLoop
 from me2e_compress.fidelity.output_liveness import Liveness
+from me2e_compress.fidelity.sensitivity import Candidate, Sensitivity
 from me2e_compress.manager import Step, Verification
 from me2e_compress.quantization.plan import Decision, QuantPlan
 from me2e_compress.registry.entries import Entry
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import TimeShare
-from me2e_compress.sensitivity import Candidate, Sensitivity
 from me2e_compress.study.on_road.halving import Rung
 from me2e_compress.targets.base import LintFinding
 from me2e_compress.workflows.check_model import ModelCheck

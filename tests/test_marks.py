@@ -14,12 +14,12 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.recording import write_recording
 from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
 from me2e_compress.calibration.statistics import Statistics
+from me2e_compress.fidelity.sensitivity.recipes import write_recipe
+from me2e_compress.fidelity.sensitivity.trials import Int8Choice
 from me2e_compress.registry.marks import BYTES, MARK, is_marked
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.recorded_future import RecordedFuture
-from me2e_compress.sensitivity.recipes import write_recipe
-from me2e_compress.sensitivity.trials import Int8Choice
 from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.workflows.latency_figure import draw_modules
 from me2e_compress.zoo.export import save as save_export

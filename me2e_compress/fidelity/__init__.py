@@ -1,1 +1,1 @@
-"""Two graphs on the same frames: signal to noise of every output, plans in metres."""
+"""How far a graph is from another, and which modules and nodes int8 hurts."""

@@ -12,13 +12,13 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import draw
 from me2e_compress.calibration.stack_frames import recording_of
 from me2e_compress.driving.adapter.stated import adapted
+from me2e_compress.fidelity.sensitivity import Drive, Int8Choice, Trials, write_recipe
 from me2e_compress.manager import recipe
 from me2e_compress.passes import Pass
 from me2e_compress.passes.fix_shapes import FixShapes, with_sizes
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS
 from me2e_compress.workflows.checks import (
     MOST_THREADS,

@@ -9,10 +9,10 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.errors import RecipeError
+from me2e_compress.fidelity.sensitivity import Budget, Candidate, Int8Choice, Trials
+from me2e_compress.fidelity.sensitivity import search as find
 from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session
-from me2e_compress.sensitivity import Budget, Candidate, Int8Choice, Trials
-from me2e_compress.sensitivity import search as find
 from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows.budgets import (
     Joules,

@@ -11,7 +11,7 @@ from me2e_compress import graph
 from me2e_compress.driving.policies import opened
 from me2e_compress.errors import EvaluationError, RecipeError
 from me2e_compress.extras import need_extra
-from me2e_compress.sensitivity import (
+from me2e_compress.fidelity.sensitivity import (
     Drive,
     Int8Choice,
     Score,

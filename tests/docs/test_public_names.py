@@ -36,7 +36,7 @@ ROOMS = (
     "me2e_compress.manager.recipe",
     "me2e_compress.registry",
     "me2e_compress.graph.rewrite",
-    "me2e_compress.sensitivity",
+    "me2e_compress.fidelity.sensitivity",
     "me2e_compress.study",
     "me2e_compress.targets",
     "me2e_compress.testing",

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from me2e_compress.display import significant
 from me2e_compress.errors import RecipeError
+from me2e_compress.fidelity.sensitivity.search import nothing_fits
 from me2e_compress.quantization.rules import DEFAULT_RULES
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.sensitivity.search import nothing_fits
 from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows.budgets import Joules, check_budgets
 from me2e_compress.workflows.checks import MOST_THREADS, check_count

@@ -7,11 +7,7 @@ import pytest
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.compare import Displacement, Fidelity
-from me2e_compress.manager import recipe
-from me2e_compress.passes import Context
-from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.sensitivity import (
+from me2e_compress.fidelity.sensitivity import (
     Drive,
     Int8Choice,
     Score,
@@ -20,10 +16,14 @@ from me2e_compress.sensitivity import (
     analyse,
     write_recipe,
 )
-from me2e_compress.sensitivity.analysis import names_of
+from me2e_compress.fidelity.sensitivity.analysis import names_of
+from me2e_compress.manager import recipe
+from me2e_compress.passes import Context
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.targets import TARGETS
+from tests.fidelity.sensitivity.delicate import delicate, trials
 from tests.nets import MODULES
-from tests.sensitivity.delicate import delicate, trials
 
 
 @pytest.mark.parametrize("bad", [2, 3, 5])

@@ -7,10 +7,10 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.fidelity.sensitivity import Trials
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.sensitivity import Trials
 from me2e_compress.targets import TARGETS
 from tests.frames import record
 from tests.nets import MODULES, net

@@ -7,10 +7,10 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import EvaluationError
-from me2e_compress.sensitivity import Budget, Candidate, Int8Choice, search
-from me2e_compress.sensitivity.search import nothing_fits
+from me2e_compress.fidelity.sensitivity import Budget, Candidate, Int8Choice, search
+from me2e_compress.fidelity.sensitivity.search import nothing_fits
 from me2e_compress.workflows.search import SearchResult
-from tests.sensitivity.delicate import trials
+from tests.fidelity.sensitivity.delicate import trials
 
 
 def weight_bytes(made: ir.Model) -> float:

@@ -3,8 +3,8 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
+from me2e_compress.fidelity.sensitivity.trials import Int8Choice, Score, Trials
 from me2e_compress.quantization.plan import RESIDUAL
-from me2e_compress.sensitivity.trials import Int8Choice, Score, Trials
 
 BLAME = 0.5
 """Nodes are to blame if they alone cost this part of what their module costs."""

@@ -5,12 +5,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.fidelity.sensitivity.analysis import Sensitivity
+from me2e_compress.fidelity.sensitivity.trials import Int8Choice, Trials
 from me2e_compress.quantization.plan.overrides import overrides_text
 from me2e_compress.registry import drafts, marks
 from me2e_compress.registry.documents import toml_string
 from me2e_compress.runtime.atomic import write_bytes
-from me2e_compress.sensitivity.analysis import Sensitivity
-from me2e_compress.sensitivity.trials import Int8Choice, Trials
 
 
 def advise(
