@@ -19,21 +19,12 @@ from me2e_compress.fidelity.sensitivity.trials import Int8Choice
 from me2e_compress.registry.marks import BYTES, MARK, is_marked
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.recorded_future import RecordedFuture
 from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.workflows.latency_figure import draw_modules
 from me2e_compress.zoo.export import save as save_export
 from tests.graph.test_files import weighted
 from tests.workflows.test_latency_figure import trace_of
 
-FUTURE = RecordedFuture(
-    waypoints=((0.0, 1.0),) * 6,
-    forward=0.0,
-    ego=(4.0, 2.0),
-    centre=(0.0, 0.0),
-    agents=None,
-    command=0,
-)
 SEEN = Statistics("m", "s", ("t",), (0,), np.zeros((1, 1, 3), np.float32))
 
 
@@ -48,7 +39,7 @@ def export(path: Path) -> None:
 
 
 def record(folder: Path) -> None:
-    frame = Frame(0, True, {"camera": np.zeros((1, 4), np.float32)}, future=FUTURE)
+    frame = Frame(0, True, {"camera": np.zeros((1, 4), np.float32)})
     write_recording(folder, lambda _: [frame], {})
 
 
@@ -84,7 +75,7 @@ def test_all_that_is_written_says_so(tmp_path: Path, name: str) -> None:
 def test_what_says_so_is_read_as_before(tmp_path: Path) -> None:
     record(tmp_path / "frames")
     (frame,) = CalibrationSet(tmp_path / "frames")
-    assert frame.future == FUTURE
+    assert list(frame.arrays) == ["camera"]
     save_routes(load_routes(), tmp_path / "routes.json")
     assert load_routes(tmp_path / "routes.json") == load_routes()
     graph.save(weighted(), tmp_path / "m.onnx")

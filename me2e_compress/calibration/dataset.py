@@ -3,7 +3,6 @@
 A recording is a folder with one ``.npz`` a frame, keyed by input name and ordered by
 file name, and ``scenes.json``: ``{"scenes": [0, 64, ...]}``, the index of the first
 frame of every scene, and which inputs are pixels (`me2e_compress.calibration.pixels`).
-A frame may have a ``.future.json`` beside it: what really happened next.
 """
 
 import hashlib
@@ -23,12 +22,8 @@ from me2e_compress.display import Displayed, Table, counted, reason, table
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.recurrence import not_fed_back, recurrent_inputs, sides
-from me2e_compress.registry import documents, marks
+from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.recorded_future import RecordedFuture
-
-FUTURE = ".future.json"
-"""Suffix of the file beside a frame that holds its `RecordedFuture`."""
 
 T = TypeVar("T", Array, Declared)
 
@@ -88,7 +83,7 @@ class CalibrationSet(Displayed):
         """Read one frame and normalise its pixels."""
         path = self.files[index]
         arrays = self._as_fed(path, load_arrays(path), PixelInput.normalised)
-        return Frame(index, index in self.scenes, arrays, future=_future(path))
+        return Frame(index, index in self.scenes, arrays)
 
     def _as_fed(
         self, path: Path, held: Mapping[str, T], turn: Callable[[PixelInput, T], T]
@@ -232,18 +227,6 @@ def _draw(value: ir.Value, generator: np.random.Generator) -> Array:
     if dtype.kind == "f":
         return np.asarray(generator.standard_normal(shape)).astype(dtype)
     return np.asarray(generator.integers(0, 2, shape)).astype(dtype)
-
-
-def _future(frame: Path) -> RecordedFuture | None:
-    """Read the recorded future of a frame; None where there is none."""
-    path = frame.with_suffix(FUTURE)
-    if not path.is_file():
-        return None
-    with documents.reading(path, FramesError, "not a recorded future"):
-        found = documents.from_json(documents.content(path))
-        if isinstance(found, dict) and found.get("generator") == marks.MARK:
-            del found["generator"]
-        return RecordedFuture.model_validate(found)
 
 
 def _index(path: Path) -> dict[str, Any]:

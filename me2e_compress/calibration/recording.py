@@ -10,7 +10,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from me2e_compress.calibration.dataset import FUTURE
 from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import documents, drafts, marks
@@ -48,12 +47,11 @@ def write_recording(
 ) -> Path:
     """Write a folder that `CalibrationSet` reads, atomically.
 
-    It has one ``000000.npz`` a frame, keyed by input name, ``000000.future.json`` where
-    the future is known, and ``scenes.json`` with the starts of scenes and with
-    ``about``. An earlier recording in the folder is replaced. The same frames give the
-    same bytes. Complete scenes of a killed run are kept in a separate folder beside it,
-    and a run with the same ``about`` and ``key`` resumes from them. ``pixels`` has the
-    inputs that the source yields as bytes, by name.
+    It has one ``000000.npz`` a frame, keyed by input name, and ``scenes.json`` with the
+    starts of scenes and with ``about``. An earlier recording in the folder is replaced.
+    The same frames give the same bytes. Complete scenes of a killed run are kept in a
+    separate folder beside it, and a run with the same ``about`` and ``key`` resumes
+    from them. ``pixels`` has the inputs that the source yields as bytes, by name.
 
     Raises:
         FramesError: there are no frames, or a folder holds something else.
@@ -138,9 +136,6 @@ class _Draft:
         path = self._frame(self.count)
         with drafts.naming(path):
             _write_npz(path, frame.arrays)
-            if frame.future is not None:
-                future = marks.IN_JSON | frame.future.model_dump(mode="json")
-                path.with_suffix(FUTURE).write_text(f"{json.dumps(future)}\n")
         self.count += 1
 
     def finish(self) -> None:
@@ -172,7 +167,7 @@ def _check_replaceable(folder: Path, mark: str = INDEX) -> None:
         raise FramesError(f"{folder} is not empty, and no recording: it has {names[0]}")
     # Everything inside must have been written by us.
     for name in names:
-        number = name.removesuffix(FUTURE).removesuffix(".npz")
+        number = name.removesuffix(".npz")
         ours = name in (INDEX, PROGRESS) or name.startswith(f".{PROGRESS}.")
         if not ours and not (number != name and number.isdigit()):
             raise FramesError(f"{folder} holds frames but also {name}: not replaced")

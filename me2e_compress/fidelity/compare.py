@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.fidelity.matched_sets import SetFidelity, SetOutputs, SetTally
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
@@ -66,7 +65,6 @@ class Fidelity:
         plan: displacement of the plan; None if it was not measured, for `plan_reason`.
         frames: how many were compared.
         plan_output: the output that holds the plan; empty if it was not measured.
-        agents: sets of agents, matched; None if there are none.
         same_choice: share of frames with the same candidate; None if no scores choose
             the plan.
     """
@@ -77,7 +75,6 @@ class Fidelity:
     plan_reason: str
     frames: int
     plan_output: str = ""
-    agents: SetFidelity | None = None
     same_choice: float | None = None
 
 
@@ -142,11 +139,9 @@ def _compare(
         raise EvaluationError(
             f"no output in common: {', '.join(a.outputs)} and {', '.join(b.outputs)}"
         )
-    # what can be compared: single outputs, the plan, sets of agents
+    # what can be compared: single outputs, and the plan
     tallies = {name: Tally(name) for name in shared}
     adapter, reason = common_adapter(a, b)
-    named = SetOutputs.of(a.metadata, {name: a.outputs[name].shape for name in shared})
-    sets = None if named is None else SetTally(named)
     moved, chosen = list[Float64](), list[bool]()
     count = 0
     # frame by frame, with one frame in memory
@@ -163,8 +158,6 @@ def _compare(
                 chosen.append(adapter.choice(left) == adapter.choice(right))
         if watch is not None:
             watch(left, right, frame)
-        if sets is not None:
-            sets.add(left, right)
         count += 1
     if not count:
         raise EvaluationError("no frames to compare on")
@@ -175,7 +168,6 @@ def _compare(
         reason,
         count,
         adapter.output if adapter is not None and moved else "",
-        None if sets is None else sets.result(),
         float(np.mean(chosen)) if chosen else None,
     )
 
@@ -226,7 +218,7 @@ class Tally:
         # sums for the SQNR, largest values for the error
         gap = np.abs(x - y)
         signal, noise = float(np.vdot(x, x)), float(np.vdot(gap, gap))
-        self.frames_db.append(_decibels(signal, noise))
+        self.frames_db.append(decibels(signal, noise))
         self.signal += signal
         self.noise += noise
         self.reach = max(self.reach, float(np.abs(x).max()))
@@ -235,7 +227,7 @@ class Tally:
     def result(self) -> OutputFidelity:
         """Return the output's fidelity over the frames so far."""
         error = self.gap / self.reach if self.reach else math.inf if self.gap else 0.0
-        sqnr, apart = _decibels(self.signal, self.noise), len(self.frames_db) > 1
+        sqnr, apart = decibels(self.signal, self.noise), len(self.frames_db) > 1
         least, most = (
             min(self.frames_db, default=sqnr),
             max(self.frames_db, default=sqnr),
@@ -253,7 +245,8 @@ class Tally:
         return wide
 
 
-def _decibels(signal: float, noise: float) -> float:
+def decibels(signal: float, noise: float) -> float:
+    """Return the ratio of two powers in dB; infinite without noise."""
     if noise == 0:
         return math.inf
     return 10 * math.log10(signal / noise) if signal else -math.inf

@@ -7,8 +7,6 @@ from typing import Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.runtime.recorded_future import RecordedFuture
-
 Array: TypeAlias = npt.NDArray[np.generic]
 
 
@@ -22,14 +20,12 @@ class Frame:
         arrays: one array for every input, by input name; recurrent ones may be missing.
         place: number of its scene among those that its source tried; some give no
             frame.
-        future: what really happened next; None where it was not recorded.
     """
 
     index: int
     starts_scene: bool
     arrays: dict[str, Array]
     place: int = 0
-    future: RecordedFuture | None = None
 
     def __repr__(self) -> str:
         """Show the index and the shapes, not the arrays."""

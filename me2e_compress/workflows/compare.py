@@ -13,11 +13,11 @@ from me2e_compress.fidelity.compare import Fidelity, common_adapter
 from me2e_compress.fidelity.compare import compare as measure
 from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.fidelity.liveness import LivenessTally
-from me2e_compress.fidelity.matched_sets import SetFidelity
-from me2e_compress.fidelity.open_loop import OpenLoop, OpenLoopTally
+from me2e_compress.fidelity.matched_sets import SetFidelity, SetOutputs, SetTally
 from me2e_compress.fidelity.output_liveness import Liveness
 from me2e_compress.graph import LoadedModel, provenance
 from me2e_compress.passes.ablate_modules import AblateModules
+from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack_session import open_session
@@ -37,17 +37,16 @@ from me2e_compress.workflows.runtime_loss import (
 class CompareResult(Result):
     """How close a graph stays to another.
 
-    `open_loop` holds both plans against the recorded future; where that is None, not
-    measured, `open_loop_reason` says why. `liveness` is None if it was not asked for;
-    `runtime`, what onnxruntime's int8 answers otherwise, if there is none to ask.
+    `agents` is None unless the metadata ``me2e.sets`` names outputs that both graphs
+    have. `liveness` is None if it was not asked for; `runtime`, what onnxruntime's
+    int8 answers otherwise, if there is none to ask.
     `slow_here` tells by file name of int8 whose form is slow on this CPU.
     """
 
     reference: Path
     candidate: Path
     fidelity: Fidelity
-    open_loop: OpenLoop | None = None
-    open_loop_reason: str = ""
+    agents: SetFidelity | None = None
     liveness: Liveness | None = None
     runtime: RuntimeLoss | None = None
     slow_here: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -88,7 +87,7 @@ class CompareResult(Result):
         return f"{said}; the same candidate on {found.same_choice:.1%} of them"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return outputs, how they answer, agents, and plans against the future."""
+        """Return outputs, how they answer, and agents."""
         found = self.fidelity
         rows = [
             *((o.name, f"{o.sqnr_db:.1f}", f"{o.error:.1e}") for o in found.outputs),
@@ -96,25 +95,23 @@ class CompareResult(Result):
         ]
         title = f"Fidelity over {counted(found.frames, 'frame')}"
         outputs = table(title, ("output", "SQNR dB", "max|a-b|/max|a|"), rows)
-        agents = () if found.agents is None else (_agents(found.agents),)
-        driven = () if self.open_loop is None else (self.open_loop.table(),)
+        agents = () if self.agents is None else (_agents(self.agents),)
         alive = self.liveness is not None and self.liveness.outputs
         lively = (self.liveness.table(),) if self.liveness and alive else ()
-        return (outputs, *lively, *agents, *driven)
+        return (outputs, *lively, *agents)
 
     def records(self) -> list[dict[str, object]]:
         """Return one row per output."""
         return [dataclasses.asdict(each) for each in self.fidelity.outputs]
 
     def to_json(self) -> object:
-        """Return the fidelity, liveness, and both plans against the recorded future."""
+        """Return the fidelity, agents, and liveness."""
         alive = None if self.liveness is None else dataclasses.asdict(self.liveness)
-        driven = None if self.open_loop is None else dataclasses.asdict(self.open_loop)
+        agents = None if self.agents is None else dataclasses.asdict(self.agents)
         runtime = None if self.runtime is None else dataclasses.asdict(self.runtime)
         return {
             **dataclasses.asdict(self.fidelity),
-            "open_loop": driven,
-            "open_loop_reason": self.open_loop_reason,
+            "agents": agents,
             "liveness": alive,
             "runtime": runtime,
             "slow_here": self.slow_here,
@@ -129,17 +126,22 @@ def _is_ablated(model: ir.Model) -> bool:
 def _agents(found: SetFidelity) -> Table:
     rows = [(name, f"{decibels:.1f}") for name, decibels in found.sqnr_db.items()]
     agents = counted(found.agents, "agent")
-    away = (
-        "" if found.centre_m is None else f", {found.centre_m:.2f} m apart on average"
-    )
     return table(
         "Agents with a score of 0.5 or more, each against the nearest",
         ("output", "SQNR dB"),
         rows,
         f"The first graph scores {agents} at 0.5 or more. The second has an agent "
-        f"within 2 m of {found.found} of them{away}, scores {found.kept} of those at "
-        f"0.5 or more, and {found.added} where the first has none.",
+        f"within 2 m of {found.matched} of them.",
     )
+
+
+def _set_tally(left: AnySession, right: AnySession) -> SetTally | None:
+    """Return what matches agents; None where no set is named, or one graph lacks it."""
+    shapes = {name: port.shape for name, port in left.outputs.items()}
+    outputs = SetOutputs.of(left.metadata, shapes)
+    if outputs is None or not set(outputs.names) <= set(right.outputs):
+        return None
+    return SetTally(outputs)
 
 
 def compare(
@@ -157,8 +159,8 @@ def compare(
     """Run two graphs over frames: SQNR of every output, plan displacement in metres.
 
     Each graph is an ONNX file, the TOML of a stack, or the name of a model that ships.
-    Where the frames tell what was really driven, L2 and collisions of both plans are
-    measured too. `as_it_stands` runs the first graph without onnxruntime's
+    Outputs that the metadata ``me2e.sets`` of the first names are matched agent by
+    agent. `as_it_stands` runs the first graph without onnxruntime's
     optimizations and the second with all of them: comparing a graph with itself shows
     what they change. An output is dead that moves less than a share `alive` of the
     first graph's, between frames or when one input is exchanged; 0 does not ask, which
@@ -203,11 +205,10 @@ def compare(
         said=said[paths[1]],
     )  # fmt: skip
     try:
-        read, reason = common_adapter(left, right)
+        common_adapter(left, right)
+        sets = _set_tally(left, right)
     except GraphError as error:
         raise GraphError(f"{paths[0]}: {error}") from error
-    # plans are judged against the recorded future where one is known
-    tally = None if read is None else OpenLoopTally(read)
     lively = LivenessTally(left, right) if alive else None
     # what onnxruntime's int8 answers, beside the nodes as they stand
     kernels = None
@@ -216,14 +217,15 @@ def compare(
             paths[1], stock=True, release=True, provider=provider, said=said[paths[1]]
         )
         kernels = RuntimeTally(third, recording)
-    watching = [each.add for each in (tally, lively, kernels) if each is not None]
+    watching = [each.add for each in (sets, lively, kernels) if each is not None]
 
     def watch(a: dict[str, Array], b: dict[str, Array], frame: Frame) -> None:
         for add in watching:
             add(a, b, frame)
 
     fidelity = measure(left, right, map(reported, recording), watch)
-    found = CompareResult(*paths, fidelity, slow_here=slow)
+    agents = None if sets is None else sets.result()
+    found = CompareResult(*paths, fidelity, agents, slow_here=slow)
     if kernels is not None:
         runtime = kernels.result(models[-1], fidelity)
         found = dataclasses.replace(found, runtime=runtime)
@@ -231,7 +233,4 @@ def compare(
         model = models[-1]
         told = lively.result(alive, model, ablated=_is_ablated(model))
         found = dataclasses.replace(found, liveness=told)
-    driven = reason if tally is None else OpenLoop.of(tally)
-    if isinstance(driven, str):
-        return dataclasses.replace(found, open_loop_reason=driven)
-    return dataclasses.replace(found, open_loop=driven)
+    return found

@@ -1,27 +1,30 @@
-"""Agents in another order are the same agents; others are lost, or new."""
+"""Agents in another order are the same agents."""
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import onnx_ir as ir
 import pytest
 
+from me2e_compress.calibration.recording import write_recording
 from me2e_compress.errors import GraphError
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.fidelity.matched_sets import SetFidelity, SetOutputs, SetTally
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
+from me2e_compress.workflows.compare import compare as compare_files
+from tests.nets import save_text
 
 Frames = dict[str, np.ndarray]
 
 BOXES = np.array([[10.0, 0, 4, 2], [20, 3, 4, 2], [5, -4, 4, 2], [90, 9, 4, 2]])
 SCORES = np.array([0.9, 0.8, 0.7, 0.1])
-SHAPES = {"boxes": (1, 4, 4), "scores": (1, 4), "futures": (1, 4, 3, 6, 2)}
+OUTPUTS = SetOutputs(boxes="boxes", scores="scores")
 
 SWAPPED = """
-<ir_version: 9, opset_import: ["" : 17]>
 tracker (float[1,2,3] x, float[1,2] s) => (float[1,2,3] boxes, float[1,2] scores)
 <int64[2] order = {%s}> {
     boxes = Gather <axis = 1> (x, order)
@@ -44,8 +47,8 @@ def outputs(boxes: np.ndarray, scores: np.ndarray) -> Frames:
 
 
 def matched(left: Frames, right: Frames) -> SetFidelity:
-    tally = SetTally(SetOutputs(others=()))
-    tally.add(left, right)
+    tally = SetTally(OUTPUTS)
+    tally.add(left, right, Frame(0, True, {}))
     return tally.result()
 
 
@@ -53,8 +56,7 @@ def matched(left: Frames, right: Frames) -> SetFidelity:
 def test_the_order_does_not_matter(order: list[int]) -> None:
     found = matched(outputs(BOXES, SCORES), outputs(BOXES[order], SCORES[order]))
 
-    assert (found.agents, found.found, found.kept, found.added) == (3, 3, 3, 0)
-    assert found.centre_m == 0.0
+    assert (found.agents, found.matched) == (3, 3)
     assert found.sqnr_db == {"boxes": math.inf, "scores": math.inf}
 
 
@@ -64,77 +66,72 @@ def test_an_agent_that_moved_a_metre() -> None:
 
     found = matched(outputs(BOXES, SCORES), outputs(moved[::-1], SCORES[::-1]))
 
-    assert found.centre_m == pytest.approx(1 / 3)
     signal = float((BOXES[:3] ** 2).sum())
     assert found.sqnr_db["boxes"] == pytest.approx(10 * math.log10(signal))
 
 
-def test_agents_that_are_lost_doubted_or_new() -> None:
+def test_an_agent_that_is_lost_has_no_match() -> None:
     other = BOXES.copy()
-    other[0, 0] = 40.0  # the first went, and stands where nobody was
-    scores = np.array([0.9, 0.4, 0.7, 0.1])  # the second is doubted
+    other[0, 0] = 40.0
 
-    found = matched(outputs(BOXES, SCORES), outputs(other, scores))
+    found = matched(outputs(BOXES, SCORES), outputs(other, SCORES))
 
-    assert (found.agents, found.found, found.kept, found.added) == (3, 2, 1, 1)
+    assert (found.agents, found.matched) == (3, 2)
 
 
 def test_nobody_is_sure_of_anybody() -> None:
     found = matched(outputs(BOXES, SCORES / 10), outputs(BOXES, SCORES / 10))
 
-    assert found == SetFidelity(0, 0, 0, 0, None, {})
-
-
-def test_a_detector_that_sorts_otherwise_is_the_same() -> None:
-    frame = Frame(
-        0,
-        starts_scene=True,
-        arrays={
-            "x": np.array([[[1, 2, 3], [9, 8, 7]]], np.float32),
-            "s": np.array([[0.9, 0.8]], np.float32),
-        },
-    )
-    one, other = (Session(ir.from_onnx_text(SWAPPED % o)) for o in ("0, 1", "1, 0"))
-
-    found = compare(one, other, [frame])
-
-    assert found.outputs[0].sqnr_db < 6.0
-    assert found.agents is not None
-    assert found.agents.sqnr_db["boxes"] == math.inf
+    assert found == SetFidelity(0, 0, {})
 
 
 def test_the_outputs_are_named_in_the_metadata() -> None:
-    named = json.dumps({"boxes": "tracks", "scores": "sure", "others": []})
+    named = json.dumps({"boxes": "tracks", "scores": "sure"})
     shapes = {"tracks": (1, 9, 7), "sure": (1, 9)}
 
     found = SetOutputs.of({"me2e.sets": named}, shapes)
 
-    assert found == SetOutputs(boxes="tracks", scores="sure", others=())
+    assert found == SetOutputs(boxes="tracks", scores="sure")
+    assert SetOutputs.of({}, {"boxes": (1, 9, 7), "scores": (1, 9)}) is None
 
 
 @pytest.mark.parametrize(
-    "shapes",
+    ("named", "message"),
     [
-        {"boxes": (1, 4, 4)},
-        {"boxes": (1, 4, 4), "scores": (1, 5)},
-        {"boxes": (4, 4), "scores": (4,)},
+        ({"box": "boxes"}, r"me2e\.sets names no outputs"),
+        ({"boxes": "boxes", "scores": "votes"}, "votes has no row for every agent"),
+        ({"boxes": "boxes", "scores": "few"}, "few has no row for every agent"),
     ],
 )
-def test_outputs_of_another_form_are_no_set(shapes: dict[str, tuple[int, ...]]) -> None:
-    assert SetOutputs.of({}, shapes) is None
+def test_metadata_that_is_no_set_is_named(named: dict[str, str], message: str) -> None:
+    shapes = {"boxes": (1, 4, 4), "few": (1, 3)}
+    with pytest.raises(GraphError, match=message):
+        SetOutputs.of({"me2e.sets": json.dumps(named)}, shapes)
 
 
-def test_only_outputs_with_a_row_an_agent_belong_to_it() -> None:
-    found = SetOutputs.of({}, SHAPES)
-    assert found == SetOutputs()
+@pytest.mark.parametrize("has_scores", [True, False])
+def test_compare_matches_what_both_graphs_have(
+    tmp_path: Path, has_scores: bool
+) -> None:
+    sets = json.dumps({"boxes": "boxes", "scores": "scores"})
+    save_text(tmp_path / "one.onnx", SWAPPED % "0, 1", **{"me2e.sets": sets})
+    other = SWAPPED if has_scores else SWAPPED.replace("scores", "votes")
+    save_text(tmp_path / "other.onnx", other % "1, 0")
+    arrays = {
+        "x": np.array([[[1, 2, 3], [9, 8, 7]]], np.float32),
+        "s": np.array([[0.9, 0.8]], np.float32),
+    }
+    write_recording(tmp_path / "frames", lambda _: [Frame(0, True, arrays)], {})
 
-    found = SetOutputs.of({}, {**SHAPES, "futures": (1, 9, 3)})
-    assert found == SetOutputs(others=())
+    files = (tmp_path / name for name in ("one.onnx", "other.onnx", "frames"))
+    found = compare_files(*files, alive=0.0)
 
-
-def test_metadata_that_is_no_set_is_named() -> None:
-    with pytest.raises(GraphError, match=r"me2e\.sets names no outputs"):
-        SetOutputs.of({"me2e.sets": '{"box": 1}'}, SHAPES)
+    assert found.fidelity.outputs[0].sqnr_db < 6.0
+    if has_scores:
+        assert found.agents is not None
+        assert found.agents.sqnr_db["boxes"] == math.inf
+    else:
+        assert found.agents is None
 
 
 def chooser(bias: float) -> Session:
