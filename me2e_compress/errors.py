@@ -28,6 +28,8 @@ FORMER = {
     "quantize-int8 weight_only_gemv": f"weight_only_gemv {_NOW} without=[gemv]",
     "--weight-only-gemv": f"--weight-only-gemv {_NOW} --rules 'safe{{without=[gemv]}}'",
     "--no-remedy": "--no-remedy is gone since 0.3.0: compress searches no nodes",
+    "driving log nuscenes": f"nuscenes {_NOW} examples/driving_logs",
+    "driving log bench2drive": f"bench2drive {_NOW} examples/driving_logs",
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""
 

@@ -8,7 +8,6 @@ from me2e_compress.errors import BrokenPackageError, MissingExtraError
 MODULES = {
     "highway": ("highway_env", "gymnasium", "cv2", "jinja2", "matplotlib"),
     "fast": ("numba", "llvmlite"),
-    "logs": ("cv2",),
     "ray": ("ray",),
     "zoo": ("torch", "onnxscript", "safetensors"),
     "bench": ("onnxslim",),

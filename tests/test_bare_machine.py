@@ -32,9 +32,7 @@ TORCH = (
     "zoo.drawing",
     "zoo.resnet",
 )
-PICTURES = (
-    "evaluators.carla.observer",
-    "evaluators.carla.graph_agent",
+WORLD = (
     "evaluators.highway.blind",
     "evaluators.highway.driven_frames",
     "evaluators.highway.expert",
@@ -45,9 +43,6 @@ PICTURES = (
     "simulator.cameras",
     "simulator.pictures",
     "study",
-)
-WORLD = (
-    *PICTURES,
     "evaluators.highway.controller",
     "evaluators.highway.episode_recorder",
     "simulator.privileged",
@@ -77,7 +72,6 @@ KERNELS = (
 )
 ROOMS: Mapping[str, tuple[str, ...]] = {
     "highway": WORLD,
-    "logs": PICTURES,
     "zoo": TORCH,
     "fast": KERNELS,
     "trt-check": ("targets.tensorrt.rtx.rtx_main",),
@@ -205,7 +199,7 @@ def test_a_public_name_without_its_extra_says_what_to_install(
 ) -> None:
     lacking = without[case]["names"]
     assert all(each.startswith("MissingExtraError: ") for each in lacking.values())
-    assert bool(lacking) == (case in ("highway", "logs", ALL))
+    assert bool(lacking) == (case in ("highway", ALL))
 
 
 def test_modules_of_extras_are_what_the_project_says() -> None:

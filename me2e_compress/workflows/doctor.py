@@ -21,18 +21,9 @@ from me2e_compress.workflows.result import Result, Table, table
 _EXTRAS = (
     ("torch", "zoo", "export the reference stacks, train the driver"),
     ("highway_env", "highway", "drive models in closed loop"),
-    ("cv2", "logs", "make frames of recorded driving (frames --from)"),
     ("tensorrt_rtx", "trt-check", "parse and build for TensorRT without a GPU"),
     ("onnxslim", "bench", "compare with onnxslim in the benchmarks"),
 )
-
-_OPENCV = (
-    "opencv-python-headless",
-    "opencv-python",
-    "opencv-contrib-python-headless",
-    "opencv-contrib-python",
-)
-"""Packages that each provide cv2."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,9 +89,8 @@ def _packages() -> list[Checkup]:
 
 
 def _version(module: str) -> str:
-    for package in _OPENCV if module == "cv2" else (module.replace("_", "-"),):
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            return importlib.metadata.version(package)
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(module.replace("_", "-"))
     return "of unknown version"
 
 

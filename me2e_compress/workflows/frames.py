@@ -1,11 +1,11 @@
 """Make calibration frames that are coherent in time."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
-from me2e_compress.calibration.logs import LOGS, DriveLog
-from me2e_compress.calibration.logs.log_frames import LoggedInputs
+from me2e_compress.calibration.logs import LOGS, DriveLog, LogRequest
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.calibration.recording import (
     Begin,
@@ -23,12 +23,10 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.simulator.routes import check_road
 from me2e_compress.version import __version__
-from me2e_compress.workflows.adapted_log import AdaptedInputs
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.logged_inputs import inputs_of_model, inputs_of_stack
 from me2e_compress.workflows.result import Result, counted
 from me2e_compress.zoo.stacks import STACKS, find
 from me2e_compress.zoo.synthetic_frames import frames as synthetic
@@ -119,8 +117,9 @@ def record_frames(
 
     For stacks of the zoo a synthetic world is drawn. For a driver that ships, or any
     ONNX file that keeps the policy contract, the expert drives fresh routes of
-    highway-env. With a log, recorded driving is laid out as either takes it. A run that
-    was killed goes on after its last whole scene. The folder is returned.
+    highway-env. With a log, recorded driving is laid out as the driver or file takes
+    it. A run that was killed goes on after its last whole scene. The folder is
+    returned.
 
     Raises:
         GraphError: The stack or file is missing or altered, or the folder is the input.
@@ -129,7 +128,7 @@ def record_frames(
         EvaluationError: The file does not keep the policy contract, the adapter
             adapts nothing, or there is no such road.
         ProviderError: The provider is not available.
-        MissingExtraError: Driving needs the extra ``highway``, a log ``logs``.
+        MissingExtraError: Driving needs the extra ``highway``.
     """
     options, folder = options or FramesOptions(), Path(folder)
     if not folder.name:
@@ -142,7 +141,7 @@ def record_frames(
 def _recorded(
     source: str | Path, folder: Path, options: FramesOptions, listener: Listener
 ) -> Path:
-    pixels = dict[str, PixelInput]()
+    pixels: Mapping[str, PixelInput] = {}
     about: dict[str, str | int] = {"stack": str(source), "seed": options.seed}
     if options.road is not None and (options.log or not _drives(source, options)):
         raise FramesError(f"--road {options.road}: nobody drives for these frames")
@@ -173,32 +172,19 @@ def _recorded(
 
 def _logged(
     source: str | Path, log: DriveLog, options: FramesOptions
-) -> tuple[Source, str, dict[str, PixelInput]]:
-    need_extra("logs", "reading pictures of a log")
-    from me2e_compress.calibration.logs.log_frames import log_frames
-
-    model: LoggedInputs | AdaptedInputs
-    # the model's inputs follow from its adapter, its metadata or the zoo
-    if options.adapter is not None and _drives(source, options):
-        path = model_path(source)
-        model, of = AdaptedInputs(_policy(path, options)), sha256_of(path)
-        log = model.log_for(log)
-    elif Path(source).is_file():
-        model, of = (
-            inputs_of_model(Path(source), log.size),
-            sha256_of(Path(source)),
-        )
-    else:
-        model, of = inputs_of_stack(find(str(source))), str(source)
-    count, length = options.count, options.scene_length
-
-    def make(begin: Begin) -> Iterator[Frame]:
-        return log_frames(
-            log, model, count, length, done=begin.frame, first=begin.place
-        )
-
-    image = model.image if isinstance(model, LoggedInputs) else None
-    return make, of, {} if image is None else {"img": image}
+) -> tuple[Source, str, Mapping[str, PixelInput]]:
+    request = LogRequest(
+        model_path(source),
+        options.count,
+        options.scene_length,
+        None if options.adapter is None else adapter_file(options.adapter),
+        options.provider,
+    )
+    return (
+        partial(log.frames, request),
+        sha256_of(request.model),
+        log.pixels(request),
+    )
 
 
 def _drives(source: str | Path, options: FramesOptions) -> bool:

@@ -20,7 +20,7 @@ Length = Annotated[
 ]
 Log = Annotated[
     str | None,
-    typer.Option("--from", help="recorded driving: nuscenes:ROOT, bench2drive:ROOT"),
+    typer.Option("--from", help="recorded driving, read by another package: LOG:ROOT"),
 ]
 
 
@@ -47,8 +47,8 @@ def frames(
 
     A synthetic world is drawn for stacks of the zoo; for a driver that ships, or any
     ONNX file or stack of files (STACK.toml) that keeps the policy contract (--adapter),
-    the expert drives fresh routes of a --road. With --from, recorded driving of
-    nuScenes or Bench2Drive is laid out as either takes it.
+    the expert drives fresh routes of a --road. With --from, recorded driving is laid
+    out as the file takes it (docs/writing-logs.md).
     """
     options = workflow.FramesOptions(
         count,

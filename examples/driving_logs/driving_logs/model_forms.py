@@ -1,41 +1,24 @@
-"""How a stack of the zoo, or an ONNX file, is fed from recorded driving."""
+"""How an ONNX file is fed from recorded driving."""
 
 from pathlib import Path
 
-import numpy as np
 import onnx_ir as ir
 
+from driving_logs.model_inputs import InputForm, LoggedInputs
 from me2e_compress import graph
-from me2e_compress.calibration.logs.log_frames import InputForm, LoggedInputs
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.driving.adapter import ImageNormalization
 from me2e_compress.driving.adapter.image_inputs import Triple
 from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.graph.recurrence import recurrent_inputs
-from me2e_compress.zoo.stacks import STACKS, Stack
 
 STACK = "me2e.stack"
-"""Metadata key: the stack of the zoo that a file was exported from."""
-PICTURE_COLUMNS = 1600
-"""Width of pictures of nuScenes and Bench2Drive, to which a stack's scale applies."""
-
-
-def inputs_of_stack(stack: Stack) -> LoggedInputs:
-    """Return how a stack of the zoo is fed from a log."""
-    forms = {
-        name: InputForm(shape, np.dtype(stack.dtypes.get(name, "float32")))
-        for name, shape in stack.inputs.items()
-        if name not in stack.recurrent
-    }
-    rows, columns = stack.inputs["img"][-2:]
-    image = PixelInput(
-        mean=stack.image.mean,
-        std=stack.image.std,
-        order=stack.image.order,
-        rows=rows,
-        columns=columns,
-    )
-    return LoggedInputs(forms, image, stack.trained, _picture_columns(stack, columns))
+"""Metadata key: the stack that a file was exported from."""
+LIDAR_STACKS = ("vad-tiny", "uniad-tiny", "uniad-trt")
+"""Stacks that see the ground in the axes of nuScenes' lidar."""
+PICTURE_OF = {416: 400}
+"""Columns that a picture takes of those of an image, where it does not take all: UniAD
+of DL4AGX."""
 
 
 def inputs_of_model(path: Path, size: tuple[int, int] | None) -> LoggedInputs:
@@ -55,9 +38,8 @@ def inputs_of_model(path: Path, size: tuple[int, int] | None) -> LoggedInputs:
         for each in model.graph.inputs
         if each.name not in fed_back
     }
-    # the stack that a file was exported from decides the axes
-    stack = STACKS.get(model.metadata_props.get(STACK, ""))
-    forward_left = stack is None or stack.trained
+    stack = model.metadata_props.get(STACK, "")
+    forward_left = stack not in LIDAR_STACKS
     if "img" not in forms:
         return LoggedInputs(forms, None, forward_left)
     try:
@@ -79,14 +61,8 @@ def inputs_of_model(path: Path, size: tuple[int, int] | None) -> LoggedInputs:
         rows=rows,
         columns=columns,
     )
-    return LoggedInputs(forms, image, forward_left, _picture_columns(stack, columns))
-
-
-def _picture_columns(stack: Stack | None, columns: int) -> int | None:
-    """Return the columns that a picture takes: of 416, UniAD of DL4AGX fills 400."""
-    if stack is None or stack.trained or columns != stack.inputs["img"][-1]:
-        return None
-    return round(PICTURE_COLUMNS * stack.scale)
+    width = None if forward_left else PICTURE_OF.get(columns)
+    return LoggedInputs(forms, image, forward_left, width)
 
 
 def _unscaled(levels: Triple, scale: float) -> Triple:

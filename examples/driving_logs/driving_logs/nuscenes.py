@@ -1,4 +1,4 @@
-"""nuScenes (Caesar et al. 2020): key frames at 2 Hz, six cameras, boxes, CAN bus."""
+"""nuScenes (Caesar et al. 2020): key frames at 2 Hz, six cameras, CAN bus."""
 
 import functools
 import math
@@ -9,16 +9,16 @@ from typing import ClassVar, Literal, Self
 
 import numpy as np
 
-from me2e_compress.calibration.logs.base import (
+from driving_logs.framed_log import FramedLog
+from driving_logs.moments import (
     CAMERAS,
     CAN_BUS_SIZE,
-    DriveLog,
     Floats,
     LogMoment,
     intrinsics,
     matrix_of,
 )
-from me2e_compress.calibration.logs.nuscenes_tables import NuScenesTables, Row, rows
+from driving_logs.nuscenes_tables import NuScenesTables, Row, rows
 from me2e_compress.errors import FramesError
 
 LIDAR = "LIDAR_TOP"
@@ -41,7 +41,7 @@ CAN_BUS_KEYS = ("accel", "rotation_rate", "vel")
 
 
 @dataclass(frozen=True)
-class NuScenesLog(DriveLog):
+class NuScenesLog(FramedLog):
     """nuScenes: tables of a version, pictures under samples/, CAN bus if present.
 
     The CAN bus expansion is searched in ``can_bus/`` in the folder and beside it;
@@ -61,8 +61,6 @@ class NuScenesLog(DriveLog):
 
     name: ClassVar[str] = "nuscenes"
     half_second: ClassVar[int] = 1
-    ego_size: ClassVar[tuple[float, float]] = (4.084, 1.85)
-    """Renault Zoe, as in the planning metric of UniAD and VAD."""
 
     root: Path = field(kw_only=False)
     version: str = ""
@@ -126,7 +124,6 @@ class NuScenesLog(DriveLog):
             lidar_to_ego=to_ego,
             l2g_rows=True,  # UniAD
             can_bus=self._can_bus(sample, car_to_world, data[LIDAR], messages),
-            agents=self._tables.agents_of(sample["token"]),
             command=None,
         )
 

@@ -6,16 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from me2e_compress.calibration.logs.base import (
+from driving_logs.commands import command_at
+from driving_logs.model_inputs import changes
+from driving_logs.moments import (
     CAMERAS,
-    DriveLog,
-    Floats,
+    CameraLog,
     LogMoment,
     LogScene,
 )
-from me2e_compress.calibration.logs.futures import command_at
-from me2e_compress.calibration.logs.log_frames import changes
-from me2e_compress.calibration.logs.pictures import read_pixels
+from driving_logs.pictures import read_pixels
 from me2e_compress.driving.contract import EgoKinematics, Observation
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError, FramesError
@@ -28,7 +27,7 @@ class AdaptedInputs:
 
     policy: OnnxPolicy
 
-    def log_for(self, log: DriveLog) -> DriveLog:
+    def log_for(self, log: CameraLog) -> CameraLog:
         """Return the log in the contract's axes, with the cameras the graph sees."""
         for option in ("cameras", "size", "width"):
             if getattr(log, option):
@@ -39,24 +38,11 @@ class AdaptedInputs:
         seen = tuple(CAMERAS[at] for at in self.policy.inputs.cameras)
         return dataclasses.replace(log.as_contract(), cameras=seen)
 
-    def check(self, log: DriveLog) -> None:
+    def check(self, log: CameraLog) -> None:
         """Check nothing: the policy ran on zeros when it was opened."""
 
-    def ground(self, now: LogMoment) -> Floats | None:
-        """Return the [4, 4] transform from the lidar to the plan's frame.
-
-        None stands for left-handed plan axes: the headings of the recorded future mean
-        nothing in a mirrored frame.
-        """
-        axes = self.policy.adapter.axes
-        if axes.is_left_handed:
-            return None
-        from_ego = np.eye(4)
-        from_ego[:3, :3] = axes.to_ego.T
-        return from_ego @ now.lidar_to_ego
-
     def arrays(
-        self, log: DriveLog, scene: LogScene, at: int, before: int | None
+        self, log: CameraLog, scene: LogScene, at: int, before: int | None
     ) -> dict[str, Array]:
         """Return the model's inputs at a moment, with first values at a scene's start.
 
@@ -74,7 +60,7 @@ class AdaptedInputs:
         return {**feeds, **first}
 
     def _observation(
-        self, log: DriveLog, scene: LogScene, at: int, before: int | None
+        self, log: CameraLog, scene: LogScene, at: int, before: int | None
     ) -> Observation:
         now = scene[at]
         to_ego = np.linalg.inv(now.lidar_to_ego)

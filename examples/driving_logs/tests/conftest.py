@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.calibration.logs import LOGS, DriveLog
-from tests.calibration.logs.small_logs import MAKERS
+from driving_logs.moments import CameraLog
+from read_logs import opened
+from small_logs import MAKERS
 
 
 @pytest.fixture(scope="module")
@@ -14,6 +15,6 @@ def roots(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(params=MAKERS)
-def log(request: pytest.FixtureRequest, roots: dict[str, Path]) -> DriveLog:
+def log(request: pytest.FixtureRequest, roots: dict[str, Path]) -> CameraLog:
     name: str = request.param
-    return LOGS.parse(f"{name}:{roots[name]}")
+    return opened(f"{name}:{roots[name]}")

@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.calibration.logs.base import Floats
+from driving_logs.moments import Floats
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.errors import FramesError
 from me2e_compress.registry.documents import MalformedError, check_regular

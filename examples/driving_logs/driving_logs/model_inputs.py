@@ -7,9 +7,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from me2e_compress.calibration.logs.base import DriveLog, Floats, LogMoment, LogScene
-from me2e_compress.calibration.logs.futures import command_at, recorded_future
-from me2e_compress.calibration.logs.pictures import read_picture
+from driving_logs.commands import command_at
+from driving_logs.moments import CameraLog, Floats, LogMoment, LogScene
+from driving_logs.pictures import read_picture
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Array, Frame
@@ -50,7 +50,7 @@ class LoggedInputs:
     forward_left: bool = False
     width: int | None = None
 
-    def check(self, log: DriveLog) -> None:
+    def check(self, log: CameraLog) -> None:
         """Check that a log can feed the model."""
         # Every input must be one that a log can provide.
         for name in self.forms:
@@ -84,7 +84,7 @@ class LoggedInputs:
         return now.lidar_to_ego if self.forward_left else np.eye(4)
 
     def arrays(
-        self, log: DriveLog, scene: LogScene, at: int, before: int | None
+        self, log: CameraLog, scene: LogScene, at: int, before: int | None
     ) -> dict[str, Array]:
         """Return the model's inputs at a moment."""
         now = scene[at]
@@ -118,7 +118,7 @@ class LoggedInputs:
         made["lidar2img"] = np.stack(projections)
         return {name: _fed(made[name], form, name) for name, form in self.forms.items()}
 
-    def columns(self, log: DriveLog, image: PixelInput) -> int:
+    def columns(self, log: CameraLog, image: PixelInput) -> int:
         """Return the columns of the image that a picture takes."""
         return log.width or self.width or image.columns
 
@@ -126,23 +126,19 @@ class LoggedInputs:
 class LogFeeder(Protocol):
     """Builds the inputs of a model from the moments of a log."""
 
-    def check(self, log: DriveLog) -> None:
+    def check(self, log: CameraLog) -> None:
         """Check that a log can feed the model."""
         ...
 
-    def ground(self, now: LogMoment) -> Floats | None:
-        """Return [4, 4] from lidar to the plan's frame; None records no future."""
-        ...
-
     def arrays(
-        self, log: DriveLog, scene: LogScene, at: int, before: int | None
+        self, log: CameraLog, scene: LogScene, at: int, before: int | None
     ) -> dict[str, Array]:
         """Return the model's inputs at a moment; ``before`` None begins a scene."""
         ...
 
 
 def log_frames(
-    log: DriveLog,
+    log: CameraLog,
     model: LogFeeder,
     count: int,
     scene_length: int | None = None,
@@ -170,12 +166,8 @@ def log_frames(
         before = None
         for at in chosen:
             # Changes are relative to the last chosen moment.
-            arrays, ground = (
-                model.arrays(log, scene, at, before),
-                model.ground(scene[at]),
-            )
-            future = None if ground is None else recorded_future(log, scene, at, ground)
-            yield Frame(done, before is None, arrays, place, future)
+            arrays = model.arrays(log, scene, at, before)
+            yield Frame(done, before is None, arrays, place)
             before, done = at, done + 1
         if done == count:
             return

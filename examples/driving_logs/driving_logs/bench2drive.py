@@ -1,4 +1,4 @@
-"""Bench2Drive (Jia et al. 2024): clips of CARLA at 10 Hz, six cameras, boxes.
+"""Bench2Drive (Jia et al. 2024): clips of CARLA at 10 Hz, six cameras.
 
 Its files use CARLA's left-handed world (x forward, y right); the moments here are
 right-handed, with the lidar turned to x right, y forward, as its UniAD and VAD do.
@@ -14,10 +14,9 @@ from typing import Any, ClassVar, overload
 
 import numpy as np
 
-from me2e_compress.calibration.logs.base import (
+from driving_logs.framed_log import FramedLog
+from driving_logs.moments import (
     CAN_BUS_SIZE,
-    Agent,
-    DriveLog,
     Floats,
     LogMoment,
     heading_of,
@@ -27,10 +26,6 @@ from me2e_compress.calibration.logs.base import (
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import documents
 
-ROAD_USERS = ("vehicle", "walker")
-"""Classes of boxes that a plan may collide with."""
-STOREY_M = 10.0
-"""Boxes this far above or below the ego are on another road (Bench2DriveZoo)."""
 PERIOD_US = 100_000
 DEEPEST = 3
 """Most folders between the root and ``anno``."""
@@ -46,7 +41,7 @@ _CAMERA = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 
 
 @dataclass(frozen=True)
-class Bench2DriveLog(DriveLog):
+class Bench2DriveLog(FramedLog):
     """Bench2Drive: folders with anno/ and camera/rgb_*/, at most three below the root.
 
     Attributes:
@@ -58,8 +53,6 @@ class Bench2DriveLog(DriveLog):
 
     name: ClassVar[str] = "bench2drive"
     half_second: ClassVar[int] = 5
-    ego_size: ClassVar[tuple[float, float]] = (4.902, 2.128)
-    """Lincoln MKZ 2020 in CARLA 0.9.15, twice its extent."""
 
     root: Path = field(kw_only=False)
     every: int = field(default=5, kw_only=True)
@@ -148,7 +141,6 @@ class _Clip(Sequence[LogMoment]):
             lidar_to_ego=lidar_to_ego,
             l2g_rows=False,  # Bench2DriveZoo
             can_bus=_can_bus(about, lidar_to_world, path),
-            agents=tuple(_agents(about["bounding_boxes"], path)),
             command=_command(about["command_near"], path),
         )
 
@@ -198,22 +190,3 @@ def _command(near: object, path: Path) -> int:
     if not isinstance(near, int) or near > 6:
         raise FramesError(f"{path}: command_near {near!r} is none of -1, 1 to 6")
     return (near if near > 0 else 4) - 1
-
-
-def _agents(boxes: Sequence[Mapping[str, Any]], path: Path) -> list[Agent]:
-    """Read the road users; the first box is the ego."""
-    ego, *others = boxes
-    _, _, road = matrix_of(ego["location"], (3,), f"{path}: ego's location").tolist()
-    found = list[Agent]()
-    for box in others:
-        if box["class"] not in ROAD_USERS:
-            continue
-        what = f"{path}: box {box.get('id')}"
-        x, y, z = matrix_of(box["center"], (3,), what).tolist()
-        if abs(z - road) > STOREY_M:
-            continue
-        # CARLA's angles are clockwise, its extents half sizes.
-        half_length, half_width, _ = matrix_of(box["extent"], (3,), what).tolist()
-        heading = -math.radians(matrix_of(box["rotation"], (3,), what).tolist()[-1])
-        found.append(Agent(x, -y, heading, 2 * half_length, 2 * half_width))
-    return found

@@ -5,19 +5,16 @@ and only the required rows are kept.
 """
 
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from me2e_compress.calibration.logs.base import Agent, Floats, matrix_of, pose
+from driving_logs.moments import Floats, matrix_of, pose
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import documents
 
 Row: TypeAlias = Mapping[str, Any]
 
-ROAD_USERS = ("vehicle.", "human.")
-"""Categories that a plan may collide with, as in UniAD and VAD."""
 NAMES = ("token", "name", "next", "channel")
 TIMES = ("timestamp", "utime")
 LATEST_US = 1 << 62
@@ -82,7 +79,6 @@ class NuScenesTables:
             lambda row: row["token"] in used,
             *("translation", "rotation"),
         )
-        self._agents = self._boxes()
 
     def _key_frames(self) -> dict[str, dict[str, Row]]:
         """Return the row of each sample and sensor."""
@@ -99,26 +95,6 @@ class NuScenesTables:
                 found[row["sample_token"]][sensor["channel"]] = row
         return found
 
-    def _boxes(self) -> dict[str, list[Agent]]:
-        # A box refers to an instance, and that to its category.
-        kinds = by_token(self.folder / "category.json", lambda row: True, "name")
-        things = by_token(
-            self.folder / "instance.json", lambda row: True, "category_token"
-        )
-        # Resolve the category of each box, and keep road users.
-        found: dict[str, list[Agent]] = {}
-        path = self.folder / "sample_annotation.json"
-        names = ("sample_token", "instance_token", "translation", "size", "rotation")
-        for row in rows(path, "token", *names):
-            thing = things.get(row["instance_token"])
-            kind = None if thing is None else kinds.get(thing["category_token"])
-            if kind is None:
-                raise FramesError(f"{path}: {row['token']} has no instance or category")
-            sample = row["sample_token"]
-            if sample in self.samples and kind["name"].startswith(ROAD_USERS):
-                found.setdefault(sample, []).append(_agent(row, path))
-        return found
-
     def samples_of(self, scene: Row) -> list[Row]:
         """Return the samples of a scene in order."""
         token, found = scene["first_sample_token"], list[Row]()
@@ -129,10 +105,6 @@ class NuScenesTables:
             found.append(self.samples[token])
             token = found[-1]["next"]
         return found
-
-    def agents_of(self, sample: str) -> tuple[Agent, ...] | None:
-        """Return the road users; None where the version has no annotations."""
-        return tuple(self._agents.get(sample, ())) if self._agents else None
 
     def sensor(self, data: Row) -> Row:
         """Return the calibration of the sensor of a sample_data row."""
@@ -157,14 +129,6 @@ class NuScenesTables:
                 f" {data['filename']} names"
             )
         return found
-
-
-def _agent(row: Row, path: Path) -> Agent:
-    what = f"{path}: {row['token']}"
-    x, y, _ = matrix_of(row["translation"], (3,), what).tolist()
-    width, length, _ = matrix_of(row["size"], (3,), what).tolist()
-    turn = pose(matrix_of(row["rotation"], (4,), what).tolist(), (0, 0, 0), what)
-    return Agent(x, y, math.atan2(turn[1, 0], turn[0, 0]), length, width)
 
 
 def _objects(path: Path) -> Iterator[dict[str, Any]]:

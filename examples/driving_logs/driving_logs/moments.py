@@ -1,4 +1,4 @@
-"""The common interface of driving logs.
+"""What both data sets give: moments, which become frames of a model.
 
 Coordinate frames: *lidar* is x right, y forward, z up at the roof lidar (nuScenes,
 UniAD, VAD); *ego* is x forward, y left, z up on the ground under the centre of the
@@ -6,7 +6,7 @@ vehicle; the *world* is right-handed. A matrix ``a_to_b`` [4, 4] maps (x, y, z, 
 to b.
 """
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import ClassVar, Self, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.calibration.logs import DriveLog
 from me2e_compress.errors import FramesError
 
 Floats: TypeAlias = npt.NDArray[np.float64]
@@ -32,20 +33,6 @@ CAMERAS = (
 CAN_BUS_SIZE = 18
 
 
-@dataclass(frozen=True)
-class Agent:
-    """A road user as a box on the ground of the world; metres, radians.
-
-    ``heading`` is counter-clockwise from the x axis, along the length.
-    """
-
-    x: float
-    y: float
-    heading: float
-    length: float
-    width: float
-
-
 @dataclass(frozen=True, eq=False)
 class LogMoment:
     """The recorded data of one moment.
@@ -61,7 +48,6 @@ class LogMoment:
             world for rows (p @ r), which is its transpose.
         can_bus: [18] as the data set's own models take it, but [0:3] is the position
             and [17] the heading in degrees, not their changes.
-        agents: the road users; None where the log has none.
         command: the route's next command, numbered as in the data set's models; None
             where the log has none.
     """
@@ -73,7 +59,6 @@ class LogMoment:
     lidar_to_ego: Floats
     l2g_rows: bool
     can_bus: Floats
-    agents: tuple[Agent, ...] | None
     command: int | None
 
 
@@ -82,8 +67,8 @@ LogScene: TypeAlias = Sequence[LogMoment]
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriveLog(ABC):
-    """A data set of recorded driving.
+class CameraLog(DriveLog):
+    """A data set of driving that cameras recorded; `frames` lays out its moments.
 
     Attributes:
         scenes: names of the scenes; empty means all.
@@ -95,11 +80,8 @@ class DriveLog(ABC):
             None takes the stack's value, else all.
     """
 
-    name: ClassVar[str]
     half_second: ClassVar[int]
     """Number of moments in half a second."""
-    ego_size: ClassVar[tuple[float, float]]
-    """Length and width of the ego vehicle, metres."""
 
     scenes: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()

@@ -3,23 +3,26 @@
 import math
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 
-from me2e_compress.calibration.logs import LOGS, DriveLog
-from me2e_compress.calibration.logs.log_frames import (
+from driving_logs.bench2drive import Bench2DriveLog
+from driving_logs.model_inputs import (
     InputForm,
     LoggedInputs,
     log_frames,
 )
-from me2e_compress.calibration.logs.pictures import Picture, read_picture
+from driving_logs.moments import CameraLog
+from driving_logs.nuscenes import NuScenesLog
+from driving_logs.pictures import Picture, read_picture
+from me2e_compress.calibration.logs import LOGS
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.errors import FramesError
 from me2e_compress.testing import check_form
-from tests.calibration.logs.read_logs import F32, FORMS, MODEL, PIXELS, frames, to_lidar
-from tests.calibration.logs.small_logs import (
+from read_logs import F32, FORMS, MODEL, PIXELS, frames, opened, to_lidar
+from small_logs import (
     BEND,
     CLIP,
     MAKERS,
@@ -33,6 +36,8 @@ from tests.calibration.logs.small_logs import (
     write_nuscenes,
 )
 
+Layout = Literal["nuscenes", "bench2drive"]
+
 
 def bright(planes: np.ndarray) -> tuple[float, float]:
     """Return the middle of what is white."""
@@ -42,7 +47,7 @@ def bright(planes: np.ndarray) -> tuple[float, float]:
 
 @pytest.mark.parametrize("forward_left", [False, True])
 def test_a_point_lands_on_the_pixel_it_was_drawn_at(
-    log: DriveLog, forward_left: bool
+    log: CameraLog, forward_left: bool
 ) -> None:
     frame = frames(log, LoggedInputs(FORMS, PIXELS, forward_left), 1)[0]
 
@@ -56,14 +61,14 @@ def test_a_point_lands_on_the_pixel_it_was_drawn_at(
         assert 2 * u / depth == pytest.approx(pixel(camera)[0], abs=1e-3)
 
 
-def test_pictures_are_bytes_and_what_is_short_is_left_to_pad(log: DriveLog) -> None:
+def test_pictures_are_bytes_and_what_is_short_is_left_to_pad(log: CameraLog) -> None:
     image = frames(log, count=1)[0].arrays["img"]
 
     assert str(image.dtype) == "uint8"
     assert image.shape == (1, 6, 3, 45, 80)
 
 
-def test_what_is_too_tall_loses_its_upper_rows(log: DriveLog) -> None:
+def test_what_is_too_tall_loses_its_upper_rows(log: CameraLog) -> None:
     short = PIXELS.model_copy(update={"rows": 32})
     whole = frames(log, count=1)[0].arrays
     cut = frames(log, LoggedInputs(FORMS, short), 1)[0].arrays
@@ -79,8 +84,7 @@ def test_a_picture_may_take_a_part_of_the_columns(
     roots: dict[str, Path], by_log: bool
 ) -> None:
     """As 416 columns of DL4AGX's UniAD hold pictures of 400."""
-    width = {"width": 60} if by_log else {}
-    log = LOGS.build("nuscenes", {"root": roots["nuscenes"], **width})
+    log = NuScenesLog(roots["nuscenes"], width=60 if by_log else None)
     model = LoggedInputs(FORMS, PIXELS, width=60 if not by_log else None)
 
     arrays = frames(log, model, 1)[0].arrays
@@ -91,7 +95,7 @@ def test_a_picture_may_take_a_part_of_the_columns(
     assert u / depth * WIDTH / 60 == pytest.approx(pixel("CAM_FRONT")[0], abs=1e-3)
 
 
-def test_frames_are_half_a_second_apart_and_one_scene(log: DriveLog) -> None:
+def test_frames_are_half_a_second_apart_and_one_scene(log: CameraLog) -> None:
     found = frames(log)
 
     assert [each.starts_scene for each in found] == [True, False, False, False]
@@ -99,7 +103,7 @@ def test_frames_are_half_a_second_apart_and_one_scene(log: DriveLog) -> None:
     assert seconds == pytest.approx([0, 0.5, 1, 1.5])
 
 
-def test_the_can_bus_holds_changes_since_the_frame_before(log: DriveLog) -> None:
+def test_the_can_bus_holds_changes_since_the_frame_before(log: CameraLog) -> None:
     first, second = (
         each.arrays["can_bus"].astype(float) for each in frames(log, count=2)
     )
@@ -123,10 +127,10 @@ def test_the_can_bus_holds_changes_since_the_frame_before(log: DriveLog) -> None
     ],
 )
 def test_the_can_bus_is_filled_as_each_data_set_does(
-    roots: dict[str, Path], text: str, expected: dict[int, float]
+    roots: dict[str, Path], text: Layout, expected: dict[int, float]
 ) -> None:
-    like = LOGS.parse(f"{text}:{roots[text]}")
-    other = LOGS.build("nuscenes", {"root": roots["nuscenes"], "layout": text})
+    like = opened(f"{text}:{roots[text]}")
+    other = NuScenesLog(roots["nuscenes"], layout=text)
     for log in (like, other):
         bus = frames(log, count=1)[0].arrays["can_bus"]
         wanted = {at: expected.get(at, 0.0) for at in range(7, 16)}
@@ -144,7 +148,7 @@ def test_the_can_bus_is_filled_as_each_data_set_does(
 def test_cameras_stand_as_the_models_of_the_data_set_have_them(
     roots: dict[str, Path], text: str, second: str
 ) -> None:
-    log = LOGS.parse(text.format_map(roots))
+    log = opened(text.format_map(roots))
 
     assert sorted(log.seen) == sorted(YAWS)
     assert log.seen[1] == second
@@ -154,12 +158,12 @@ def test_no_can_bus_is_zeros(tmp_path: Path) -> None:
     root = write_nuscenes(tmp_path, 1)
     (root / "can_bus" / "scene-0001_pose.json").unlink()
 
-    bus = frames(LOGS.parse(f"nuscenes:{root}"))[0].arrays["can_bus"]
+    bus = frames(opened(f"nuscenes:{root}"))[0].arrays["can_bus"]
 
     assert not bus[7:16].any()
 
 
-def test_the_lidar_is_placed_in_the_world(log: DriveLog) -> None:
+def test_the_lidar_is_placed_in_the_world(log: CameraLog) -> None:
     arrays = frames(log, count=1)[0].arrays
     turn = arrays["l2g_r_mat"]
     turn = turn.T if log.name == "nuscenes" else turn  # UniAD multiplies rows
@@ -171,10 +175,10 @@ def test_the_lidar_is_placed_in_the_world(log: DriveLog) -> None:
 
 @pytest.mark.parametrize(("layout", "left"), [("nuscenes", 1), ("bench2drive", 0)])
 def test_the_command_follows_what_the_car_did(
-    tmp_path: Path, layout: str, left: int
+    tmp_path: Path, layout: Layout, left: int
 ) -> None:
     root = write_nuscenes(tmp_path, 8)
-    log = LOGS.build("nuscenes", {"root": root, "layout": layout})
+    log = NuScenesLog(root, layout=layout)
     straight = {"nuscenes": 2, "bench2drive": 3}[layout]
 
     found = [each.arrays["command"].item() for each in frames(log)]
@@ -184,21 +188,17 @@ def test_the_command_follows_what_the_car_did(
 
 
 def test_bench2drive_gives_its_command(roots: dict[str, Path]) -> None:
-    log = LOGS.parse(f"bench2drive:{roots['bench2drive']}")
+    log = opened(f"bench2drive:{roots['bench2drive']}")
     assert frames(log, count=1)[0].arrays["command"].item() == 3
 
 
 def test_scenes_cameras_and_every_nth_are_chosen(tmp_path: Path) -> None:
     write_bench2drive(tmp_path, 4)
-    options = {
-        "root": tmp_path,
-        "scenes": [CLIP],
-        "cameras": ["CAM_BACK", "CAM_FRONT"],
-        "every": 2,
-    }
+    cameras = ("CAM_BACK", "CAM_FRONT")
+    log = Bench2DriveLog(tmp_path, scenes=(CLIP,), cameras=cameras, every=2)
     form = {"img": InputForm((2, 3, 45, 80), F32)}
 
-    found = frames(LOGS.build("bench2drive", options), LoggedInputs(form, PIXELS))
+    found = frames(log, LoggedInputs(form, PIXELS))
 
     assert len(found) == 2
     assert found[0].arrays["img"].shape == (2, 3, 45, 80)
@@ -207,7 +207,7 @@ def test_scenes_cameras_and_every_nth_are_chosen(tmp_path: Path) -> None:
 
 
 def test_pictures_are_read_when_their_frame_is_asked_for(
-    log: DriveLog, monkeypatch: pytest.MonkeyPatch
+    log: CameraLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = list[Path]()
 
@@ -225,7 +225,7 @@ def test_pictures_are_read_when_their_frame_is_asked_for(
 def test_it_goes_on_with_a_scene(tmp_path: Path) -> None:
     for name in ("b", "a"):
         write_bench2drive(tmp_path / name, 2)
-    log = LOGS.parse(f"bench2drive:{tmp_path}")
+    log = opened(f"bench2drive:{tmp_path}")
 
     found = list(log_frames(log, MODEL, 2, 1, done=1, first=1))
 
@@ -254,7 +254,7 @@ def test_it_goes_on_with_a_scene(tmp_path: Path) -> None:
 def test_what_a_log_cannot_feed_is_named(
     roots: dict[str, Path], form: dict[str, Any], message: str
 ) -> None:
-    log = LOGS.parse(f"nuscenes:{roots['nuscenes']}")
+    log = opened(f"nuscenes:{roots['nuscenes']}")
     forms = {name: each for name, each in form.items() if name != "width"}
     image = PIXELS if "img" in form else None
     model = LoggedInputs(forms, image, width=form.get("width"))

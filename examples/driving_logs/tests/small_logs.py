@@ -96,17 +96,9 @@ INTRINSIC = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
 
 
 def write_nuscenes(root: Path, samples: int = 4, name: str = "scene-0001") -> Path:
-    """A scene at 2 Hz with a car 8 m ahead that keeps its distance, and a barrier."""
+    """A scene at 2 Hz."""
     tables: dict[str, list[dict[str, Any]]] = {
         "scene": [{"token": name, "name": name, "first_sample_token": f"{name}-0"}],
-        "category": [
-            {"token": "c", "name": "vehicle.car"},
-            {"token": "b", "name": "movable_object.barrier"},
-        ],
-        "instance": [
-            {"token": "car", "category_token": "c"},
-            {"token": "barrier", "category_token": "b"},
-        ],
         "sensor": [{"token": s, "channel": s} for s in ("LIDAR_TOP", *YAWS)],
         "calibrated_sensor": [
             {
@@ -119,7 +111,6 @@ def write_nuscenes(root: Path, samples: int = 4, name: str = "scene-0001") -> Pa
             for sensor in ("LIDAR_TOP", *YAWS)
         ],
         **{each: [] for each in ("sample", "sample_data", "ego_pose")},
-        "sample_annotation": [],
     }
     messages = []
     for index in range(samples):
@@ -171,18 +162,6 @@ def _add_sample(
         )
         if sensor != "LIDAR_TOP":
             draw(root / file, sensor)
-    for thing, (ahead, left) in {"car": (8.0, 0.0), "barrier": (3.0, 3.0)}.items():
-        x, y = (car.to_world @ [ahead, left, 0, 1])[:2].tolist()
-        tables["sample_annotation"].append(
-            {
-                "token": f"{token} {thing}",
-                "sample_token": token,
-                "instance_token": thing,
-                "translation": [x, y, 0.8],
-                "size": [1.9, 4.5, 1.6],
-                "rotation": _wxyz(Rotation.from_euler("z", car.heading)),
-            }
-        )
 
 
 def _sensor_turn(sensor: str) -> list[float]:
@@ -202,7 +181,7 @@ CLIP = "ParkingCutIn_Town12_Route1_Weather3"
 
 
 def write_bench2drive(root: Path, moments: int = 16) -> Path:
-    """A clip at 10 Hz with a parked car, a walker and one on a bridge above."""
+    """A clip at 10 Hz."""
     clip = root / CLIP
     (clip / "anno").mkdir(parents=True, exist_ok=True)
     for index in range(moments):
@@ -229,15 +208,6 @@ def _annotation(index: int) -> dict[str, Any]:
         forward, left, up = CAMERA_M
         cam2ego = moved(-math.radians(yaw), (forward, -left, up))
         sensors[camera] = {"intrinsic": INTRINSIC, "cam2ego": cam2ego.tolist()}
-    boxes = [_box("ego_vehicle", mirrored, 0.0)]
-    for kind, up, (ahead, right) in (
-        ("vehicle", 0.0, (8.0, 0.0)),
-        ("walker", 0.0, (5.0, 4.0)),
-        ("vehicle", 20.0, (0.0, 0.0)),
-        ("traffic_sign", 0.0, (2.0, 2.0)),
-    ):
-        x, y = (ego_to_world @ [ahead, right, 0, 1])[:2].tolist()
-        boxes.append(_box(kind, Car(x, y, mirrored.heading), up))
     return {
         "x": mirrored.x,
         "y": mirrored.y,
@@ -247,18 +217,6 @@ def _annotation(index: int) -> dict[str, Any]:
         "angular_velocity": [0.0, 0.0, -SPEED * BEND],
         "command_near": 4,
         "sensors": sensors,
-        "bounding_boxes": boxes,
-    }
-
-
-def _box(kind: str, at: Car, up: float) -> dict[str, Any]:
-    return {
-        "class": kind,
-        "id": kind,
-        "location": [at.x, at.y, up],
-        "center": [at.x, at.y, up + 0.8],
-        "extent": [2.25, 0.95, 0.8],
-        "rotation": [0.0, 0.0, math.degrees(at.heading)],
     }
 
 

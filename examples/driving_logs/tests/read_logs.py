@@ -2,15 +2,16 @@
 
 import numpy as np
 
-from me2e_compress.calibration.logs import DriveLog
-from me2e_compress.calibration.logs.log_frames import (
+from driving_logs.model_inputs import (
     InputForm,
     LoggedInputs,
     log_frames,
 )
+from driving_logs.moments import CameraLog
+from me2e_compress.calibration.logs import LOGS
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.runtime.frames import Frame
-from tests.calibration.logs.small_logs import LIDAR_M
+from small_logs import LIDAR_M
 
 F32 = np.dtype(np.float32)
 FORMS = {
@@ -27,7 +28,13 @@ MODEL = LoggedInputs(FORMS, PIXELS)
 """Half the pictures' 160 x 90, padded to 64 rows."""
 
 
-def frames(log: DriveLog, model: LoggedInputs = MODEL, count: int = 99) -> list[Frame]:
+def opened(text: str) -> CameraLog:
+    log = LOGS.parse(text)
+    assert isinstance(log, CameraLog)
+    return log
+
+
+def frames(log: CameraLog, model: LoggedInputs = MODEL, count: int = 99) -> list[Frame]:
     return list(log_frames(log, model, count))
 
 
