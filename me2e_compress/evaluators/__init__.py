@@ -1,4 +1,4 @@
-"""Evaluators: they drive a compressed model, or read how it drove; agents for CARLA.
+"""Evaluators: they drive a compressed model, or read how it drove.
 
 To add an evaluator: write its class, then add it to this table.
 """

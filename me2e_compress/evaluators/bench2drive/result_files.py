@@ -32,7 +32,7 @@ _UNREADABLE = {
 _RECORDING = "metric_info.json"
 """Name that Bench2Drive's agents use; needed if the content is ambiguous."""
 _DECISIONS = "decisions.jsonl"
-"""Name of the log of `carla.real_time.RealTimeAgent`."""
+"""Name of the log of decisions: a line each, `frame` and `latency_us`."""
 _HEAD_BYTES = 4096
 _PICTURES = {".png", ".jpg", ".jpeg", ".gif", ".mp4", ".npz", ".npy", ".laz", ".bin"}
 

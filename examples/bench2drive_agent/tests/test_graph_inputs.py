@@ -3,21 +3,15 @@
 import json
 import math
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
+from agent_files import options, straight_on
 from me2e_compress.driving.answer import six_waypoints
-from me2e_compress.evaluators.carla import graph_agent, real_time
-from tests.evaluators.carla.small_leaderboard import (
-    SAVE_NAME,
-    Leaderboard,
-    RoadOption,
-    World,
-    written,
-)
-from tests.evaluators.highway.drivers import straight_on
+from small_leaderboard import SAVE_NAME, Leaderboard, RoadOption, World
 
 IMAGE = json.dumps({"mean": [10, 20, 30], "std": [1, 1, 1], "order": "bgr"})
 ECHO = {
@@ -52,8 +46,10 @@ def heard(agent: Any) -> list[np.ndarray]:
     return found
 
 
-def test_a_model_is_told_what_the_contract_says(board: Leaderboard, echo: Path) -> None:
-    agent = board.make(graph_agent, f"{echo}+{SAVE_NAME}")
+def test_a_model_is_told_what_the_contract_says(
+    board: Leaderboard, graph_agent: ModuleType, echo: Path
+) -> None:
+    agent = board.make(graph_agent, f"{options(echo)}+{SAVE_NAME}")
     found, worlds = heard(agent), list[World]()
     board.world.yaw_deg, board.world.speed = 30.0, 5.0
 
@@ -81,7 +77,9 @@ parts = [{ source = "target-point" }, { source = "target-point", which = "far" }
 """
 
 
-def test_a_model_is_told_what_to_aim_at(board: Leaderboard, tmp_path: Path) -> None:
+def test_a_model_is_told_what_to_aim_at(
+    board: Leaderboard, graph_agent: ModuleType, tmp_path: Path
+) -> None:
     """Nodes every 20 m to the east, 2 m to the right of where it starts."""
     model = straight_on(
         tmp_path / "m.onnx",
@@ -90,9 +88,7 @@ def test_a_model_is_told_what_to_aim_at(board: Leaderboard, tmp_path: Path) -> N
         initializers=""", int64[3] plan_shape = {1, 6, 2},
             int64[12] picked = {0, 1, 2, 3, 0, 0, 0, 0, 0, 0, 0, 0}""",
     )
-    (tmp_path / "a.toml").write_text(AIMS)
-    conf = tmp_path / "graph.toml"
-    conf.write_text(f'model = "{model}"\nadapter = "{tmp_path / "a.toml"}"')
+    conf = options(model, AIMS)
     board.noise = 0.0
     route = [(20.0 * k, 2.0, RoadOption.LANEFOLLOW) for k in range(1, 6)]
     agent = board.make(graph_agent, f"{conf}+{SAVE_NAME}", route)
@@ -105,9 +101,9 @@ def test_a_model_is_told_what_to_aim_at(board: Leaderboard, tmp_path: Path) -> N
 
 
 def test_the_first_decision_has_nothing_before_it(
-    board: Leaderboard, echo: Path
+    board: Leaderboard, graph_agent: ModuleType, echo: Path
 ) -> None:
-    agent = board.make(graph_agent, f"{echo}+{SAVE_NAME}")
+    agent = board.make(graph_agent, f"{options(echo)}+{SAVE_NAME}")
     found = heard(agent)
 
     board.run(agent, 1)
@@ -118,15 +114,11 @@ def test_the_first_decision_has_nothing_before_it(
 
 
 def test_the_can_bus_counts_from_the_last_decision(
-    board: Leaderboard, echo: Path, tmp_path: Path
+    board: Leaderboard, graph_agent: ModuleType, echo: Path
 ) -> None:
-    wrap = written(
-        tmp_path / "wrap.toml",
-        f'agent = "me2e_compress.evaluators.carla.graph_agent"\nconfig = "{echo}"\n'
-        f'latency = "fps:5"\nfolder = "{tmp_path}"\n',
-    )
-    agent = board.make(real_time, f"{wrap}+{SAVE_NAME}")
-    found, places = heard(agent._inner), list[float]()
+    conf = options(echo, latency="fps:5")
+    agent = board.make(graph_agent, f"{conf}+{SAVE_NAME}")
+    found, places = heard(agent), list[float]()
     board.world.speed = 20.0
 
     board.run(agent, 9, lambda world: places.append(world.x))
@@ -138,7 +130,7 @@ def test_the_can_bus_counts_from_the_last_decision(
     )
     assert [each[11] for each in found] == pytest.approx([0.0, 0.2, 0.4])
     assert agent.step == 8
-    kept = json.loads((tmp_path / SAVE_NAME / "metric_info.json").read_text())
+    kept = json.loads((agent.save_path / "metric_info.json").read_text())
     assert len(kept) == 9
 
 
@@ -163,18 +155,14 @@ std = [1.0, 1.0, 1.0]
 
 
 def test_a_model_of_one_camera_mounts_no_other(
-    board: Leaderboard, tmp_path: Path
+    board: Leaderboard, graph_agent: ModuleType, tmp_path: Path
 ) -> None:
     inputs = "float[1, 3, 5, 16] img"
     picked = "int64[12] picked = {0, 80, 160, 79, 159, 239, 0, 0, 0, 0, 0, 0}"
     parts = SEES["initializers"].partition("int64[12]")[0] + picked
     see = {"inputs": inputs, "body": SEES["body"], "initializers": parts}
     model = straight_on(tmp_path / "m.onnx", **see)  # type: ignore[arg-type]
-    (tmp_path / "a.toml").write_text(AHEAD)
-    conf = tmp_path / "graph.toml"
-    conf.write_text(
-        f'model = "{model}"\nadapter = "{tmp_path / "a.toml"}"\njpeg_quality = 0'
-    )
+    conf = options(model, AHEAD, jpeg_quality=0)
     agent = board.make(graph_agent, f"{conf}+{SAVE_NAME}")
     found = heard(agent)
 
@@ -187,11 +175,15 @@ def test_a_model_of_one_camera_mounts_no_other(
 
 @pytest.mark.parametrize(("quality", "off"), [(0, 0.0), (20, 12.0)])
 def test_images_are_rgb_scaled_and_padded_with_the_mean(
-    board: Leaderboard, tmp_path: Path, quality: int, off: float
+    board: Leaderboard,
+    graph_agent: ModuleType,
+    tmp_path: Path,
+    quality: int,
+    off: float,
 ) -> None:
     model = straight_on(tmp_path / "m.onnx", metadata={"me2e.image": IMAGE}, **SEES)
-    conf = f'model = "{model}"\nwidth = 32\nheight = 18\njpeg_quality = {quality}\n'
-    agent = board.make(graph_agent, f"{written(tmp_path / 'g.toml', conf)}+{SAVE_NAME}")
+    conf = options(model, jpeg_quality=quality)
+    agent = board.make(graph_agent, f"{conf}+{SAVE_NAME}")
     found = heard(agent)
 
     board.run(agent, 1)

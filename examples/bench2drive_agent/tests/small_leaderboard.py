@@ -7,16 +7,13 @@ agent returned.
 """
 
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 
 DT_S = 0.05
 EARTH_M = 6378137.0
@@ -64,7 +61,6 @@ class World:
     turn_deg: float = 0.0
     frame: int = 0
     sensors: list[dict[str, Any]] = field(default_factory=list)
-    others: list[SimpleNamespace] = field(default_factory=list)
 
     def tick(self, control: VehicleControl | None) -> None:
         self.frame += 1
@@ -86,15 +82,9 @@ class World:
     def hero(self) -> SimpleNamespace:
         """The ego's actor; like CARLA's, it tells how things are when it is asked."""
         return SimpleNamespace(
-            id=1,
-            type_id="vehicle.lincoln.mkz_2020",
             get_acceleration=lambda: vector(*self._pushed(), 0.0),
             get_angular_velocity=lambda: vector(0.0, 0.0, self.turn_deg),
-            get_location=lambda: vector(self.x, self.y, 0.0),
             get_transform=self._transform,
-            get_world=lambda: SimpleNamespace(
-                get_actors=lambda: [self.hero, *self.others]
-            ),
         )
 
     def _pushed(self) -> tuple[float, float]:
@@ -109,12 +99,6 @@ class World:
             get_forward_vector=lambda: vector(math.cos(yaw), math.sin(yaw), 0.0),
             get_right_vector=lambda: vector(-math.sin(yaw), math.cos(yaw), 0.0),
         )
-
-    def put(self, kind: str, x: float, y: float) -> None:
-        """Put another actor there."""
-        place, number = vector(x, y, 0.0), len(self.others) + 2
-        actor = SimpleNamespace(id=number, type_id=kind, get_location=lambda: place)
-        self.others.append(actor)
 
     def sensed(self) -> dict[str, tuple[int, Any]]:
         return {each["id"]: (self.frame, self._sense(each)) for each in self.sensors}
@@ -278,16 +262,3 @@ def modules(board: Leaderboard) -> dict[str, ModuleType]:
         "leaderboard.autoagents": ModuleType("leaderboard.autoagents"),
         "leaderboard.autoagents.autonomous_agent": agent,
     }
-
-
-def installed(monkeypatch: pytest.MonkeyPatch) -> Leaderboard:
-    """Put the modules where an import finds them, until the test ends."""
-    board = Leaderboard()
-    for name, module in modules(board).items():
-        monkeypatch.setitem(sys.modules, name, module)
-    return board
-
-
-def written(path: Path, text: str) -> Path:
-    path.write_text(text, encoding="utf-8")
-    return path

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
+from bench2drive_agent.sensors import Pictures, specs
 from me2e_compress.driving.adapter import Axes
-from me2e_compress.evaluators.carla.rig import BENCH2DRIVE_CAMERAS, CarlaRig
 
 LIDAR_M = (-0.39, 0.0, 1.84)
-FULL = CarlaRig(BENCH2DRIVE_CAMERAS, (1600, 900), (900, 1600))
+FULL = Pictures((900, 1600), 0, (0, 0, 0))
 
 ZOO = {
     0: [
@@ -40,7 +40,7 @@ def test_cameras_project_as_bench2drives_agents_have_it(camera: int) -> None:
 
 
 def test_a_picture_is_scaled_as_a_whole_and_padded_below() -> None:
-    small = CarlaRig(BENCH2DRIVE_CAMERAS, (1600, 900), (384, 640))
+    small = Pictures((384, 640), 0, (0, 0, 0))
     point = np.array([12.0, 1.0, 0.5, 1.0])  # ahead, to the left
 
     u, v, depth, _ = small.lidar2img((0.0, 0.0, 0.0))[0] @ point
@@ -54,9 +54,9 @@ def test_a_picture_is_scaled_as_a_whole_and_padded_below() -> None:
 
 
 def test_the_sensors_keep_the_leaderboards_limits() -> None:
-    specs = FULL.specs(range(6))
+    found = specs(range(6))
 
-    kinds = [each["type"] for each in specs]
+    kinds = [each["type"] for each in found]
     assert kinds.count("sensor.camera.rgb") == 6
-    assert len({each["id"] for each in specs}) == len(specs) == 9
-    assert FULL.specs(()) == specs[6:]
+    assert len({each["id"] for each in found}) == len(found) == 9
+    assert specs(()) == found[6:]
