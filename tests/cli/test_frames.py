@@ -13,7 +13,7 @@ from me2e_compress.calibration.logs import LOGS, DriveLog, LogRequest
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.calibration.recording import Begin
 from me2e_compress.driving.shipped_adapters import adapter_file
-from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.testing import check_form
 from tests.command import Cli
 from tests.installed import install
@@ -39,7 +39,7 @@ class Rides(DriveLog):
         """Yield grey pictures."""
         self.requests.append(request)
         for index in range(begin.frame, min(4, request.count)):
-            arrays = {"img": np.full((1, 3, 2, 2), 9 + index, np.uint8)}
+            arrays: dict[str, Array] = {"img": np.full((1, 3, 2, 2), 9 + index, "u1")}
             yield Frame(index, index % 2 == 0, arrays, index // 2)
 
     def pixels(self, request: LogRequest) -> Mapping[str, PixelInput]:

@@ -12,7 +12,7 @@ from me2e_compress.calibration.recording import write_recording
 from me2e_compress.errors import GraphError
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.fidelity.matched_sets import SetFidelity, SetOutputs, SetTally
-from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.compare import compare as compare_files
@@ -115,16 +115,16 @@ def test_compare_matches_what_both_graphs_have(
 ) -> None:
     sets = json.dumps({"boxes": "boxes", "scores": "scores"})
     save_text(tmp_path / "one.onnx", SWAPPED % "0, 1", **{"me2e.sets": sets})
-    other = SWAPPED if has_scores else SWAPPED.replace("scores", "votes")
-    save_text(tmp_path / "other.onnx", other % "1, 0")
-    arrays = {
+    text = SWAPPED if has_scores else SWAPPED.replace("scores", "votes")
+    save_text(tmp_path / "other.onnx", text % "1, 0")
+    arrays: dict[str, Array] = {
         "x": np.array([[[1, 2, 3], [9, 8, 7]]], np.float32),
         "s": np.array([[0.9, 0.8]], np.float32),
     }
     write_recording(tmp_path / "frames", lambda _: [Frame(0, True, arrays)], {})
 
-    files = (tmp_path / name for name in ("one.onnx", "other.onnx", "frames"))
-    found = compare_files(*files, alive=0.0)
+    one, other, frames = (tmp_path / n for n in ("one.onnx", "other.onnx", "frames"))
+    found = compare_files(one, other, frames, alive=0.0)
 
     assert found.fidelity.outputs[0].sqnr_db < 6.0
     if has_scores:
