@@ -56,16 +56,16 @@ def test_no_count_rises_against_the_commit_before() -> None:
 
 
 def risen(now: Budget, before: str) -> list[str]:
-    """List the counts that rose; a room may, where files of another moved into it."""
+    """List the counts that rose; a room may, where the total falls."""
     if "[today]" not in before:
         return []  # budgets of another form
     then = Budget.parse(before).today
-    has_moved = any(name not in now.today for name in then)
+    has_fallen = now.today["total"] < then["total"]
     return [
         f"{name}: {then[name]} became {count}"
         for name, count in now.today.items()
         if name in then and count > then[name]
-        if not (has_moved and name.startswith("lines."))
+        if not (has_fallen and name.startswith("lines."))
     ]
 
 
