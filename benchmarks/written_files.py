@@ -60,12 +60,12 @@ routes = "HazardAtSideLane_0,Accident_0"
 frames = "frames"
 held_out = "held-out"
 
-[[scheme]]
+[[variant]]
 name = "float"
 policy = "highway"
 trace = "trace.json"
 
-[[scheme]]
+[[variant]]
 name = "full"
 policy = "highway"
 recipe = "full"
