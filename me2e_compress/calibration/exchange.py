@@ -3,20 +3,24 @@
 Both store one number per tensor, so imported ranges are symmetric: [-reach, reach].
 """
 
+import dataclasses
 import re
 import struct
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import onnx_ir as ir
 from onnxruntime.quantization.calibrate import TensorData
 from onnxruntime.quantization.quant_utils import write_calibration_table
 
 from me2e_compress.calibration.observers import QUANT_MAX, scale_of
 from me2e_compress.calibration.observers.base import MaxMin
 from me2e_compress.calibration.ranges import IMPORTED, LARGEST, Ranges
+from me2e_compress.display import counted
 from me2e_compress.errors import FramesError
+from me2e_compress.graph import digest, provenance
 from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_bytes
 
@@ -25,6 +29,9 @@ TABLE_FILES = ("calibration.flatbuffers", "calibration.json", "calibration.cache
 
 _MIN_MAX, _ENTROPY = "MinMaxCalibration", "EntropyCalibration2"
 _HEAD = re.compile(r"TRT-\d+-(\w+)")
+
+_LEAST = 0.5
+"""Least share of the needed tensors that a cache of this graph has."""
 
 _VERSION = "TRT-101000"
 """Version in the head of a written cache; TensorRT 10 reads caches of this form."""
@@ -85,6 +92,40 @@ def read_cache(path: Path) -> Ranges:
         raise FramesError(f"{path}: a calibration cache without a tensor")
     bounds = {name: (-each, each) for name, each in reach.items()}
     return Ranges(bounds, IMPORTED, 0, "", "", calibrator=head[1] if head else "")
+
+
+def taken_from(
+    cache: Ranges, path: Path, model: ir.Model, tensors: Sequence[str]
+) -> Ranges:
+    """Take those of ``tensors`` that a cache has, by their names in ``model``.
+
+    A node that stands for several of the file may have kept the name of the first, and
+    gives what the last gave: its output is not taken.
+
+    Raises:
+        FramesError: the cache is of another graph: it has less than half of them.
+    """
+    known = cache.tensors.keys() - _merged_outputs(model)
+    bounds = {name: cache.tensors[name] for name in tensors if name in known}
+    if len(bounds) < _LEAST * len(tensors):
+        missing = [name for name in tensors if name not in bounds]
+        raise FramesError(
+            f"{path}: a cache of another graph: it lacks {missing[0]} and"
+            f" {len(missing) - 1} more of {counted(len(tensors), 'tensor')}; it has"
+            f" {next(iter(cache.tensors))}"
+        )
+    return dataclasses.replace(cache, tensors=bounds, model=digest(model))
+
+
+def _merged_outputs(model: ir.Model) -> set[str]:
+    """Return the outputs of nodes that stand for several of the source file."""
+    pasts = {node: provenance.read(node) for node in model.graph}
+    return {
+        str(value.name)
+        for node, past in pasts.items()
+        if past is not None and len(past.origins) > 1
+        for value in node.outputs
+    }
 
 
 def _parse(

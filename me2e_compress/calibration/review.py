@@ -1,7 +1,8 @@
 """What of measured or imported ranges deserves a look, and what to record instead."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Literal
 
 from me2e_compress.calibration.ranges import OUTLIER_CREST, Activity, Ranges
@@ -28,7 +29,7 @@ _SHOWN = 5
 Kind = Literal[
     "rounds to zero", "few elements", "clipped", "dead tensor", "unfed input",
     "constant input", "dead output", "not finite", "few scenes", "other range",
-    "only in one", "renamed", "not in cache",
+    "only in one", "not in cache",
 ]  # fmt: skip
 
 
@@ -76,6 +77,17 @@ def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
         )
         found.append(RangeFinding("few scenes", "note", said, advice=advice))
     return tuple(sorted(found, key=lambda each: each.severity, reverse=True))
+
+
+def not_in(cache: Path, missing: Sequence[str]) -> tuple[RangeFinding, ...]:
+    """Name the tensors that an imported cache lacks."""
+    if not missing:
+        return ()
+    said = f"{counted(len(missing), 'tensor')} not in {cache}"
+    advice = "What reads them stays float, as in TensorRT 10"
+    return (
+        RangeFinding("not in cache", "warning", said, tuple(missing), advice=advice),
+    )
 
 
 def review_beside(

@@ -8,17 +8,17 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.cache_names import SourceNames, taken_from
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.exchange import (
     TABLE_FILES,
     read_cache,
+    taken_from,
     write_onnxruntime_table,
     write_tensorrt_cache,
 )
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges, rms_of
-from me2e_compress.calibration.review import review
+from me2e_compress.calibration.review import not_in, review
 from me2e_compress.calibration.sample import FrameSubset, draw, shard
 from me2e_compress.calibration.stack_frames import StackFrames, recording_of
 from me2e_compress.calibration.statistics import Statistics, merge
@@ -27,7 +27,6 @@ from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.stack.part_graph import PartGraph
 from me2e_compress.manager import recipe
 from me2e_compress.passes.fix_shapes import with_sizes
-from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.quantization.plan.overrides import keep_readers, overrides_text
 from me2e_compress.registry import drafts, marks
 from me2e_compress.runtime.atomic import write_bytes
@@ -85,7 +84,7 @@ def calibrate(
     if options.onnxruntime_table is not None:
         check_folder(Path(options.onnxruntime_table), inputs, TABLE_FILES)
     with writing(outputs, inputs, force=options.force):
-        ready, part, first, names = _ready(source, frames, output, options, listener)
+        ready, part, first = _ready(source, frames, output, options, listener)
         gc.collect()  # 150 MB of VAD-tiny as it was read; graphs are cycles
         with drafts.all_or_none():
             of_first = {
@@ -96,8 +95,8 @@ def calibrate(
                 )
                 for label, file in first.items()
             }
-            if names is not None:
-                found = _import(ready, names, part, output, options)
+            if options.imported is not None:
+                found = _import(ready, part, output, options)
             else:
                 found = _calibrate(ready, part, output, options, listener)
     return dataclasses.replace(found, first_frames=of_first)
@@ -131,13 +130,8 @@ def _ready(
     output: Path,
     options: CalibrateOptions,
     listener: Listener,
-) -> tuple[
-    PreparedGraph, FrameSubset | None, Mapping[str, PartGraph], SourceNames | None
-]:
-    """Read the graph and its frames, and prepare it for int8.
-
-    The last is what its nodes made before the passes, for an import.
-    """
+) -> tuple[PreparedGraph, FrameSubset | None, Mapping[str, PartGraph]]:
+    """Read the graph and its frames, and prepare it for int8."""
     loaded = read_graph(source, listener, options.adapter, options.module_map)
     first = _first_files(loaded, output, options)
     # what is read is checked, and the graph is opened, before any pass runs
@@ -152,13 +146,8 @@ def _ready(
         frames=part,
         provider=options.provider,
     )
-    names = None
-    if options.imported is not None:  # the first pass gives every node its name
-        first_pass = (ImportNormalize(),)
-        named = PreparedGraph.of(source, loaded.model, options.module_map, first_pass)
-        names = SourceNames.of(named.model)
     ready = _prepared(source, loaded.model, options.module_map, options)
-    return ready, part, first, names
+    return ready, part, first
 
 
 def _prepared(
@@ -222,16 +211,15 @@ def _merged(
 
 def _import(
     ready: PreparedGraph,
-    names: SourceNames,
     part: FrameSubset | None,
     output: Path,
     options: CalibrateOptions,
 ) -> CalibrateResult:
     """Take another tool's ranges; keep in float what has none."""
     path = Path(str(options.imported))
-    found, missing, said = taken_from(
-        read_cache(path), path, ready.model, ready.tensors(), names
-    )
+    cache, tensors = read_cache(path), ready.tensors()
+    found = taken_from(cache, path, ready.model, tensors)
+    missing = [name for name in tensors if name not in found.tensors]
     # two frames show the size of every tensor; the second has a state
     if part is not None:
         few = dataclasses.replace(part, places=part.places[:2])
@@ -245,7 +233,7 @@ def _import(
         text = marks.IN_TOML + overrides_text(floats)
         write_bytes(overrides, text.encode())
     return dataclasses.replace(
-        made, findings=(*said, *made.findings), overrides=overrides
+        made, findings=(*not_in(path, missing), *made.findings), overrides=overrides
     )
 
 

@@ -3,6 +3,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
+import onnx_ir as ir
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,12 +11,15 @@ from onnxruntime.quantization.CalTableFlatBuffers.TrtTable import TrtTable
 
 from me2e_compress.calibration.exchange import (
     read_cache,
+    taken_from,
     write_onnxruntime_table,
     write_tensorrt_cache,
 )
 from me2e_compress.calibration.observers import scale_of
-from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.ranges import IMPORTED, Ranges
 from me2e_compress.errors import FramesError, RecipeError
+from me2e_compress.graph import digest, provenance
+from me2e_compress.graph.provenance import Provenance
 from tests.profiles import scaled
 
 NAMES = ("/head/MatMul output", "a: b", "image")
@@ -131,3 +135,39 @@ def test_imported_ranges_fit_any_method_but_one_graph(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match="no calibration method 'imported'"):
         ranges().check(model="digest", tensors=NAMES, method="imported")
     assert np.isfinite(list(found.tensors.values())).all()
+
+
+def model(*origins: str) -> ir.Model:
+    """Read a graph whose first node stands for some nodes of a source file."""
+    read = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]> m (float[1,4] x) => (float[1,4] y)'
+        '{ ["/c"] c = Abs(x) ["/r"] r = Relu(c) ["/y"] y = Exp(r) }'
+    )
+    provenance.stamp(read.graph[0], Provenance("head", origins))
+    return read
+
+
+def cache(*names: str) -> Ranges:
+    return Ranges(dict.fromkeys(names, (-2.0, 2.0)), IMPORTED, 0, "", "")
+
+
+def test_tensors_are_taken_from_a_cache_by_their_names() -> None:
+    found = taken_from(cache("x", "c", "other"), Path("c"), model("/c"), "xcr")
+
+    assert found.tensors == {"x": (-2.0, 2.0), "c": (-2.0, 2.0)}
+    assert found.model == digest(model("/c"))
+
+
+def test_a_name_that_a_merged_node_kept_is_not_trusted() -> None:
+    merged = model("/conv", "/norm")
+
+    assert list(taken_from(cache("x", "c"), Path("c"), merged, "xc").tensors) == ["x"]
+
+
+@pytest.mark.parametrize("names", [("n1",), ("c", "n1", "n2")])
+def test_a_cache_with_less_than_half_is_of_another_graph(
+    names: tuple[str, ...],
+) -> None:
+    message = rf"c: a cache of another graph: it lacks \w and . more of 3 .*{names[0]}"
+    with pytest.raises(FramesError, match=message):
+        taken_from(cache(*names), Path("c"), model("/c"), "xcr")
