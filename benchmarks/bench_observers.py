@@ -1,7 +1,7 @@
 """Which method reads int8 ranges best: what ``observers/README.md`` asks of frames.
 
     python -m benchmarks.bench_observers outliers OUT
-    python -m benchmarks.bench_observers scenes benchmarks/observers OUT
+    python -m benchmarks.bench_observers scenes benchmarks/observers
 
 ``outliers`` gives TCP and VAD-tiny of the zoo, whose weights are random, outliers of
 trained size, and prints the SQNR of every output on held-out frames under each method.
@@ -214,7 +214,7 @@ def _crests(seen: Statistics) -> str:
     return f"{half:.1f} (median) to {most:.0f}"
 
 
-def scenes(folder: Path, out: Path) -> None:
+def scenes(folder: Path) -> None:
     """Compare the ranges of recordings, and of a few scenes with those of all."""
     from me2e_compress.workflows.checks import model_path
     from me2e_compress.workflows.prepare_int8 import PreparedGraph
@@ -223,11 +223,8 @@ def scenes(folder: Path, out: Path) -> None:
     ready = PreparedGraph.of(path, graph.LoadedModel.load(path).model, None)
     tensors, recordings = ready.tensors(), list[Statistics]()
     for seed in (10, 11, 12):
-        file = out / f"seen-{seed}.npz"
-        if not file.is_file():
-            frames = CalibrationSet(folder / f"frames-{seed}")
-            Calibrator().collect(ready.model, tensors, frames).save(file)
-        recordings.append(Statistics.load(file))
+        frames = CalibrationSet(folder / f"frames-{seed}")
+        recordings.append(Calibrator().collect(ready.model, tensors, frames))
     for a, b in itertools.combinations(recordings, 2):
         both = (a.reach > 0) & (b.reach > 0)
         ratio = np.log(a.reach[both] / b.reach[both])
@@ -257,13 +254,12 @@ def main() -> None:
     kinds = parser.add_subparsers(required=True)
     first = kinds.add_parser("outliers")
     second = kinds.add_parser("scenes")
+    first.add_argument("out", type=Path)
     second.add_argument("folder", type=Path)
     for each, run in ((first, outliers), (second, scenes)):
-        each.add_argument("out", type=Path)
         each.set_defaults(run=run)
     chosen = vars(parser.parse_args())
     run = chosen.pop("run")
-    chosen["out"].mkdir(parents=True, exist_ok=True)
     run(**chosen)
 
 

@@ -30,6 +30,8 @@ FORMER = {
     "--no-remedy": "--no-remedy is gone since 0.3.0: compress searches no nodes",
     "driving log nuscenes": f"nuscenes {_NOW} examples/driving_logs",
     "driving log bench2drive": f"bench2drive {_NOW} examples/driving_logs",
+    "--shard": f"--shard {_NOW} one run, which goes on where it was killed",
+    "--merge": f"--merge {_NOW} one run, which goes on where it was killed",
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""
 

@@ -13,7 +13,6 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.recording import write_recording
 from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
-from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.fidelity.sensitivity.recipes import write_recipe
 from me2e_compress.fidelity.sensitivity.trials import Int8Choice
 from me2e_compress.registry.marks import BYTES, MARK, is_marked
@@ -25,7 +24,6 @@ from me2e_compress.zoo.export import save as save_export
 from tests.graph.test_files import weighted
 from tests.workflows.test_latency_figure import trace_of
 
-SEEN = Statistics("m", "s", ("t",), (0,), np.zeros((1, 1, 3), np.float32))
 
 
 def export(path: Path) -> None:
@@ -54,7 +52,6 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "w.onnx": lambda path: graph.save(weighted(900), path, external=True),
     "e.onnx": export,
     "r.toml": recipe,
-    "s.npz": SEEN.save,
     "c.npz": lambda path: CalibrationCheckpoint(path, {}).write(CalibrationState()),
     "frames": record,
     "routes.json": lambda path: save_routes(load_routes(), path),

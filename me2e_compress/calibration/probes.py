@@ -59,7 +59,7 @@ class Counts:
 
         TfidfVectorizer is the one standard operator that counts integers: exact,
         available from opset 9 on, without a second array as large as the tensor.
-        Scaling by a power of two is exact, so shards agree on the bin of every element.
+        Scaling by a power of two is exact: every element lies in its own bin.
         """
         bins_per_unit = np.ldexp(np.float32(BINS), -self.exponents[at])
         factor = shared_constant(

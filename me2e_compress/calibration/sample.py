@@ -1,4 +1,4 @@
-"""Parts of a recording: random samples, shards, and held-out frames."""
+"""Parts of a recording: random samples and held-out frames."""
 
 import dataclasses
 import itertools
@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.shares import Share
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Frame
 
@@ -16,13 +15,11 @@ from me2e_compress.runtime.frames import Frame
 class FrameSubset:
     """Some of the frames of a recording, in its order; the first starts a scene.
 
-    ``places`` are indices in the whole recording; ``share`` is None if it is not a
-    shard.
+    ``places`` are indices in the whole recording.
     """
 
     whole: CalibrationSet
     places: tuple[int, ...]
-    share: Share | None = None
 
     @property
     def fingerprint(self) -> str:
@@ -84,26 +81,6 @@ def hold_out(whole: CalibrationSet, most: int) -> tuple[FrameSubset, FrameSubset
         FrameSubset(whole, tuple(range(cut))),
         FrameSubset(whole, tuple(range(cut, cut + count))),
     )
-
-
-def shard(part: FrameSubset, number: int, count: int) -> FrameSubset:
-    """Return part ``number`` (from 1) of ``count``, with about as many scenes each."""
-    if not 1 <= number <= count:
-        raise FramesError(f"no shard {number} of {count}: they count from 1")
-    taken = set(part.places)
-    # Divide whole scenes only: state runs through them.
-    scenes = [
-        [place for place in scene if place in taken] for scene in _scenes(part.whole)
-    ]
-    scenes = [scene for scene in scenes if scene]
-    if len(scenes) < count:
-        raise FramesError(
-            f"{len(scenes)} scenes cannot be shared by {count} shards: recurrent state"
-            " runs through a scene"
-        )
-    mine = np.array_split(np.arange(len(scenes)), count)[number - 1].tolist()
-    places = tuple(place for at in mine for place in scenes[at])
-    return FrameSubset(part.whole, places, Share(number, count, part.places))
 
 
 def _scenes(whole: CalibrationSet) -> list[range]:

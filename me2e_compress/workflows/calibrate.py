@@ -1,4 +1,4 @@
-"""Calibrate int8: measure, merge or import the ranges of tensors."""
+"""Calibrate int8: measure or import the ranges of tensors."""
 
 import dataclasses
 import gc
@@ -19,9 +19,8 @@ from me2e_compress.calibration.exchange import (
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges, rms_of
 from me2e_compress.calibration.review import not_in, review
-from me2e_compress.calibration.sample import FrameSubset, draw, shard
+from me2e_compress.calibration.sample import FrameSubset, draw
 from me2e_compress.calibration.stack_frames import StackFrames, recording_of
-from me2e_compress.calibration.statistics import Statistics, merge
 from me2e_compress.errors import FramesError
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.stack.part_graph import PartGraph
@@ -32,10 +31,8 @@ from me2e_compress.registry import drafts, marks
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.workflows.calibrate_options import (
     CalibrateOptions,
-    check_sources,
     checkpoint_beside,
     overrides_beside,
-    share_of,
     written_files,
 )
 from me2e_compress.workflows.calibrate_result import CalibrateResult, beside_ranges
@@ -61,15 +58,13 @@ def calibrate(
     """Measure the ranges of every tensor that any scheme, rule set or target needs.
 
     The model is a float ONNX file, the TOML of a stack or the name of one that ships;
-    frames are None to merge shards, and may be to import another tool's ranges. The
-    output is ``RANGES.json``, or ``SHARD.npz`` for a shard. Tensors that an imported
-    cache lacks are kept in float by ``RANGES.overrides.toml``. A run that was killed
-    goes on from ``OUTPUT.checkpoint``. A file that runs at first frames alone has
-    ranges of its own beside it, ``RANGES.head.first_frame.json``.
+    frames may be None to import another tool's ranges. The output is ``RANGES.json``.
+    Tensors that an imported cache lacks are kept in float by ``RANGES.overrides.toml``.
+    A run that was killed goes on from ``OUTPUT.checkpoint``. A file that runs at first
+    frames alone has ranges of its own beside it, ``RANGES.head.first_frame.json``.
 
     Raises:
-        FramesError: There is no source, or shards beside another, or frames or a cache
-            do not fit.
+        FramesError: There is no source, or frames or a cache do not fit.
         PreconditionError: The graph is quantized already, or nothing can become int8.
         GraphError: The model does not exist, or an output would harm an input.
         RecipeError: The recipe does not exist.
@@ -77,10 +72,14 @@ def calibrate(
     """
     options = options or CalibrateOptions()
     source, output = model_path(model), output_path(output)
-    check_sources(frames, options)
+    if frames is None and options.imported is None:
+        raise FramesError(
+            "give recorded frames, or another tool's cache (--import, frames then judge"
+            " its scales); ranges are never made up"
+        )
     named = (options.recipe, options.module_map, options.imported, options.adapter)
     outputs = written_files(output, options)
-    inputs = (source, frames, *named, *options.merge)
+    inputs = (source, frames, *named)
     if options.onnxruntime_table is not None:
         check_folder(Path(options.onnxruntime_table), inputs, TABLE_FILES)
     with writing(outputs, inputs, force=options.force):
@@ -108,9 +107,9 @@ def _first_files(
     """Return the files of a stack that run at first frames alone, by label."""
     found = loaded.first_files
     check_ours([beside_ranges(output, each) for each in found], force=options.force)
-    if found and (options.shard or options.merge or options.imported):
+    if found and options.imported:
         raise FramesError(
-            f"{loaded.path}: --shard, --merge and --import are for one graph, and"
+            f"{loaded.path}: --import is for one graph, and"
             f" {', '.join(found)} runs where a scene begins"
         )
     return found
@@ -169,8 +168,6 @@ def _calibrate(
     listener: Listener,
 ) -> CalibrateResult:
     tensors = ready.tensors()
-    if part is None:  # shards were measured elsewhere
-        return _written(_merged(ready, tensors, options), output, options)
     # a checkpoint lets a run that was killed go on
     method = options.method or ready.method
     checkpoint = checkpoint_beside(output)
@@ -183,30 +180,15 @@ def _calibrate(
         part,
         lambda done, of: listener.on_progress("calibrate", done, of, method),
     )
-    if options.shard is not None:
-        dataclasses.replace(seen, share=part.share).save(output)
-        return CalibrateResult(output, len(part), None, options.shard)
     return _written(Ranges.of(seen, OBSERVERS.parse(method)), output, options)
 
 
 def _part(
     loaded: graph.LoadedModel, folder: str | Path, options: CalibrateOptions
 ) -> FrameSubset:
-    """Draw frames that fit the model, or one shard of them."""
+    """Draw frames that fit the model."""
     recording = recording_of(loaded, folder, options.provider)
-    drawn = draw(recording, options.count, options.seed)
-    return drawn if options.shard is None else shard(drawn, *share_of(options.shard))
-
-
-def _merged(
-    ready: PreparedGraph, tensors: tuple[str, ...], options: CalibrateOptions
-) -> Ranges:
-    seen = merge([Statistics.load(Path(path)) for path in options.merge])
-    method = options.method or ready.method
-    found = Ranges.of(seen, OBSERVERS.parse(method))
-    digest = graph.digest(ready.model)
-    found.check(model=digest, tensors=tensors, method=method, named=options.merge[0])
-    return found
+    return draw(recording, options.count, options.seed)
 
 
 def _import(

@@ -1,4 +1,4 @@
-"""How ranges are measured, merged or imported, and the files that this takes."""
+"""How ranges are measured or imported, and the files that this takes."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -6,14 +6,13 @@ from pathlib import Path
 
 from me2e_compress.calibration.exchange import TABLE_FILES
 from me2e_compress.calibration.observers import OBSERVERS
-from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.checks import MOST_THREADS, check_count
 
 
 @dataclasses.dataclass(frozen=True)
 class CalibrateOptions:
-    """How ranges are measured, merged or imported.
+    """How ranges are measured or imported.
 
     Attributes:
         recipe: a shipped recipe or a TOML file; its passes before int8 are run.
@@ -22,8 +21,6 @@ class CalibrateOptions:
         count: number of frames, drawn in whole scenes.
         seed: seed of that draw.
         module_map: preset or TOML file; None finds the preset.
-        shard: ``2/4`` measures only the second of four shards and saves statistics.
-        merge: saved shards to merge, instead of frames.
         imported: a TensorRT cache or onnxruntime table, instead of frames; frames given
             too only judge its scales.
         tensorrt_cache: write a TensorRT calibration cache too.
@@ -36,8 +33,7 @@ class CalibrateOptions:
         force: replace outputs that we did not write, too.
 
     Raises:
-        RecipeError: The method, a number or the shard is not valid.
-        FramesError: A shard is asked for a file that only whole ranges can fill.
+        RecipeError: The method or a number is not valid.
     """
 
     recipe: str | Path = "exact"
@@ -45,8 +41,6 @@ class CalibrateOptions:
     count: int = 256
     seed: int = 0
     module_map: str | Path | None = None
-    shard: str | None = None
-    merge: tuple[str | Path, ...] = ()
     imported: str | Path | None = None
     tensorrt_cache: str | Path | None = None
     onnxruntime_table: str | Path | None = None
@@ -61,26 +55,6 @@ class CalibrateOptions:
             OBSERVERS.parse(self.method)
         check_count("--seed", self.seed)
         check_count("--threads", self.threads, most=MOST_THREADS)
-        if self.shard is None:
-            return
-        share_of(self.shard)
-        if self.tensorrt_cache is not None or self.onnxruntime_table is not None:
-            raise FramesError(
-                "a shard has no ranges yet: leave --tensorrt-cache and"
-                " --onnxruntime-table to --merge"
-            )
-
-
-def check_sources(frames: str | Path | None, options: CalibrateOptions) -> None:
-    """Refuse no source, or shards beside another one."""
-    measured = frames is not None or options.imported is not None
-    if measured == bool(options.merge):
-        raise FramesError(
-            "give recorded frames, or shards (--merge), or another tool's cache"
-            " (--import, frames then judge its scales); ranges are never made up"
-        )
-    if options.shard is not None and (frames is None or options.imported is not None):
-        raise FramesError("--shard is for frames, and none are given")
 
 
 def checkpoint_beside(output: Path) -> Path:
@@ -105,11 +79,3 @@ def written_files(output: Path, options: CalibrateOptions) -> list[Path]:
         if folder.is_dir():
             files += (folder / name for name in TABLE_FILES)
     return files
-
-
-def share_of(text: str) -> tuple[int, int]:
-    """Parse which shard of how many: ``2/4``."""
-    number, slash, count = text.partition("/")
-    if not slash or not (number.isdecimal() and count.isdecimal()):
-        raise RecipeError(f"--shard is {text!r}; write 2/4 for the second of four")
-    return int(number), int(count)

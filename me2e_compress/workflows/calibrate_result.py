@@ -1,4 +1,4 @@
-"""The result of a calibration: ranges, or the statistics of one shard."""
+"""The result of a calibration."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from me2e_compress.workflows.result import Result, counted
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CalibrateResult(Result):
-    """The range of every tensor; or a shard's statistics, with `ranges` of None.
+    """The range of every tensor.
 
     Of a stack, `first_frames` has those of each file for first frames, by label.
     `findings` say what of the ranges deserves a look. `overrides` is the file that
@@ -20,8 +20,7 @@ class CalibrateResult(Result):
 
     output: Path
     frames: int
-    ranges: Ranges | None
-    shard: str | None = None
+    ranges: Ranges
     first_frames: Mapping[str, "CalibrateResult"] = dataclasses.field(
         default_factory=dict
     )
@@ -31,8 +30,6 @@ class CalibrateResult(Result):
     @property
     def headline(self) -> str:
         """The file, and the number of tensors, the method and the number of frames."""
-        if self.ranges is None:
-            return f"{self.output}: shard {self.shard}, {counted(self.frames, 'frame')}"
         found = self.ranges
         return (
             f"{self.output}: {counted(len(found.tensors), 'tensor')}, {found.method},"
@@ -56,16 +53,13 @@ class CalibrateResult(Result):
 
     def records(self) -> list[dict[str, object]]:
         """Return one row per tensor."""
-        tensors = {} if self.ranges is None else self.ranges.tensors
         return [
             {"tensor": name, "low": low, "high": high}
-            for name, (low, high) in tensors.items()
+            for name, (low, high) in self.ranges.tensors.items()
         ]
 
     def to_json(self) -> object:
-        """Return the ranges and the tensors that are always zero, or the shard."""
-        if self.ranges is None:
-            return {"shard": self.shard, "frames": self.frames}
+        """Return the ranges and the tensors that are always zero."""
         first = {name: each.to_json() for name, each in self.first_frames.items()}
         found = self.ranges
         own = {**dataclasses.asdict(found), "dead": found.dead}

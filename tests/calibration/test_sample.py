@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.sample import hold_out
+from me2e_compress.calibration.sample import draw, hold_out
+from me2e_compress.errors import FramesError
 from tests.frames import record
 
 
@@ -45,3 +46,21 @@ def test_state_begins_anew_where_a_scene_is_cut(tmp_path: Path) -> None:
     _, kept = hold_out(recording(tmp_path, 8, (0,)), 4)
 
     assert [frame.starts_scene for frame in kept] == [True, False]
+
+
+def test_frames_are_drawn_by_seed_in_whole_scenes(tmp_path: Path) -> None:
+    scenes = (0, 2, 3, 5)
+    frames = recording(tmp_path, 7, scenes)
+
+    drawn = [draw(frames, 4, seed).places for seed in range(20)]
+
+    assert draw(frames, 4, 7).places == drawn[7]
+    assert len(set(drawn)) > 5
+    for places in drawn:
+        assert list(places) == sorted(set(places))
+        assert len(places) == 4
+        for place in places:
+            assert place in scenes or place - 1 in places
+    assert draw(frames, 99, 3).places == tuple(range(7))
+    with pytest.raises(FramesError, match="0 frames were asked for"):
+        draw(frames, 0, 0)

@@ -1,7 +1,6 @@
-"""``calibrate`` and ``ranges``: ranges are saved, merged, held against others."""
+"""``calibrate`` and ``ranges``: ranges are saved, and held against others."""
 
 import json
-import re
 import struct
 from pathlib import Path
 
@@ -45,51 +44,6 @@ def test_saved_ranges_make_the_file_that_frames_make(
     made = graph.load(folder / "a.onnx").graph
     assert "QuantizeLinear" in [node.op_type for node in made]
     assert len(digests(folder / "a.onnx", folder / "b.onnx")) == 1
-
-
-def test_merged_shards_give_the_ranges_of_one_run(cli: Cli, folder: Path) -> None:
-    cli.done(f"{RANGES} --method mse -o whole.json")
-    for part in "12":
-        cli.done(f"{RANGES} --method mse --shard {part}/2 -o {part}.npz")
-    merge = "--merge 1.npz --merge 2.npz --method mse"
-    cli.done(f"calibrate dense.onnx {merge} {MAP} -o merged.json")
-
-    merged = (folder / "merged.json").read_bytes()
-    assert merged == (folder / "whole.json").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        (["1/3"], "shard 2 of 3 is missing, and 1 more"),
-        (["1/3", "3/3"], "shard 2 of 3 is missing, and 0 more"),
-        (["1/2", "3/3"], "shard 3 of 3, shard 1 of 2"),
-        (["1/2 -n 4", "2/2 -n 6"], r"1 and 2 are of different draws \(4 and 6 frames"),
-        (["1/2 -n 4", "2/2 -n 4 --seed 1"], "are of different draws"),
-        (["1/2", "2/2", "2/2"], "frame 4 is in two of the shards"),
-    ],
-)
-@pytest.mark.usefixtures("folder")
-def test_shards_that_are_no_whole_are_one_line(
-    cli: Cli, parts: list[str], message: str
-) -> None:
-    for at, part in enumerate(parts):
-        cli.done(f"{RANGES} --shard {part} -o {at}.npz")
-    merged = " ".join(f"--merge {at}.npz" for at in range(len(parts)))
-
-    said = cli.refused(f"calibrate dense.onnx {merged} {MAP} -o r.json")
-
-    assert re.search(message, said)
-
-
-def test_shards_of_another_model_are_refused(cli: Cli, folder: Path) -> None:
-    cli.done(f"{RANGES} --shard 1/1 -o s.npz")
-    model = graph.load(folder / "dense.onnx")
-    model.graph[1].name = "/plan_head/Other"
-    graph.save(model, folder / "other.onnx")
-
-    line = f"calibrate other.onnx -r exact --merge s.npz {MAP} -o r.json"
-    assert "stale: of graph" in cli.refused(line)
 
 
 def test_another_tools_cache_comes_and_goes(cli: Cli, folder: Path) -> None:
@@ -214,9 +168,8 @@ def test_fewer_frames_are_drawn_by_seed(cli: Cli, folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("folder")
-@pytest.mark.parametrize("shard", ["", "--shard 1/2"])
-def test_programs_get_json(cli: Cli, shard: str) -> None:
-    cli.document(f"{RANGES} {shard} -o r.npz")
+def test_programs_get_json(cli: Cli) -> None:
+    cli.document(f"{RANGES} -o r.json")
 
 
 def write_net(folder: Path) -> None:

@@ -23,7 +23,6 @@ INT8 = f"{M} --scheme full --frames frames"
 WRITERS = [
     f"compress {INT8}",
     f"calibrate {F}",
-    f"calibrate {F} --shard 1/1",
     f"plan {M}",
     f"sensitivity {F}",
     f"search {F} --max-mb 1",
@@ -32,7 +31,6 @@ WRITERS = [
 READERS = [
     f"calibrate {F} -r r.toml",
     f"calibrate {F} --map map.toml",
-    f"calibrate {M} --merge s.npz",
     f"calibrate {M} --import trt.cache",
     f"compress {INT8} --ranges ranges.json",
     f"compress {INT8} --overrides o.toml",

@@ -154,14 +154,11 @@ def pipeline_cases() -> Iterator[Case]:
 
 
 def cache_cases() -> Iterator[Case]:
-    """Yield broken caches of TensorRT, and shards of a calibration."""
+    """Yield broken caches of TensorRT."""
     cache = ("calibrate", MODEL, "--import", "bad.cache", "-o", "out.json")
-    merge = ("calibrate", MODEL, "--merge", "bad.npz", "-o", "out.json")
     for name, content in texts.neither():
         line = b"TRT-1-A\nx: " if len(name) % 2 else b""
         yield Case(f"cache-{name}", cache, {"bad.cache": line + content})
-    for name, content in itertools.islice(frames.broken_frames(), 0, None, 3):
-        yield Case(f"shard-{name}", merge, {"bad.npz": content})
 
 
 def session_cases() -> Iterator[Case]:

@@ -91,7 +91,6 @@ def write_good(folder: Path, command: Command) -> None:
     for name, text in {"map": MAP, "overrides": OVERRIDES, "adapter": ADAPTER}.items():
         (folder / f"{name}.toml").write_text(text)
     recorded = (model, folder / "frames", "-o")
-    assert command("calibrate", *recorded, folder / "shard.npz", "--shard", "1/1") == 0
     cache = ("--tensorrt-cache", folder / "trt.cache")
     assert command("calibrate", *recorded, folder / "ranges.json", *cache) == 0
     assert command("plan", model, "-o", folder / "plan.json") == 0

@@ -15,12 +15,8 @@ from me2e_compress.workflows.checks import sizes
 Frames = Annotated[
     Path | None, typer.Argument(help="the recorded FRAMES; --import needs none")
 ]
-Output = Annotated[
-    Path, typer.Option("-o", "--output", help="the ranges as JSON; of a shard .npz")
-]
+Output = Annotated[Path, typer.Option("-o", "--output", help="the ranges as JSON")]
 Recipe = Annotated[str, typer.Option("-r", "--recipe", help=given.RECIPE)]
-Shard = Annotated[str | None, typer.Option(help="2/4: the second of four shards")]
-Merge = Annotated[list[Path] | None, typer.Option(help="a SHARD.npz; once for each")]
 Cache = Annotated[Path | None, typer.Option(help="write a TensorRT cache too")]
 Table = Annotated[Path | None, typer.Option(help="write onnxruntime's too: a folder")]
 
@@ -36,8 +32,6 @@ def calibrate(
     module_map: given.ModuleMap = None,
     set_dim: given.SetDim = None,
     adapter: given.Adapter = None,
-    shard: Shard = None,
-    merge: Merge = None,
     imported: given.Import = None,
     tensorrt_cache: Cache = None,
     onnxruntime_table: Table = None,
@@ -54,7 +48,7 @@ def calibrate(
     """
     options = CalibrateOptions(
         recipe=recipe, method=method, count=count, seed=seed, module_map=module_map,
-        shard=shard, merge=tuple(merge or ()), imported=imported, threads=threads,
+        imported=imported, threads=threads,
         force=force, adapter=adapter,
         tensorrt_cache=tensorrt_cache, onnxruntime_table=onnxruntime_table,
         dims=sizes(set_dim or ()), provider=provider_named(provider, plugins or ()),
