@@ -220,7 +220,7 @@ def scenes(folder: Path) -> None:
     from me2e_compress.workflows.prepare_int8 import PreparedGraph
 
     path = model_path("highway")
-    ready = PreparedGraph.of(path, graph.LoadedModel.load(path).model, None)
+    ready = PreparedGraph.of(path, graph.load(path), None)
     tensors, recordings = ready.tensors(), list[Statistics]()
     for seed in (10, 11, 12):
         frames = CalibrationSet(folder / f"frames-{seed}")

@@ -34,9 +34,11 @@ from me2e_compress.workflows.compare_dump import DumpResult
 from me2e_compress.workflows.doctor import Checkup
 from me2e_compress.workflows.inspect_result import InspectResult
 from me2e_compress.workflows.int8_outcome import Int8Outcome
+from me2e_compress.workflows.join import JoinResult
 from me2e_compress.workflows.lint import RuleSummary
 from me2e_compress.workflows.measured_loss import MeasuredLoss
 from me2e_compress.workflows.runtime_loss import RuntimeLoss
+from me2e_compress.workflows.split import SplitResult
 from me2e_compress.zoo.weights_record import WeightsRecord
 
 PAGE = Path(__file__).parents[1] / "docs" / "json.md"
@@ -56,7 +58,7 @@ NAMED = (
     *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity, Rung),
     *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
     *(Int8Outcome, RuleSummary, WeightsRecord, RangeFinding, DumpResult),
-    *(FirstDifference, RuntimeLoss),
+    *(FirstDifference, RuntimeLoss, JoinResult, SplitResult),
 )
 """Classes that the forms name; what their fields name is found."""
 HEAD = """\

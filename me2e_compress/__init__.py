@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.frames import FramesOptions, record_frames
     from me2e_compress.workflows.inspect import inspect
     from me2e_compress.workflows.inspect_result import InspectResult
+    from me2e_compress.workflows.join import JoinResult, join
     from me2e_compress.workflows.lint import LintOptions, LintResult, lint
     from me2e_compress.workflows.listener import Listener
     from me2e_compress.workflows.plan import PlanOptions, PlanResult, plan
@@ -61,6 +62,7 @@ if TYPE_CHECKING:
         SensitivityResult,
         measure_sensitivity,
     )
+    from me2e_compress.workflows.split import SplitResult, split
 
 __all__ = [
     "PASSES",
@@ -81,6 +83,7 @@ __all__ = [
     "FirstDifferenceResult",
     "FramesOptions",
     "InspectResult",
+    "JoinResult",
     "LintOptions",
     "LintResult",
     "Listener",
@@ -101,6 +104,7 @@ __all__ = [
     "SearchResult",
     "SensitivityOptions",
     "SensitivityResult",
+    "SplitResult",
     "Step",
     "StudyResult",
     "Verification",
@@ -115,6 +119,7 @@ __all__ = [
     "first_difference",
     "graph",
     "inspect",
+    "join",
     "lint",
     "load_study",
     "measure_sensitivity",
@@ -125,6 +130,7 @@ __all__ = [
     "run_study",
     "score",
     "search",
+    "split",
     "write_study",
 ]
 
@@ -161,6 +167,7 @@ _ROOMS = {
     "workflows.frames": ("FramesOptions", "record_frames"),
     "workflows.inspect": ("inspect",),
     "workflows.inspect_result": ("InspectResult",),
+    "workflows.join": ("JoinResult", "join"),
     "workflows.lint": ("LintOptions", "LintResult", "lint"),
     "workflows.listener": ("Listener",),
     "workflows.plan": ("PlanOptions", "PlanResult", "plan"),
@@ -176,6 +183,7 @@ _ROOMS = {
         "SensitivityResult",
         "measure_sensitivity",
     ),
+    "workflows.split": ("SplitResult", "split"),
 }
 _HOMES = {name: room for room, names in _ROOMS.items() for name in names}
 

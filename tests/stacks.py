@@ -8,7 +8,9 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import rewrite
+from me2e_compress.graph.stack.stack import JoinedStack
 from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.session import Session
 from tests.frames import record
 
 BACKBONE = """
@@ -29,15 +31,6 @@ head (float[1,4] feats, float[1,4] prev_bev)
 }
 """
 
-HEAD_FIRST = """
-<ir_version: 9, opset_import: ["" : 17]>
-head_first (float[1,4] feats) => (float[1,4] next_bev, float[1,2,2] plan)
-<float[1] ten = {10}, int64[3] points = {1, 2, 2}> {
-    ["/head/Mul"] next_bev = Mul(feats, ten)
-    ["/head/Reshape"] plan = Reshape(next_bev, points)
-}
-"""
-
 TWO_PARTS = """
 [[part]]
 name = "head"
@@ -47,32 +40,20 @@ name = "backbone"
 file = "backbone.onnx"
 """
 
-THREE_FILES = TWO_PARTS.replace(
-    'file = "head.onnx"', 'file = "head.onnx"\nfirst_frame = "head_first.onnx"'
-)
-
-STATE = TWO_PARTS + "[state]\nprev_bev = {first = %r}\n"
-"""Where the state of the two parts begins."""
-
-TWO_MODULES = """
-[modules.a]
-role = "feature"
-patterns = ["backbone"]
-[modules.b]
-role = "prediction"
-patterns = ["head"]
-"""
-"""A map with a module for each part."""
-
 
 def write_stack(folder: Path, toml: str = TWO_PARTS, **texts: str) -> Path:
-    """Write the three graphs, or others of these names, and a TOML; return that."""
-    known = {"backbone": BACKBONE, "head": HEAD, "head_first": HEAD_FIRST}
+    """Write the two graphs, or others of these names, and a TOML; return that."""
+    known = {"backbone": BACKBONE, "head": HEAD}
     for name, text in (known | texts).items():
         graph.save(ir.from_onnx_text(text), folder / f"{name}.onnx")
     path = folder / "stack.toml"
     path.write_text(toml)
     return path
+
+
+def joined(path: Path) -> Session:
+    """Open the graph that a stack's files are joined to."""
+    return Session(JoinedStack.load(path).model, threads=1, optimize=False)
 
 
 DENSE = {
@@ -86,15 +67,6 @@ backbone (float[4,16] img) => (float[4,32] feats)
 head (float[4,32] feats, float[4,32] prev_bev)
     => (float[4,32] next_bev, float[1,64,2] plan) <int64[3] points = {1, 64, 2}> {
     ["/head/Add"] next_bev = Add(feats, prev_bev)
-    ["/head/MatMul"] far = MatMul(next_bev, w)
-    ["/head/Reshape"] plan = Reshape(far, points)
-}
-""",
-    "head_first": """
-<ir_version: 9, opset_import: ["" : 17]>
-head_first (float[4,32] feats) => (float[4,32] next_bev, float[1,64,2] plan)
-<int64[3] points = {1, 64, 2}> {
-    ["/head/Identity"] next_bev = Identity(feats)
     ["/head/MatMul"] far = MatMul(next_bev, w)
     ["/head/Reshape"] plan = Reshape(far, points)
 }

@@ -25,7 +25,6 @@ from tests.graph.test_files import weighted
 from tests.workflows.test_latency_figure import trace_of
 
 
-
 def export(path: Path) -> None:
     """Write what the exporter of torch gives: it names itself."""
     made = onnx.helper.make_model(

@@ -66,6 +66,8 @@ _PANELS = {
         "inspect": (
             "Show what a graph holds: interface, and nodes, parameters, MACs by module."
         ),
+        "join": "Join the files of a model into one graph, which all commands take.",
+        "split": "Cut a graph that was joined, and made smaller, into its files again.",
         "frames": "Write calibration frames, coherent in time, seen by six cameras.",
     },
     "Compress": {

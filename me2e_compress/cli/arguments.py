@@ -9,9 +9,7 @@ from me2e_compress.cli.verbosity import set_json
 
 Model = Annotated[str, typer.Argument(help="the ONNX file, or highway; not changed")]
 FloatModel = Annotated[str, typer.Argument(help="the ONNX file, or highway; float")]
-AnyModel = Annotated[
-    str, typer.Argument(help="the ONNX file, a stack's TOML, or highway; not changed")
-]
+Stack = Annotated[Path, typer.Argument(help="the TOML file that names the files")]
 Recording = Annotated[Path, typer.Argument(help="the recorded FRAMES")]
 ModuleMap = Annotated[
     str | None, typer.Option("--map", help="vad, uniad, tcp, highway, or a TOML file")

@@ -14,15 +14,14 @@ from me2e_compress.driving.contract import Answer, Observation, RouteInfo, Traje
 from me2e_compress.driving.host_stage import HostStage, HostWork
 from me2e_compress.driving.ports import fits
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
-from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.stack_session import open_session
+from me2e_compress.runtime.session import Session
 
 
 @dataclass
 class OnnxPolicy:
-    """Runs an ONNX graph or a stack of several, on one thread that does not spin.
+    """Runs an ONNX graph, on one thread that does not spin.
 
     Inputs are ``img`` float [1, 6, 3, H, W], ``lidar2img`` [1, 6, 4, 4], ``can_bus``
     [18], ``command`` int64 [1] and ``timestamp`` float [1], seconds since the route
@@ -32,7 +31,7 @@ class OnnxPolicy:
     spacing, and controls. ``stage`` changes the plan on the host.
     """
 
-    session: AnySession
+    session: Session
     adapter: Adapter
     inputs: ModelInputs
     outputs: ModelOutputs
@@ -54,7 +53,7 @@ class OnnxPolicy:
         stage: HostStage | None = None,
         said: Mapping[str, str] | None = None,
     ) -> Self:
-        """Load a file, or the TOML of a stack of several, and run it once on zeros.
+        """Load a file, and run it once on zeros.
 
         ``said`` are metadata that override the model's own.
 
@@ -62,7 +61,7 @@ class OnnxPolicy:
             EvaluationError: It cannot be run, or does not keep the contract.
         """
         try:
-            session = open_session(
+            session = Session(
                 path, threads=1, int8_kernels=True, provider=provider, said=said
             )
             return cls.of(session, adapter or Adapter(), stage)
@@ -72,7 +71,7 @@ class OnnxPolicy:
 
     @classmethod
     def of(
-        cls, session: AnySession, adapter: Adapter, stage: HostStage | None = None
+        cls, session: Session, adapter: Adapter, stage: HostStage | None = None
     ) -> Self:
         """Drive a graph that is open, and run it once on zeros; see :meth:`open`."""
         recurrent = recurrent_of(session, adapter)
@@ -118,7 +117,7 @@ class OnnxPolicy:
         feeds = self.feeds(observation)
         if self._begins:
             self._state |= self.first.at(feeds)
-        outputs = self.session.run({**self._state, **feeds}, first=self._begins)
+        outputs = self.session.run({**self._state, **feeds})
         self._begins = False
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
         # the host stage may change the plan
@@ -157,7 +156,7 @@ class OnnxPolicy:
                 )
 
 
-def recurrent_of(session: AnySession, adapter: Adapter) -> dict[str, str]:
+def recurrent_of(session: Session, adapter: Adapter) -> dict[str, str]:
     """Return each recurrent input with the output that answers it."""
     fed_otherwise = {*adapter.feeds, *adapter.images}
     if adapter.recurrent is not None:

@@ -10,10 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
-from me2e_compress.runtime.session import detached, replay
+from me2e_compress.runtime.session import Session, detached, replay
 
 Float64: TypeAlias = npt.NDArray[np.float64]
 Watch: TypeAlias = Callable[[dict[str, Array], dict[str, Array], Frame], None]
@@ -85,19 +84,19 @@ class Reference:
     ``answers`` holds its outputs on every frame, all in memory.
     """
 
-    session: AnySession
+    session: Session
     frames: Frames
     answers: tuple[dict[str, Array], ...]
 
     @classmethod
-    def of(cls, session: AnySession, frames: Frames) -> Self:
+    def of(cls, session: Session, frames: Frames) -> Self:
         """Run the model once over the frames."""
         answers = tuple(detached(each) for each in replay(session, frames))
         return cls(session, frames, answers)
 
     def compare(
         self,
-        other: AnySession,
+        other: Session,
         frames: Frames | None = None,
         watch: Watch | None = None,
     ) -> Fidelity:
@@ -111,7 +110,7 @@ class Reference:
 
 
 def compare(
-    a: AnySession, b: AnySession, frames: Iterable[Frame], watch: Watch | None = None
+    a: Session, b: Session, frames: Iterable[Frame], watch: Watch | None = None
 ) -> Fidelity:
     """Run two models over the same frames, each with its own recurrent state.
 
@@ -128,9 +127,9 @@ def compare(
 
 
 def _compare(
-    a: AnySession,
+    a: Session,
     answers: Iterator[dict[str, Array]],
-    b: AnySession,
+    b: Session,
     frames: Iterable[Frame],
     watch: Watch | None = None,
 ) -> Fidelity:
@@ -172,7 +171,7 @@ def _compare(
     )
 
 
-def common_adapter(a: AnySession, b: AnySession) -> tuple[PlanAdapter | None, str]:
+def common_adapter(a: Session, b: Session) -> tuple[PlanAdapter | None, str]:
     """Return how the plan of both models is read; else None and the reason."""
     adapter = PlanAdapter.of(a.metadata, list(a.outputs))
     if adapter is None:

@@ -10,8 +10,8 @@ from me2e_compress.fidelity.engine_run import EngineRun
 from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.fidelity.output_liveness import Movement
 from me2e_compress.fidelity.saturation import Cause
-from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.session import Session
 
 LOWEST_DB = -20.0
 """The closeness of outputs that cannot be compared, since the graph's is not finite."""
@@ -67,7 +67,7 @@ class _Sums:
 
 def losses(
     run: EngineRun,
-    source: AnySession | None,
+    source: Session | None,
     alive: float = ALIVE,
     on_frame: Callable[[int], None] = lambda index: None,
 ) -> tuple[OutputLoss, ...]:

@@ -6,9 +6,8 @@ from typing import Protocol, TypeAlias, TypeVar
 import numpy as np
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.session import DTYPES
+from me2e_compress.runtime.session import DTYPES, Session
 
 Arrays: TypeAlias = Mapping[str, Array]
 T_co = TypeVar("T_co", covariant=True)
@@ -37,7 +36,7 @@ class EngineRun:
     """
 
     def __init__(
-        self, session: AnySession, frames: Indexed[Frame], dump: Indexed[Arrays]
+        self, session: Session, frames: Indexed[Frame], dump: Indexed[Arrays]
     ) -> None:
         self.session, self.frames, self.dump = session, frames, dump
         self.names = [name for name in session.outputs if name in dump[0]]
@@ -46,7 +45,7 @@ class EngineRun:
         return len(self.frames)
 
     def follow(
-        self, session: AnySession, names: Sequence[str]
+        self, session: Session, names: Sequence[str]
     ) -> Iterator[tuple[Arrays, Arrays]]:
         """Run a graph over all frames; yield its inputs and the outputs that are named.
 
@@ -61,7 +60,7 @@ class EngineRun:
             if index == 0 or frame.starts_scene:
                 state = session.first_state(frame.arrays)
             inputs = {**frame.arrays, **state}
-            answers = session.run(inputs, asked, first=frame.starts_scene)
+            answers = session.run(inputs, asked)
             yield inputs, {name: answers[name] for name in names}
             after = {**answers, **self.dump[index]}
             # a copy: the session may write its next answers into the same memory

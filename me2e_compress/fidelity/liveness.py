@@ -25,9 +25,8 @@ from me2e_compress.fidelity.output_liveness import (
     share_without_jumps,
 )
 from me2e_compress.fidelity.saturation import cause_of
-from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.session import detached
+from me2e_compress.runtime.session import Session, detached
 
 LEAST_SIDE = 16
 """Least rows and columns of a camera's picture."""
@@ -40,7 +39,7 @@ Sides: TypeAlias = tuple[dict[str, Array], dict[str, Array]]
 
 
 def measure_liveness(
-    a: AnySession, b: AnySession, frames: Iterable[Frame], alive: float = ALIVE
+    a: Session, b: Session, frames: Iterable[Frame], alive: float = ALIVE
 ) -> Liveness:
     """Run two graphs over frames and compare how their outputs answer.
 
@@ -129,7 +128,7 @@ class LivenessTally:
     taken from a second frame too: a graph that picks may have jumped but once.
     """
 
-    def __init__(self, a: AnySession, b: AnySession) -> None:
+    def __init__(self, a: Session, b: Session) -> None:
         self._sessions = a, b
         names = [name for name in a.outputs if name in b.outputs]
         self._movements = {name: Movement() for name in names}
@@ -259,5 +258,4 @@ class LivenessTally:
         else:
             feeds[part.input] = feeds[part.input].copy()
             part.of(feeds[part.input])[...] = donor.values[side]
-        names, first = list(self._movements), base.frame.starts_scene
-        return detached(session.run(feeds, names, first=first))
+        return detached(session.run(feeds, list(self._movements)))

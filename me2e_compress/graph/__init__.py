@@ -5,7 +5,14 @@ package says about it, besides walking nodes and values.
 """
 
 from me2e_compress.graph.digest import digest
-from me2e_compress.graph.files import data_names, is_external, save
+from me2e_compress.graph.files import (
+    data_names,
+    file_bytes,
+    is_external,
+    load,
+    save,
+    sha256_of,
+)
 from me2e_compress.graph.nodes import (
     array_of,
     graphs_of,
@@ -27,15 +34,6 @@ from me2e_compress.graph.shapes import (
     rank_of,
     static_shape,
 )
-from me2e_compress.graph.stack.stack import (
-    JoinedStack,
-    LoadedModel,
-    file_bytes,
-    load,
-    paths_of,
-    sha256_of,
-)
-from me2e_compress.graph.stack.stack_file import is_stack
 from me2e_compress.graph.summary import (
     Port,
     Size,
@@ -50,8 +48,6 @@ from me2e_compress.graph.summary import (
 __all__ = [
     "CONVOLUTIONS",
     "WEIGHTED",
-    "JoinedStack",
-    "LoadedModel",
     "Port",
     "Provenance",
     "Size",
@@ -67,7 +63,6 @@ __all__ = [
     "input_at",
     "interface",
     "is_external",
-    "is_stack",
     "is_standard",
     "load",
     "macs",
@@ -76,7 +71,6 @@ __all__ = [
     "nodes_of",
     "open_shape",
     "opset_of",
-    "paths_of",
     "producer_of",
     "rank_of",
     "save",

@@ -51,6 +51,11 @@ def load(path: str | Path) -> ir.Model:
     path = Path(path)
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
+    if path.suffix == ".toml":
+        raise GraphError(
+            f"{path}: a stack of several files is joined first: me2e-compress join"
+            f" {path} -o MODEL.onnx"
+        )
     try:
         proto = onnx.load(path, format="protobuf", load_external_data=False)
     except DecodeError as error:

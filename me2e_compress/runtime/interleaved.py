@@ -8,7 +8,6 @@ from statistics import median
 from time import perf_counter, process_time
 
 from me2e_compress.graph import sha256_of
-from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.others_load import OthersLoad
@@ -19,7 +18,7 @@ from me2e_compress.runtime.profile import (
     machine_words,
 )
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import replay
+from me2e_compress.runtime.session import Session, replay
 
 BLOCK = 10
 """Inferences of one model in a row: caches stay warm, and noise that lasts a second
@@ -48,7 +47,7 @@ class RunTimes:
 
 
 def time_interleaved(
-    sessions: Mapping[str, AnySession],
+    sessions: Mapping[str, Session],
     frames: Sequence[Frame],
     rounds: int,
     on_run: Callable[[int, int, str], None] | None = None,
@@ -89,7 +88,7 @@ def record_traces(
     """Record the latency of models, each warm, in alternating blocks.
 
     Recurrent state is fed forward and reset where scenes begin; the recording is
-    repeated as often as needed. ``models`` has ONNX files or TOML files of stacks;
+    repeated as often as needed. ``models`` has ONNX files;
     ``samples`` and ``warm_up`` count for each model; ``on_sample`` is called with
     samples done, all samples and the model's name.
     """

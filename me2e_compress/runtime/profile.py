@@ -12,8 +12,7 @@ from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Array, Frames
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
-from me2e_compress.runtime.session import replay
-from me2e_compress.runtime.stack_session import open_session
+from me2e_compress.runtime.session import Session, replay
 
 WARM_UP = 10
 
@@ -64,11 +63,10 @@ def check_work(samples: int, warm_up: int, frames: Frames) -> None:
         )
 
 
-class TimedSession:
+class TimedSession(Session):
     """A session that records how long each run took.
 
-    ``taken_us`` has the microseconds of each run; for a stack, of all its files
-    together.
+    ``taken_us`` has the microseconds of each run.
     """
 
     def __init__(
@@ -79,25 +77,17 @@ class TimedSession:
         provider: Provider = CPU,
         said: Mapping[str, str] | None = None,
     ) -> None:
-        self._timed = open_session(
+        super().__init__(
             model, threads=threads, int8_kernels=True, provider=provider, said=said
         )
-        self.inputs, self.outputs = self._timed.inputs, self._timed.outputs
-        self.metadata, self.recurrent = self._timed.metadata, self._timed.recurrent
-        self.provider = provider
-        self.first_state = self._timed.first_state
         self.taken_us = list[int]()
 
     def run(
-        self,
-        feeds: Mapping[str, Array],
-        outputs: Sequence[str] | None = None,
-        *,
-        first: bool = False,
+        self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None
     ) -> dict[str, Array]:
         """Run once and record the time."""
         begun = time.perf_counter_ns()
-        values = self._timed.run(feeds, outputs, first=first)
+        values = super().run(feeds, outputs)
         self.taken_us.append((time.perf_counter_ns() - begun) // 1_000)
         return values
 

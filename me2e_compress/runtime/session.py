@@ -11,7 +11,6 @@ import onnxruntime as ort
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import NATIVE
 from me2e_compress.graph.recurrence import SessionPort, not_fed_back, recurrence
-from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.opening import (
     REFUSALS,
@@ -157,10 +156,10 @@ class Session:
         self,
         feeds: Mapping[str, Array],
         outputs: Sequence[str] | None = None,
-        *,
-        first: bool = False,
     ) -> dict[str, Array]:
-        """Run one inference; ``first`` makes no difference to a single graph.
+        """Run one inference; return all outputs, or those that are named.
+
+        ``feeds`` has one array for every input; other names are ignored.
 
         Raises:
             FramesError: an input is missing or has the wrong type or shape.
@@ -189,7 +188,7 @@ class Session:
 
 
 def replay(
-    session: AnySession,
+    session: Session,
     frames: Iterable[Frame],
     outputs: Sequence[str] | None = None,
     state: Mapping[str, Array] | None = None,
@@ -197,10 +196,10 @@ def replay(
     """Run a model over a recording, its recurrent state fed forward; yield its outputs.
 
     At the start of a scene a recurrent input comes from the frame or, if the frame has
-    none, is its first value: zeros, unless a stack defines another one. Afterwards it
-    is the model's output of the previous frame, even if the frame has an array for it.
-    ``state`` holds the recurrent inputs before a first frame that continues a scene, to
-    resume an interrupted replay; ``outputs`` None yields all.
+    none, is zeros. Afterwards it is the model's output of the previous frame, even if
+    the frame has an array for it. ``state`` holds the recurrent inputs before a first
+    frame that continues a scene, to resume an interrupted replay; ``outputs`` None
+    yields all.
 
     Raises:
         FramesError: a frame does not fit; the message names it.
@@ -215,7 +214,7 @@ def replay(
             memory = session.first_state(frame.arrays)
         try:
             fed = {**frame.arrays, **memory}
-            values = session.run(fed, fetched, first=frame.starts_scene)
+            values = session.run(fed, fetched)
         except FramesError as error:
             raise FramesError(f"frame {frame.index}: {error}") from error
         # The outputs of this frame are the next one's state.

@@ -21,7 +21,7 @@ from me2e_compress.study.workspace import Workspace
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.version import __version__
 from me2e_compress.workflows.compress import CompressOptions, compress
-from me2e_compress.workflows.compress_result import beside, written_model
+from me2e_compress.workflows.compress_result import beside
 from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.zoo.weights_record import named_weights
@@ -141,10 +141,7 @@ def _compressed(
 ) -> Path:
     """Apply the passes, unless a file exists that still matches its report."""
     frames = None if study.frames is None else CalibrationSet(study.frames)
-    output = workspace.model(variant, _key(study, variant, source, frames))
-    if graph.is_stack(source):  # several files in a folder
-        output = output.with_suffix("")
-    path = written_model(source, output)
+    path = workspace.model(variant, _key(study, variant, source, frames))
     if path.is_file() and beside(path, "report").is_file():
         if _reported_beside(path) is not None:
             return path
@@ -164,7 +161,7 @@ def _compressed(
         allow_empty=True,
     )
     heard = Listener(report, listener.on_warning)
-    compress(source, output, variant.passes, study.frames, options, heard)
+    compress(source, path, variant.passes, study.frames, options, heard)
     return path
 
 

@@ -1,12 +1,8 @@
 """Build a TensorRT engine of a graph, where TensorRT is installed."""
 
 import dataclasses
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_bytes
@@ -74,11 +70,10 @@ def build(
 ) -> EngineResult:
     """Build a TensorRT engine of a graph for the GPU of this machine.
 
-    The model is an ONNX file, the TOML of a stack or the name of one that ships.
+    The model is an ONNX file or the name of one that ships.
 
     Raises:
-        GraphError: The model does not exist, the output would harm an input, or other
-            files of a stack run at first frames.
+        GraphError: The model does not exist, or the output would harm an input.
         MissingPackageError: TensorRT is not installed.
         PreconditionError: TensorRT lacks an option, or refuses the graph.
     """
@@ -87,27 +82,8 @@ def build(
     # the engine is written only when it is whole
     with writing([output], (source,), force=options.force):
         listener.on_progress("build", 0, 1, source.name)
-        with _one_file(source) as file:
-            engine = build_engine(file, options.settings)
+        engine = build_engine(source, options.settings)
         with drafts.written(output, GraphError):
             write_bytes(output, engine.content)
         listener.on_progress("build", 1, 1, source.name)
     return EngineResult(source, output, engine)
-
-
-@contextmanager
-def _one_file(source: Path) -> Iterator[Path]:
-    """Yield a file of the graph: of a stack, of the joined one."""
-    if not graph.is_stack(source):
-        yield source
-        return
-    stack = graph.JoinedStack.load(source)
-    if stack.first is not None:
-        raise GraphError(
-            f"{source}: another graph runs where a scene begins, and an engine holds"
-            " one: build those of its files"
-        )
-    with TemporaryDirectory(prefix="me2e-build-") as folder:
-        file = Path(folder) / f"{source.stem}.onnx"
-        graph.save(stack.model, file)
-        yield file

@@ -2,13 +2,10 @@
 
 import dataclasses
 import gc
-from collections.abc import Mapping
 from pathlib import Path
 
-import onnx_ir as ir
-
-from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.exchange import (
     TABLE_FILES,
     read_cache,
@@ -20,10 +17,7 @@ from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges, rms_of
 from me2e_compress.calibration.review import not_in, review
 from me2e_compress.calibration.sample import FrameSubset, draw
-from me2e_compress.calibration.stack_frames import StackFrames, recording_of
 from me2e_compress.errors import FramesError
-from me2e_compress.graph.modules import ModuleMap
-from me2e_compress.graph.stack.part_graph import PartGraph
 from me2e_compress.manager import recipe
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.quantization.plan.overrides import keep_readers, overrides_text
@@ -35,14 +29,14 @@ from me2e_compress.workflows.calibrate_options import (
     overrides_beside,
     written_files,
 )
-from me2e_compress.workflows.calibrate_result import CalibrateResult, beside_ranges
+from me2e_compress.workflows.calibrate_result import CalibrateResult
 from me2e_compress.workflows.checks import (
     check_folder,
     model_path,
     output_path,
     read_graph,
 )
-from me2e_compress.workflows.claims import check_ours, writing
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
@@ -57,11 +51,10 @@ def calibrate(
 ) -> CalibrateResult:
     """Measure the ranges of every tensor that any scheme, rule set or target needs.
 
-    The model is a float ONNX file, the TOML of a stack or the name of one that ships;
-    frames may be None to import another tool's ranges. The output is ``RANGES.json``.
-    Tensors that an imported cache lacks are kept in float by ``RANGES.overrides.toml``.
-    A run that was killed goes on from ``OUTPUT.checkpoint``. A file that runs at first
-    frames alone has ranges of its own beside it, ``RANGES.head.first_frame.json``.
+    The model is a float ONNX file or the name of one that ships; frames may be None to
+    import another tool's ranges. The output is ``RANGES.json``. Tensors that an
+    imported cache lacks are kept in float by ``RANGES.overrides.toml``. A run that was
+    killed goes on from ``OUTPUT.checkpoint``.
 
     Raises:
         FramesError: There is no source, or frames or a cache do not fit.
@@ -83,86 +76,49 @@ def calibrate(
     if options.onnxruntime_table is not None:
         check_folder(Path(options.onnxruntime_table), inputs, TABLE_FILES)
     with writing(outputs, inputs, force=options.force):
-        ready, part, first = _ready(source, frames, output, options, listener)
+        ready, part = _ready(source, frames, options, listener)
         gc.collect()  # 150 MB of VAD-tiny as it was read; graphs are cycles
         with drafts.all_or_none():
-            of_first = {
-                label: _calibrate(
-                    _prepared(file.path, file.model, ready.modules.lenient(), options),
-                    _first_part(part, file),
-                    *(beside_ranges(output, label), options, listener),
-                )
-                for label, file in first.items()
-            }
             if options.imported is not None:
-                found = _import(ready, part, output, options)
-            else:
-                found = _calibrate(ready, part, output, options, listener)
-    return dataclasses.replace(found, first_frames=of_first)
-
-
-def _first_files(
-    loaded: graph.LoadedModel, output: Path, options: CalibrateOptions
-) -> Mapping[str, PartGraph]:
-    """Return the files of a stack that run at first frames alone, by label."""
-    found = loaded.first_files
-    check_ours([beside_ranges(output, each) for each in found], force=options.force)
-    if found and options.imported:
-        raise FramesError(
-            f"{loaded.path}: --import is for one graph, and"
-            f" {', '.join(found)} runs where a scene begins"
-        )
-    return found
-
-
-def _first_part(part: FrameSubset | None, file: PartGraph) -> FrameSubset | None:
-    """Return the first frames of a recording, as a file is fed that runs at them."""
-    if part is None or not isinstance(part.whole, StackFrames):
-        return None
-    whole = part.whole.of_file(file)
-    return FrameSubset(whole, tuple(whole.places))
+                return _import(ready, Path(options.imported), part, output, options)
+            assert part is not None
+            return _calibrate(ready, part, output, options, listener)
 
 
 def _ready(
     source: Path,
     frames: str | Path | None,
-    output: Path,
     options: CalibrateOptions,
     listener: Listener,
-) -> tuple[PreparedGraph, FrameSubset | None, Mapping[str, PartGraph]]:
-    """Read the graph and its frames, and prepare it for int8."""
+) -> tuple[PreparedGraph, FrameSubset | None]:
+    """Read the graph and its frames, and run the passes before int8.
+
+    Ranges belong to the graph as these passes leave it.
+    """
     loaded = read_graph(source, listener, options.adapter, options.module_map)
-    first = _first_files(loaded, output, options)
     # what is read is checked, and the graph is opened, before any pass runs
     if options.imported is not None:
         read_cache(Path(options.imported))
-    part = None if frames is None else _part(loaded, frames, options)
+    part = None
+    if frames is not None:
+        recording = CalibrationSet(frames)
+        recording.check(loaded)
+        part = draw(recording, options.count, options.seed)
     try_first(
-        loaded.model,
+        loaded,
         source.name,
         listener=listener,
-        file=loaded.file,
+        file=source,
         frames=part,
         provider=options.provider,
     )
-    ready = _prepared(source, loaded.model, options.module_map, options)
-    return ready, part, first
-
-
-def _prepared(
-    source: Path,
-    loaded: ir.Model,
-    modules: str | Path | ModuleMap | None,
-    options: CalibrateOptions,
-) -> PreparedGraph:
-    """Run the passes before int8: ranges belong to the graph as they leave it."""
     passes = with_sizes(recipe.load(options.recipe), options.dims)
-    return PreparedGraph.of(source, loaded, modules, passes)
+    return PreparedGraph.of(source, loaded, options.module_map, passes), part
 
 
 def _calibrate(
     ready: PreparedGraph,
-    part: FrameSubset | None,
+    part: FrameSubset,
     output: Path,
     options: CalibrateOptions,
     listener: Listener,
@@ -183,22 +139,14 @@ def _calibrate(
     return _written(Ranges.of(seen, OBSERVERS.parse(method)), output, options)
 
 
-def _part(
-    loaded: graph.LoadedModel, folder: str | Path, options: CalibrateOptions
-) -> FrameSubset:
-    """Draw frames that fit the model."""
-    recording = recording_of(loaded, folder, options.provider)
-    return draw(recording, options.count, options.seed)
-
-
 def _import(
     ready: PreparedGraph,
+    path: Path,
     part: FrameSubset | None,
     output: Path,
     options: CalibrateOptions,
 ) -> CalibrateResult:
     """Take another tool's ranges; keep in float what has none."""
-    path = Path(str(options.imported))
     cache, tensors = read_cache(path), ready.tensors()
     found = taken_from(cache, path, ready.model, tensors)
     missing = [name for name in tensors if name not in found.tensors]

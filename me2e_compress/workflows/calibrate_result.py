@@ -1,7 +1,6 @@
 """The result of a calibration."""
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 
 from me2e_compress.calibration.ranges import Ranges
@@ -13,7 +12,6 @@ from me2e_compress.workflows.result import Result, counted
 class CalibrateResult(Result):
     """The range of every tensor.
 
-    Of a stack, `first_frames` has those of each file for first frames, by label.
     `findings` say what of the ranges deserves a look. `overrides` is the file that
     keeps in float what an imported cache has no range for; None where it has all.
     """
@@ -21,9 +19,6 @@ class CalibrateResult(Result):
     output: Path
     frames: int
     ranges: Ranges
-    first_frames: Mapping[str, "CalibrateResult"] = dataclasses.field(
-        default_factory=dict
-    )
     findings: tuple[RangeFinding, ...] = ()
     overrides: Path | None = None
 
@@ -38,15 +33,13 @@ class CalibrateResult(Result):
 
     def lines(self) -> tuple[str, ...]:
         """Return the headline, and the ranges that deserve a look."""
-        first = (line for each in self.first_frames.values() for line in each.lines())
-        return (*first, self.headline, *self._said("note"))
+        return (self.headline, *self._said("note"))
 
     def alerts(self) -> tuple[str, ...]:
         """Return what is wrong with the ranges for all that is known."""
-        first = (line for each in self.first_frames.values() for line in each.alerts())
         how = f"compress --ranges {self.output} --overrides {self.overrides}"
         also = () if self.overrides is None else (f"These floats: {how}",)
-        return (*first, *self._said("warning"), *also)
+        return (*self._said("warning"), *also)
 
     def _said(self, severity: str) -> tuple[str, ...]:
         return tuple(str(each) for each in self.findings if each.severity == severity)
@@ -60,13 +53,7 @@ class CalibrateResult(Result):
 
     def to_json(self) -> object:
         """Return the ranges and the tensors that are always zero."""
-        first = {name: each.to_json() for name, each in self.first_frames.items()}
         found = self.ranges
         own = {**dataclasses.asdict(found), "dead": found.dead}
         own |= {"outliers": found.outliers, "findings": self.findings}
-        return {**own, "first_frames": first, "overrides": self.overrides}
-
-
-def beside_ranges(ranges: Path, label: str) -> Path:
-    """Return where the ranges of a file for first frames stand."""
-    return ranges.with_name(f"{ranges.stem}.{label}.json")
+        return {**own, "overrides": self.overrides}

@@ -9,9 +9,8 @@ from me2e_compress.driving.onnx_policy import OnnxPolicy, recurrent_of
 from me2e_compress.driving.policies import opened
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
-from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.stack_session import open_session
+from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.evaluate import driver_of
 from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
@@ -115,7 +114,7 @@ def check_model(
     try_file(driver.path, listener, provider)
     read = Adapter() if driver.adapter is None else Adapter.load(driver.adapter)
     try:
-        session = open_session(
+        session = Session(
             driver.path, threads=1, provider=driver.provider, said=driver.said()
         )
     except (GraphError, FramesError) as error:
@@ -131,7 +130,7 @@ def check_model(
     return ModelCheck(named, used.drives_by, fed, outputs, tuple(problems))
 
 
-def _at_work(session: AnySession, adapter: Adapter) -> str:
+def _at_work(session: Session, adapter: Adapter) -> str:
     """Run the model on zeros; return what went wrong, else an empty string."""
     try:
         OnnxPolicy.of(session, adapter)

@@ -42,22 +42,18 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
 
 def read_graph(
     path: Path, listener: Listener, adapter: Given = None, module_map: Given = None
-) -> graph.LoadedModel:
+) -> ir.Model:
     """Read a graph; warn of a lowered opset and of missing shapes.
 
     What an adapter and a map state becomes metadata of the graph; see :func:`adapted`.
     """
-    is_stack = graph.is_stack(path)
-    if adapter is not None and is_stack:
-        raise RecipeError(f"--adapter is for one file: {path} says state and plan")
-    loaded = graph.LoadedModel.load(path)
-    model = loaded.model
-    adapted(model, adapter, None if is_stack else module_map)
+    model = graph.load(path)
+    adapted(model, adapter, module_map)
     if said := lowered(model):
         listener.on_warning(f"{path}: {said}: onnxruntime reads no newer")
     if lack := lacking_shapes(model):
         listener.on_warning(f"{path}: {lack}")
-    return loaded
+    return model
 
 
 def lacking_shapes(model: ir.Model) -> str:
@@ -160,8 +156,6 @@ def _weights(given: Path) -> Iterator[Path]:
     """Yield the external weight files of a model; none for other files."""
     try:
         model = graph.load(given)
-        if graph.is_stack(given):
-            yield from graph.paths_of(given)
     except GraphError:  # not a model, or refused before anything is written
         return
     for each in model.graphs():

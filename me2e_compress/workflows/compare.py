@@ -15,15 +15,14 @@ from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.fidelity.liveness import LivenessTally
 from me2e_compress.fidelity.matched_sets import SetFidelity, SetOutputs, SetTally
 from me2e_compress.fidelity.output_liveness import Liveness
-from me2e_compress.graph import LoadedModel, provenance
+from me2e_compress.graph import load, provenance
 from me2e_compress.passes.ablate_modules import AblateModules
-from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.stack_session import open_session
+from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import check_number, model_path
-from me2e_compress.workflows.first_opening import try_model
+from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, counted, table
 from me2e_compress.workflows.runtime_loss import (
@@ -135,7 +134,7 @@ def _agents(found: SetFidelity) -> Table:
     )
 
 
-def _set_tally(left: AnySession, right: AnySession) -> SetTally | None:
+def _set_tally(left: Session, right: Session) -> SetTally | None:
     """Return what matches agents; None where no set is named, or one graph lacks it."""
     shapes = {name: port.shape for name, port in left.outputs.items()}
     outputs = SetOutputs.of(left.metadata, shapes)
@@ -158,15 +157,14 @@ def compare(
 ) -> CompareResult:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres.
 
-    Each graph is an ONNX file, the TOML of a stack, or the name of a model that ships.
-    Outputs that the metadata ``me2e.sets`` of the first names are matched agent by
-    agent. `as_it_stands` runs the first graph without onnxruntime's
-    optimizations and the second with all of them: comparing a graph with itself shows
-    what they change. An output is dead that moves less than a share `alive` of the
-    first graph's, between frames or when one input is exchanged; 0 does not ask, which
-    saves an inference of each graph for every input. The adapter's TOML says which
-    output is the plan and which are fed back, in both graphs; None leaves it to their
-    metadata.
+    Each graph is an ONNX file or the name of a model that ships. Outputs that the
+    metadata ``me2e.sets`` of the first names are matched agent by agent. `as_it_stands`
+    runs the first graph without onnxruntime's optimizations and the second with all of
+    them: comparing a graph with itself shows what they change. An output is dead that
+    moves less than a share `alive` of the first graph's, between frames or when one
+    input is exchanged; 0 does not ask, which saves an inference of each graph for every
+    input. The adapter's TOML says which output is the plan and which are fed back, in
+    both graphs; None leaves it to their metadata.
 
     Raises:
         GraphError: A model does not exist or run, or nothing picks one of a plan's
@@ -182,13 +180,16 @@ def compare(
     slow = dict[str, str]()
     # each graph must take the frames, and open in another process first
     for path in dict.fromkeys(paths):
-        loaded = LoadedModel.load(path)
-        said[path] = adapted(loaded.model, adapter, module_map)
-        models.append(loaded.model)
-        if why := slow_here(loaded.model, provider):
+        loaded = load(path)
+        said[path] = adapted(loaded, adapter, module_map)
+        models.append(loaded)
+        if why := slow_here(loaded, provider):
             slow[path.name] = why
-        recording.check(loaded.model)
-        try_model(loaded, listener, provider, recording)
+        recording.check(loaded)
+        try_first(
+            loaded, path.name, recording, listener=listener, file=path,
+            provider=provider,
+        )  # fmt: skip
     total = len(recording)
 
     def reported(frame: Frame) -> Frame:
@@ -196,11 +197,11 @@ def compare(
         return frame
 
     # the sessions get the adapter's metadata, which the files lack
-    left = open_session(
+    left = Session(
         paths[0], optimize=not as_it_stands, release=True, provider=provider,
         said=said[paths[0]],
     )  # fmt: skip
-    right = open_session(
+    right = Session(
         paths[1], stock=as_it_stands, release=True, provider=provider,
         said=said[paths[1]],
     )  # fmt: skip
@@ -213,7 +214,7 @@ def compare(
     # what onnxruntime's int8 answers, beside the nodes as they stand
     kernels = None
     if not as_it_stands and has_int8_kernels(models[-1], provider):
-        third = open_session(
+        third = Session(
             paths[1], stock=True, release=True, provider=provider, said=said[paths[1]]
         )
         kernels = RuntimeTally(third, recording)

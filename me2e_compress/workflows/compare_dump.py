@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
@@ -16,16 +17,15 @@ from me2e_compress.fidelity.engine_run import EngineRun
 from me2e_compress.fidelity.engine_values import first_difference_of_engine
 from me2e_compress.fidelity.first_difference import FirstDifference
 from me2e_compress.fidelity.floor import ALIVE
-from me2e_compress.graph import LoadedModel
 from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.stack_session import open_session
+from me2e_compress.runtime.session import Session
 from me2e_compress.targets.quantized import describe_quantized
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.compress_result import beside
 from me2e_compress.workflows.first_difference import told_of, with_modules
-from me2e_compress.workflows.first_opening import try_model
+from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, counted, number, table
 from me2e_compress.zoo.shipped import SHIPPED, shipped
@@ -149,19 +149,19 @@ def compare_dump(
     path = model_path(model)
     recording, answered = CalibrationSet(Path(frames)), EngineDump(dump)
     answered.check(recording)
-    loaded = LoadedModel.load(path)
-    said = adapted(loaded.model, adapter, module_map)
-    recording.check(loaded.model)
-    notes, inner = _checked_names(answered, loaded), None
-    try_model(loaded, listener, provider, recording)
-    session = open_session(
-        path, optimize=False, release=True, provider=provider, said=said
+    loaded = graph.load(path)
+    said = adapted(loaded, adapter, module_map)
+    recording.check(loaded)
+    notes, inner = _checked_names(answered, path, loaded), None
+    try_first(
+        loaded, path.name, recording, listener=listener, file=path, provider=provider
     )
+    session = Session(path, optimize=False, release=True, provider=provider, said=said)
     run = EngineRun(session, recording, answered)
     source, why = _float_source(path, loaded, float_graph)
     opened = None
     if source is not None:
-        opened = open_session(source, release=True, provider=provider, said=said)
+        opened = Session(source, release=True, provider=provider, said=said)
     total = len(recording)
     try:
         outputs = losses(
@@ -170,7 +170,7 @@ def compare_dump(
     except EvaluationError as error:
         raise EvaluationError(f"{answered.path}: {error}") from error
     if set(answered.names) - set(session.outputs):
-        named = with_modules(loaded.model)
+        named = with_modules(loaded)
         inner = first_difference_of_engine(named, run, provider=provider)
     return DumpResult(
         path, answered.path, source, why, total, _state(run), outputs,
@@ -178,19 +178,19 @@ def compare_dump(
     )  # fmt: skip
 
 
-def _checked_names(dump: EngineDump, loaded: LoadedModel) -> tuple[str, ...]:
+def _checked_names(dump: EngineDump, path: Path, loaded: ir.Model) -> tuple[str, ...]:
     """Check that the dump is of this graph; return what of it is not compared."""
-    outputs = [str(each.name) for each in loaded.model.graph.outputs]
+    outputs = [str(each.name) for each in loaded.graph.outputs]
     if not set(outputs) & set(dump.names):
         raise EvaluationError(
-            f"{dump.path}: answers {', '.join(dump.names)}; {loaded.path} gives"
+            f"{dump.path}: answers {', '.join(dump.names)}; {path} gives"
             f" {', '.join(outputs)}: the dump is of another graph"
         )
-    made = {value.name for node in loaded.model.graph for value in node.outputs}
+    made = {value.name for node in loaded.graph for value in node.outputs}
     known = {*made, *outputs}
     if unknown := [each for each in dump.names if each not in known]:
         raise EvaluationError(
-            f"{dump.path}: {unknown[0]} is no tensor of {loaded.path}, whose outputs"
+            f"{dump.path}: {unknown[0]} is no tensor of {path}, whose outputs"
             f" are {', '.join(outputs)}"
         )
     lacking = [each for each in outputs if each not in dump.names]
@@ -198,12 +198,12 @@ def _checked_names(dump: EngineDump, loaded: LoadedModel) -> tuple[str, ...]:
 
 
 def _float_source(
-    path: Path, loaded: LoadedModel, given: str | Path | None
+    path: Path, loaded: ir.Model, given: str | Path | None
 ) -> tuple[Path | None, str]:
     """Return the float source of a graph, or why none is known."""
     if given is not None:
         return model_path(given), ""
-    if describe_quantized(loaded.model) is None:
+    if describe_quantized(loaded) is None:
         return None, f"{path.name} is not quantized"
     report = beside(path, "report")
     if not report.is_file():

@@ -6,9 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
-from me2e_compress import graph
-from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.stack_frames import StackFrames
+import onnx_ir as ir
+
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import ALIVE, SQNR_FLOOR_DB, Floor
 from me2e_compress.graph.modules import ModuleMap
@@ -21,7 +20,6 @@ from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.runtime.others_load import cpu_seconds
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.workflows.calibrate_result import beside_ranges
 from me2e_compress.workflows.checks import (
     check_count,
     check_number,
@@ -30,6 +28,7 @@ from me2e_compress.workflows.checks import (
     output_path,
     read_graph,
 )
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.compress_fidelity import (
     SplitFrames,
     measure_loss,
@@ -37,9 +36,8 @@ from me2e_compress.workflows.compress_fidelity import (
 )
 from me2e_compress.workflows.compress_result import (
     CompressResult,
-    in_place,
     write_result,
-    writing_model,
+    written_files,
 )
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.int8_outcome import Int8Outcome
@@ -174,9 +172,9 @@ def compress(
 ) -> CompressResult:
     """Apply passes to a graph, check each, and write the smaller graph and a report.
 
-    The model is an ONNX file, which is not changed, the TOML of a stack, or the name of
-    a model that ships. A stack becomes a folder of its files and a TOML. Without frames
-    exact passes are checked on seeded inputs; a model that ships has its own frames.
+    The model is an ONNX file, which is not changed, or the name of a model that ships.
+    Without frames exact passes are checked on seeded inputs; a model that ships has its
+    own frames.
 
     Raises:
         GraphError: The model does not exist, or the output would harm an input.
@@ -193,70 +191,41 @@ def compress(
     named = recipe if isinstance(recipe, str | Path) else None
     # claim the outputs first; Python's cycle collector would walk every node
     inputs = (source, named, frames, options.module_map, options.adapter, *read)
-    with (
-        writing_model(source, output, inputs, force=options.force) as target,
-        collector_paused(),
-    ):
+    outputs = written_files(output)
+    with writing(outputs, inputs, force=options.force), collector_paused():
         loaded = read_graph(source, listener, options.adapter, options.module_map)
-        modules = load_map(options.module_map, loaded.model)
-        seen = open_frames(loaded, frames, options.provider)
+        modules = load_map(options.module_map, loaded)
+        seen = open_frames(source, loaded, frames)
         split = SplitFrames.of(*seen, passes, options.measure_frames)
-        run = Compression(target, output.parent, options, listener)
-        first = _first_frames(run, loaded, seen[0], recipe, modules)
-        found = run.compress(loaded, passes, modules, split)
-    return in_place(dataclasses.replace(found, first_frames=first), output)
-
-
-def _first_frames(
-    run: "Compression",
-    loaded: graph.LoadedModel,
-    seen: CalibrationSet | None,
-    recipe: Recipe | None,
-    modules: ModuleMap,
-) -> dict[str, CompressResult]:
-    """Compress the files of a stack that run at first frames alone, one by one."""
-    found, options = dict[str, CompressResult](), run.options
-    for label, file in loaded.first_files.items():
-        # each has its own frames, ranges and output
-        fed = seen.of_file(file) if isinstance(seen, StackFrames) else None
-        ranges = options.ranges and beside_ranges(Path(options.ranges), label)
-        own = dataclasses.replace(options, ranges=ranges, allow_empty=True)
-        passes, draft = own.passes(recipe), run.output.with_name(f"{label}.onnx")
-        split = SplitFrames.of(fed, None, passes, options.measure_frames)
-        each = dataclasses.replace(run, output=draft, options=own)
-        model = graph.LoadedModel(file.path, file.model)
-        found[label] = each.compress(model, passes, modules.lenient(), split)
-    return found
+        run = Compression(source, output, options, listener)
+        return run.compress(loaded, passes, modules, split)
 
 
 @dataclasses.dataclass(frozen=True)
 class Compression:
-    """One graph to compress, whose outputs are claimed already.
+    """One graph to compress, whose outputs are claimed already."""
 
-    `reproducers` is the folder for the reproducer of a failing pass.
-    """
-
+    source: Path
     output: Path
-    reproducers: Path
     options: CompressOptions
     listener: Listener
 
     def compress(
         self,
-        loaded: graph.LoadedModel,
+        model: ir.Model,
         passes: tuple[Pass, ...],
         modules: ModuleMap,
         frames: SplitFrames,
     ) -> CompressResult:
         """Try, compress, measure and write; errors are those of :func:`compress`."""
         start, options, listener = cpu_seconds(), self.options, self.listener
-        source, model, provider = loaded.path, loaded.model, options.provider
+        source, provider = self.source, options.provider
         seen, count = frames.calibration or frames.samples, options.verify_frames or 1
         first = partial(try_first, listener=listener, count=count, provider=provider)
-        answers = first(model, source.name, seen, file=loaded.file)
+        answers = first(model, source.name, seen, file=source)
         # apply the passes, and refuse a result that is unproven or not int8
         context = Context(modules, frames.calibration, options.seed, provider)
-        checked, folder = options.verify_frames, self.reproducers
+        checked, folder = options.verify_frames, self.output.parent
         manager = PassManager(passes, checked, folder, frames.samples, first, answers)
         report = manager.run(model, context, partial(listener.on_progress, "passes"))
         _refuse_unproven(report, options)
@@ -269,7 +238,7 @@ class Compression:
         loss = measure_loss(report, provider, frames, floor, listener)
         linted = lint_written(report.model, passes, self.output, options.target)
         seconds = cpu_seconds() - start
-        return write_result(report, loaded, self.output, int8, loss, seconds, linted)
+        return write_result(report, source, self.output, int8, loss, seconds, linted)
 
 
 def _refuse_unproven(report: Report, options: CompressOptions) -> None:

@@ -8,13 +8,11 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.sample import hold_out
-from me2e_compress.calibration.stack_frames import recording_of
 from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.fidelity.compare import Reference
 from me2e_compress.fidelity.floor import Floor, Rounding
 from me2e_compress.fidelity.liveness import LivenessTally
-from me2e_compress.graph import LoadedModel
 from me2e_compress.manager import Report
 from me2e_compress.passes import Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
@@ -37,12 +35,14 @@ ADVICE = "me2e-compress sensitivity MODEL FRAMES -o RECIPE.toml"
 
 
 def open_frames(
-    loaded: LoadedModel, folder: str | Path | None, provider: Provider
+    source: Path, model: ir.Model, folder: str | Path | None
 ) -> tuple[CalibrationSet | None, CalibrationSet | None]:
     """Open and check the recording, or the frames that ship with the model."""
     if folder is not None:
-        return recording_of(loaded, folder, provider), None
-    shipped = sample_frames(loaded.path)
+        recording = CalibrationSet(folder)
+        recording.check(model)
+        return recording, None
+    shipped = sample_frames(source)
     return None, None if shipped is None else CalibrationSet(shipped)
 
 

@@ -1,21 +1,17 @@
 """The result of a compression: the graph, the report and their tables."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError, PreconditionError
+from me2e_compress.errors import PreconditionError
 from me2e_compress.manager import Report
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.quantization.plan import plan_of, save_plan
 from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_document
-from me2e_compress.workflows.checks import Given, check_folder
-from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.lint import LintResult
 from me2e_compress.workflows.measured_loss import MeasuredLoss
@@ -35,7 +31,6 @@ class CompressResult(Result):
         int8: what became int8 and what did not; None where no pass quantizes.
         loss: how true the graph stayed; None where every pass is exact.
         seconds: CPU time of everything but the writing.
-        first_frames: of a stack, how each file for first frames came to be, by label.
         lint: what the target's rules say of the graph; None where nothing is int8.
     """
 
@@ -48,9 +43,6 @@ class CompressResult(Result):
     int8: Int8Outcome | None = None
     loss: MeasuredLoss | None = None
     seconds: float = 0.0
-    first_frames: Mapping[str, "CompressResult"] = dataclasses.field(
-        default_factory=dict
-    )
     lint: LintResult | None = None
 
     @property
@@ -86,24 +78,14 @@ class CompressResult(Result):
 
     def lines(self) -> tuple[str, ...]:
         """Return the verdict: int8, how far outputs and plan moved, time and size."""
-        first = (
-            f"{name}: {line}"
-            for name, each in self.first_frames.items()
-            for line in each.verdict()
-        )
-        said = (*first, *self.verdict(), self._time, self.headline, self.weights)
+        said = (*self.verdict(), self._time, self.headline, self.weights)
         return tuple(filter(None, said))
 
     def alerts(self) -> tuple[str, ...]:
         """Return warnings: nothing became int8, or quality is below the floor."""
-        first = (
-            f"{name}: {said}"
-            for name, each in self.first_frames.items()
-            for said in each.alerts()
-        )
         empty = "" if self.int8 is None else self.int8.empty
         lost = () if self.loss is None else self.loss.alerts()
-        return (*lost, *filter(None, [empty]), *self._linted(), *first)
+        return (*lost, *filter(None, [empty]), *self._linted())
 
     def _linted(self) -> Iterator[str]:
         """Yield what the target refuses, or computes otherwise."""
@@ -129,13 +111,12 @@ class CompressResult(Result):
 
     @property
     def refusal(self) -> str | None:
-        """Why the target that the user named refuses a file; None if it takes all."""
-        linted = (each.lint for each in (self, *self.first_frames.values()))
-        asked = (each for each in linted if each is not None and each.asked)
-        return next(filter(None, (each.refusal for each in asked)), None)
+        """Why the target that the user named refuses the file; None if it does not."""
+        asked = self.lint is not None and self.lint.asked
+        return self.lint.refusal if asked else None
 
     def check(self) -> None:
-        """Raise PreconditionError if the target that was asked for refuses a file."""
+        """Raise PreconditionError if the target that was asked for refuses the file."""
         if self.refusal is not None:
             raise PreconditionError(f"written, but {self.refusal}")
 
@@ -177,9 +158,7 @@ class CompressResult(Result):
 
     def to_json(self) -> object:
         """Return the report file's content except the verdict, which `lines` has."""
-        held = {key: each for key, each in self.record.items() if key != "verdict"}
-        first = {name: each.to_json() for name, each in self.first_frames.items()}
-        return {**held, "first_frames": first}
+        return {key: each for key, each in self.record.items() if key != "verdict"}
 
 
 def beside(output: Path, what: str) -> Path:
@@ -210,7 +189,7 @@ def _proof(report: Report) -> Iterator[str]:
         yield from check.remarks
 
 
-def _written_files(output: Path) -> tuple[Path, ...]:
+def written_files(output: Path) -> tuple[Path, ...]:
     """Return every file that may be written for a compressed graph."""
     return (
         output,
@@ -220,57 +199,9 @@ def _written_files(output: Path) -> tuple[Path, ...]:
     )
 
 
-@contextmanager
-def writing_model(
-    source: Path, output: Path, inputs: Iterable[Given], *, force: bool
-) -> Iterator[Path]:
-    """Claim what is written of a model; yield where its graph goes.
-
-    Of a stack that is the TOML of a draft, which takes the place of a folder at the
-    end.
-
-    Raises:
-        GraphError: The output would harm an input, or is no folder for a stack.
-    """
-    if not graph.is_stack(source):
-        with writing(_written_files(output), inputs, force=force):
-            yield output
-        return
-    if output.suffix in (".onnx", ".toml"):
-        raise GraphError(f"{output}: a stack is written as a folder: name one")
-    check_folder(output, (*graph.paths_of(source), *inputs))
-    with writing(trees=[output], force=force):
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=output.parent, prefix=f".{output.name}.") as folder:
-            draft = Path(folder) / output.name
-            draft.mkdir()
-            try:
-                yield draft / source.name
-            except GraphError as error:
-                raise GraphError(str(error).replace(str(draft), str(output))) from error
-            drafts.put(draft, output)
-
-
-def written_model(source: Path, output: Path) -> Path:
-    """Return the file that opens what was written: of a stack, the TOML."""
-    return output / source.name if graph.is_stack(source) else output
-
-
-def in_place(found: CompressResult, output: Path) -> CompressResult:
-    """Return a result whose files are named where they are once the draft is put."""
-    if not graph.is_stack(found.source):
-        return found
-    first = {
-        label: dataclasses.replace(each, output=output / each.output.name)
-        for label, each in found.first_frames.items()
-    }
-    written = written_model(found.source, output)
-    return dataclasses.replace(found, output=written, first_frames=first)
-
-
 def write_result(
     report: Report,
-    loaded: graph.LoadedModel,
+    source: Path,
     output: Path,
     int8: Int8Outcome | None,
     loss: MeasuredLoss | None,
@@ -279,14 +210,13 @@ def write_result(
 ) -> CompressResult:
     """Write the graph and its plan, then the report, which vouches for both."""
     plan = plan_of(report.model)  # before writing: metadata may be malformed
-    source = loaded.path
     with drafts.all_or_none():
-        loaded.save(with_own_domains(report.model), output)
+        graph.save(with_own_domains(report.model), output)
         if plan is not None:
             save_plan(plan, beside(output, "plan"))
         sizes = graph.file_bytes(source), graph.file_bytes(output)
         made = CompressResult(
-            source, output, report, {}, *sizes, int8, loss, seconds, {}, linted
+            source, output, report, {}, *sizes, int8, loss, seconds, linted
         )
         record = report.record(source, output) | made.findings()
         write_document(beside(output, "report"), record, indent=2)

@@ -9,14 +9,14 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.adapter.stated import adapted
-from me2e_compress.errors import GraphError, ModuleMapError
+from me2e_compress.errors import ModuleMapError
 from me2e_compress.fidelity.first_difference import FirstDifference, Source
 from me2e_compress.fidelity.places import Place
-from me2e_compress.graph import LoadedModel, provenance
+from me2e_compress.graph import load, provenance
 from me2e_compress.graph.modules import ModuleMap, assign, map_of
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.checks import check_count, model_path
-from me2e_compress.workflows.first_opening import try_model
+from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, counted, number, table
 
@@ -141,8 +141,7 @@ def first_difference(
     Raises:
         EvaluationError: The graphs share no value, or compute none.
         FramesError: A frame does not fit one of the graphs.
-        GraphError: A model does not exist or run, or is a stack with files that run at
-            first frames alone.
+        GraphError: A model does not exist or run.
         ProviderError: The provider is not available.
     """
     check_count("most_frames", most_frames, 1)
@@ -150,14 +149,14 @@ def first_difference(
     recording = CalibrationSet(Path(frames))
     models = dict[Path, ir.Model]()
     for path in dict.fromkeys(paths):
-        loaded = LoadedModel.load(path)
-        if loaded.first_files:
-            names = ", ".join(loaded.first_files)
-            raise GraphError(f"{path}: {names} run at first frames alone: name a file")
-        adapted(loaded.model, adapter, module_map)
-        recording.check(loaded.model)
-        try_model(loaded, listener, provider, recording)
-        models[path] = with_modules(loaded.model)
+        loaded = load(path)
+        adapted(loaded, adapter, module_map)
+        recording.check(loaded)
+        try_first(
+            loaded, path.name, recording, listener=listener, file=path,
+            provider=provider,
+        )  # fmt: skip
+        models[path] = with_modules(loaded)
     # the source runs once, then the other graph
     shown = tuple(itertools.islice(recording, most_frames))
     listener.on_progress("sketches", 0, 2, str(paths[0]))

@@ -25,7 +25,6 @@ import platformdirs
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.graph import LoadedModel
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.operators.kernels import why_not
 from me2e_compress.runtime.atomic import write_json
@@ -92,34 +91,15 @@ def try_first(
     return found.answers
 
 
-def try_model(
-    loaded: LoadedModel,
-    listener: Listener,
-    provider: Provider = CPU,
-    frames: Frames | None = None,
-) -> None:
-    """Open a model in another process, and run its first frame; see :func:`try_first`.
-
-    Of a stack the joined graph, and that for first frames, are opened and not run.
-    """
-    name, stack = loaded.path.name, loaded.stack
-    opened = partial(try_first, listener=listener, provider=provider)
-    if stack is None:
-        opened(loaded.model, name, frames, file=loaded.path)
-        return
-    for each in filter(None, (stack.model, stack.first)):
-        opened(each, name)
-
-
 def try_file(file: Path, listener: Listener, provider: Provider = CPU) -> None:
-    """Open the graph of a file, or both of a stack, in another process."""
+    """Open the graph of a file in another process."""
     if provider != CPU:
         return
     try:
-        loaded = LoadedModel.load(file)
+        model = graph.load(file)
     except GraphError:
         return  # who opens it says what is wrong
-    try_model(loaded, listener)
+    try_first(model, file.name, listener=listener, file=file)
 
 
 def try_apart(

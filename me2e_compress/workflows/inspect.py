@@ -14,7 +14,6 @@ from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import Item, ModuleMap, assign, itemise
 from me2e_compress.graph.opset import lowered
 from me2e_compress.graph.recurrence import recurrent_inputs
-from me2e_compress.graph.stack.stack_file import ZEROS
 from me2e_compress.graph.summary import why_uncounted
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
@@ -27,7 +26,7 @@ from me2e_compress.runtime.energy.modelled import (
 )
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
-from me2e_compress.workflows.inspect_result import FedInput, InspectResult
+from me2e_compress.workflows.inspect_result import InspectResult
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.module_costs import (
     trace_of,
@@ -49,7 +48,7 @@ def inspect(
     listener: Listener = SILENT,
     adapter: str | Path | None = None,
 ) -> InspectResult:
-    """Read a graph, or a stack of several files, and weigh its modules.
+    """Read a graph, and weigh its modules.
 
     `dims` are sizes that open dimensions of the inputs are given first. `process`,
     ``45nm`` or ``7nm``, is the silicon process whose figures model the energy of a
@@ -74,24 +73,10 @@ def inspect(
     taken = None if trace is None else trace_of(trace, path)
     if frames is not None:
         taken = _timed(path, module_map, frames, listener, adapter)
-    loaded = graph.LoadedModel.load(path)
-    adapted(loaded.model, adapter, module_map)
-    modules = load_map(module_map, loaded.model)
-    found = inspected(path, loaded.model, modules, dims, process, taken)
-    return found if loaded.stack is None else _with_joints(found, loaded.stack)
-
-
-def _with_joints(found: InspectResult, stack: graph.JoinedStack) -> InspectResult:
-    """Add what feeds every file of a stack."""
-    fed = dict.fromkeys(
-        FedInput(file, name, source, form) for file, name, source, form in stack.fed()
-    )
-    firsts = {
-        name: each.first
-        for name, each in stack.content.state.items()
-        if each.first != ZEROS
-    }
-    return dataclasses.replace(found, fed=tuple(fed), first_values=firsts)
+    loaded = graph.load(path)
+    adapted(loaded, adapter, module_map)
+    modules = load_map(module_map, loaded)
+    return inspected(path, loaded, modules, dims, process, taken)
 
 
 def inspected(

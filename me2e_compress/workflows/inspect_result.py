@@ -11,25 +11,9 @@ _SHOWN = 8
 """Number of reasons for unknown MACs that are named."""
 
 
-@dataclasses.dataclass(frozen=True)
-class FedInput:
-    """One input of one file of a stack, and what feeds it.
-
-    Attributes:
-        source: an output (``backbone.feats``), ``frames``, or state (``state:
-            next_bev``).
-        form: type and shape.
-    """
-
-    file: str
-    input: str
-    source: str
-    form: str
-
-
 @dataclasses.dataclass(frozen=True, repr=False)
 class InspectResult(Result):
-    """What a file, or a stack of several files, holds.
+    """What a file holds.
 
     Attributes:
         file_bytes: size with the external weights.
@@ -45,8 +29,6 @@ class InspectResult(Result):
         modelled_energy: energy of its MACs and bytes; None if not asked for.
         weights: the checkpoint that its metadata names; or empty.
         latency_of: what the shares of time are of; empty if not measured.
-        fed: of a stack, every input of every file, in the order of running.
-        first_values: of a stack, inputs that do not begin at zeros, in words.
     """
 
     file: str
@@ -68,8 +50,6 @@ class InspectResult(Result):
     modelled_energy: ModelledEnergy | None = None
     weights: str = ""
     latency_of: str = ""
-    fed: tuple[FedInput, ...] = ()
-    first_values: dict[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def headline(self) -> str:
@@ -115,20 +95,10 @@ class InspectResult(Result):
         columns = ("module", *counts, *time)
         modelled = self.modelled_energy
         return (
-            *self._joined(),
             table("Interface", ("", "name", "type", "shape"), ports, back, words=4),
             table(f"Modules (map {self.map})", columns, rows, note),
             *(() if modelled is None else modelled.tables()),
         )
-
-    def _joined(self) -> tuple[Table, ...]:
-        if not self.fed:
-            return ()
-        rows = [(each.file, each.input, each.source, each.form) for each in self.fed]
-        columns = ("file", "input", "fed by", "form")
-        begins = (f"{name} begins at {at}" for name, at in self.first_values.items())
-        note = "; ".join(begins)
-        return (table("What feeds what", columns, rows, note, words=4),)
 
     def _share(self, item: Item) -> tuple[str, ...]:
         if not self.latency_of:

@@ -10,7 +10,6 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import draw
-from me2e_compress.calibration.stack_frames import recording_of
 from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.fidelity.sensitivity import Drive, Int8Choice, Trials, write_recipe
 from me2e_compress.manager import recipe
@@ -99,10 +98,10 @@ class TrialFiles:
         """Prepare the graph, calibrate once, and name the modules to try."""
         # check names and frames before anything is run
         rules, place = RULE_SETS.parse(options.rules), TARGETS.parse(options.target)
-        read = graph.LoadedModel.load(self.model)
-        loaded = read.model
+        loaded = graph.load(self.model)
         adapted(loaded, options.adapter, options.module_map)
-        recording = recording_of(read, self.frames, options.provider)
+        recording = CalibrationSet(self.frames)
+        recording.check(loaded)
         scheme = QuantScheme.named(options.scheme, load_map(options.module_map, loaded))
         # the graph is opened and prepared once; every trial starts from there
         name = self.model.name
@@ -110,7 +109,7 @@ class TrialFiles:
             loaded,
             name,
             listener=listener,
-            file=read.file,
+            file=self.model,
             frames=recording,
             provider=options.provider,
         )

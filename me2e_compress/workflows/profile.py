@@ -9,7 +9,6 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.stack_frames import recording_of
 from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import EvaluationError, MissingExtraError, RecipeError
 from me2e_compress.graph.modules import assign
@@ -34,7 +33,7 @@ from me2e_compress.workflows.checks import (
 )
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.deadlines_table import check_budget
-from me2e_compress.workflows.first_opening import try_model
+from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.profile_result import ProfileResult
 
@@ -119,13 +118,17 @@ def profile(
     with writing([written, figure, joules], inputs, force=options.force):
         # each measurement has inferences of its own: the profiler takes time itself
         recording = CalibrationSet(Path(frames))
-        loaded = graph.LoadedModel.load(source)
-        said = adapted(loaded.model, options.adapter, options.module_map)
-        trace = _measured(loaded, said, recording, options, listener)
+        loaded = graph.load(source)
+        said = adapted(loaded, options.adapter, options.module_map)
+        try_first(
+            loaded, source.name, recording, listener=listener, file=source,
+            provider=options.provider,
+        )  # fmt: skip
+        trace = _measured(source, said, recording, options, listener)
         operators: Microseconds = {}
         if options.by_module or figure is not None:
-            fed = recording_of(loaded, frames, options.provider)
-            found = _broken_down(loaded.model, fed, options, listener)
+            recording.check(loaded)
+            found = _broken_down(loaded, recording, options, listener)
             trace = dataclasses.replace(trace, modules_us=found.modules_us)
             operators = found.operators_us
         energy = _energy(source, said, recording, options, listener)
@@ -146,7 +149,7 @@ def profile(
         energy=energy,
         energy_output=joules,
         budget_ms=options.budget_ms,
-        slow_here=slow_here(loaded.model, options.provider),
+        slow_here=slow_here(loaded, options.provider),
     )
 
 
@@ -214,16 +217,15 @@ def _broken_down(
 
 
 def _measured(
-    loaded: graph.LoadedModel,
+    source: Path,
     said: Mapping[str, str],
     recording: CalibrationSet,
     options: ProfileOptions,
     listener: Listener,
 ) -> LatencyTrace:
-    try_model(loaded, listener, options.provider, recording)
     with OthersLoad() as others:
         trace = measure(
-            loaded.path,
+            source,
             recording,
             samples=options.samples,
             warm_up=options.warm_up,

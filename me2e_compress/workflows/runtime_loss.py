@@ -12,7 +12,6 @@ from me2e_compress.fidelity.compare import Fidelity, Tally
 from me2e_compress.manager.output_errors import relative
 from me2e_compress.manager.runtime_levels import first_node
 from me2e_compress.manager.verification_inputs import VerificationInputs
-from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay
@@ -73,7 +72,7 @@ class RuntimeTally:
         frames: those that the reference is shown.
     """
 
-    def __init__(self, session: AnySession, frames: Frames) -> None:
+    def __init__(self, session: Session, frames: Frames) -> None:
         self._answers = replay(session, frames)
         self._tallies: dict[str, Tally] = {}
         self._first: dict[str, float] = {}

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import me2e_compress as me2e
 from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import Observation, Trajectory
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.graph.stack.stack_file import StackFile
 from me2e_compress.simulator.cameras import CameraRig
 from me2e_compress.zoo.shipped import shipped
 from tests.command import Command, command
@@ -45,30 +45,21 @@ def test_the_driver_of_the_page_decides_as_the_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (toml, *_), (script, *_) = blocks(PAGE, "toml"), blocks(PAGE, "python")
+    (toml,), (script,) = blocks(PAGE, "toml"), blocks(PAGE, "python")
     Path("stack.toml").write_text(toml.text)
     exec(script.text, {})
 
-    assert decided(Path("stack.toml")) == decided(shipped("highway"))
+    made = me2e.join("stack.toml", "whole.onnx")
+
+    assert decided(made.output) == decided(shipped("highway"))
 
 
 def test_the_commands_of_the_page_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    write_dense(tmp_path)
+    write_dense(tmp_path)  # a smaller stack
     dense_frames(tmp_path)
 
     for line in "".join(each.text for each in blocks(PAGE, "sh")).splitlines():
-        if " highway " not in line:  # on a smaller stack
-            assert command(*line.split()[1:]) == 0, line
-
-
-def test_the_state_of_the_page_is_read(tmp_path: Path) -> None:
-    (state,) = (b for b in blocks(PAGE, "toml") if b.text.startswith("[state]"))
-    path = tmp_path / "stack.toml"
-    path.write_text('[[part]]\nname = "head"\nfile = "head.onnx"\n' + state.text)
-
-    assert [each.first for each in StackFile.load(path).state.values()] == [
-        *("zeros", "anchors.npy", "head.query_embedding.weight", "begin.feat")
-    ]
+        assert command(*line.split()[1:]) == 0, line

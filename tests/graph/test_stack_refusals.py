@@ -1,31 +1,12 @@
 """Files of a stack that do not fit each other: what is said, in one line."""
 
-import zipfile
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from me2e_compress.errors import FramesError, GraphError
-from me2e_compress.runtime.session import replay
-from me2e_compress.runtime.stack_session import open_session
-from tests.stacks import (
-    HEAD,
-    HEAD_FIRST,
-    STATE,
-    THREE_FILES,
-    TWO_PARTS,
-    ones,
-    write_stack,
-)
-
-
-def test_a_missing_input_is_named(tmp_path: Path) -> None:
-    session = open_session(write_stack(tmp_path))
-
-    with pytest.raises(FramesError, match="input img is missing; there is prev_bev"):
-        session.run({"prev_bev": np.zeros((1, 4), np.float32)})
-
+from me2e_compress.errors import GraphError
+from me2e_compress.graph.stack.stack import JoinedStack
+from tests.stacks import HEAD, TWO_PARTS, write_stack
 
 OTHER_FEATS = HEAD.replace("float[1,4] feats", "float[1,5] feats")
 BACKBONE_LOOP = """<ir_version: 9, opset_import: ["" : 17]>
@@ -93,36 +74,9 @@ backbone (float[1,4] img, float[1,4] next_bev) => (float[1,4] feats)
             "[state] prev_track: no part takes prev_track",
         ),
         (
-            STATE % "wide.npy",
-            {},
-            "first value wide.npy is float [1, 5], and the input takes float [1, 4]:"
-            " of another stack?",
-        ),
-        (STATE % "none.npy", {}, "first value none.npy cannot be read"),
-        (
-            STATE % "one",
-            {},
-            "first value one is none of zeros, a file .npy or .npz, and PART.NAME",
-        ),
-        (
-            THREE_FILES + '[state]\nprev_bev = {first = "head.learned"}\n',
-            {},
-            "is read by nobody: head's first_frame takes none",
-        ),
-        (
-            THREE_FILES,
-            {"head_first": HEAD_FIRST.replace("next_bev", "other_bev")},
-            "frame 1: input prev_bev is missing",
-        ),
-        (
             TWO_PARTS.replace("head.onnx", "../head.onnx"),
             {},
             "../head.onnx is outside the folder of the stack: not read",
-        ),
-        (
-            STATE % "/tmp/none.npy",
-            {},
-            "/tmp/none.npy is outside the folder of the stack: not read",
         ),
         (
             TWO_PARTS,
@@ -136,7 +90,17 @@ backbone (float[1,4] img, float[1,4] next_bev) => (float[1,4] feats)
             "head.onnx is written in opset 11, backbone.onnx in 17, and Squeeze",
         ),
         ('[[part]]\nname = "a.b"\nfile = "head.onnx"\n', {}, "letters, digits"),
-        ('[[part]]\nname = "a"\n', {}, "a has neither file nor first_frame"),
+        ('[[part]]\nname = "a"\n', {}, "part.0.file: Field required"),
+        (
+            TWO_PARTS + 'first_frame = "first.onnx"\n',
+            {},
+            "first_frame is gone since 0.3.0: use a TOML of its own",
+        ),
+        (
+            TWO_PARTS + '[state]\nprev_bev = {first = "bev.npy"}\n',
+            {},
+            "first is gone since 0.3.0: use [recurrent] of the adapter",
+        ),
         (TWO_PARTS.replace("backbone", "head"), {}, "two parts are called head"),
         (TWO_PARTS + "[egdes]\n", {}, "not a stack of several files: egdes: Extra"),
         ("part = 1", {}, "not a stack of several files: part:"),
@@ -150,21 +114,15 @@ backbone (float[1,4] img, float[1,4] next_bev) => (float[1,4] feats)
             {},
             "metadata: Value error, most: Out of range float values",
         ),
-        (STATE % "cut.npz", {}, "first value cut.npz cannot be read"),
     ],
 )
 def test_files_that_do_not_fit_each_other_are_one_line(
     tmp_path: Path, toml: str, texts: dict[str, str], said: str
 ) -> None:
     path = write_stack(tmp_path, toml, **texts)
-    np.save(tmp_path / "wide.npy", np.zeros(5, np.float32))
-    with zipfile.ZipFile(tmp_path / "cut.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("prev_bev.npy", b"\x93NUMPY" * 9)
-    whole = (tmp_path / "cut.npz").read_bytes()
-    (tmp_path / "cut.npz").write_bytes(whole.replace(whole[42:50], b"\xff" * 8))
 
-    with pytest.raises((GraphError, FramesError)) as caught:
-        list(replay(open_session(path), ones(True, False)))
+    with pytest.raises(GraphError) as caught:
+        JoinedStack.load(path)
 
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)

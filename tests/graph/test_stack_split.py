@@ -1,5 +1,6 @@
 """A stack's files as one graph: it answers as they do, and is cut again."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -8,39 +9,36 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.graph import JoinedStack
 from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.stack.stack import JoinedStack
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session, replay
-from me2e_compress.runtime.stack_session import open_session
-from tests.stacks import (
-    DENSE,
-    HEAD,
-    THREE_FILES,
-    TWO_PARTS,
-    ones,
-    write_dense,
-    write_stack,
-)
+from tests.stacks import DENSE, HEAD, TWO_PARTS, joined, ones, write_dense, write_stack
+
+
+def again(stack: JoinedStack, folder: Path, toml: str = TWO_PARTS) -> Path:
+    """Split a stack's graph into a folder; return the path of a TOML beside it."""
+    folder.mkdir()
+    for part, model in stack.split(stack.model).items():
+        graph.save(model, folder / f"{part}.onnx")
+    (folder / "stack.toml").write_text(toml)
+    return folder / "stack.toml"
 
 
 def by_files(path: Path, frames: list[Frame]) -> list[dict[str, Array]]:
     """Run the files of a stack one by one; return what the frames' outputs are."""
-    stack = JoinedStack.load(path)
+    found, joined = list[dict[str, Array]](), JoinedStack.load(path).joined
+    joints = joined.joints
     sessions = {
-        label: Session(each.path, threads=1, optimize=False)
-        for label, each in stack.files.items()
+        part: Session(each.path, threads=1, optimize=False)
+        for part, each in joints.graphs.items()
     }
-    joined, found, state = stack.joined, list[dict[str, Array]](), dict[str, Array]()
+    state = dict[str, Array]()
     for frame in frames:
-        joints = joined.at_first if frame.starts_scene else joined.at_next
         if frame.starts_scene:
-            shape = joined.inputs["prev_bev"].shape
-            sizes = [size for size in shape if isinstance(size, int)]
-            state = {"prev_bev": np.zeros(sizes, np.float32)}
-            state = {**state, **joined.first_values}
+            state = {"prev_bev": np.zeros((4, 32), np.float32)}
         values = dict[tuple[str, str], Array]()
         for part in joints.order:
             fed = {
@@ -49,7 +47,7 @@ def by_files(path: Path, frames: list[Frame]) -> list[dict[str, Array]]:
                 else {**frame.arrays, **state}[source.name]
                 for name, source in joints.sources[part].items()
             }
-            ran = sessions[joints.graphs[part].label].run(fed)
+            ran = sessions[part].run(fed)
             values |= {(part, name): value for name, value in ran.items()}
         found.append({name: values[at] for name, at in joined.answers.items()})
         state = {name: found[-1][answer] for name, answer in joined.recurrent.items()}
@@ -64,12 +62,10 @@ def images(count: int = 5) -> list[Frame]:
     ]
 
 
-@pytest.mark.parametrize("toml", [TWO_PARTS, THREE_FILES])
-def test_the_joined_graph_answers_as_its_parts(tmp_path: Path, toml: str) -> None:
-    path = write_dense(tmp_path, toml)
+def test_the_joined_graph_answers_as_its_parts(tmp_path: Path) -> None:
+    path = write_dense(tmp_path)
 
-    session = open_session(path, threads=1, optimize=False)
-    whole = list(replay(session, images()))
+    whole = list(replay(joined(path), images()))
 
     for one, other in zip(whole, by_files(path, images()), strict=True):
         assert one.keys() == other.keys()
@@ -78,22 +74,19 @@ def test_the_joined_graph_answers_as_its_parts(tmp_path: Path, toml: str) -> Non
 
 @pytest.mark.parametrize("text", ["exact", "full-fused"])
 def test_what_passes_made_is_cut_and_joined_again(tmp_path: Path, text: str) -> None:
-    path = write_dense(tmp_path, THREE_FILES)
+    path = write_dense(tmp_path)
     stack = JoinedStack.load(path)
     passes = tuple(each for each in recipe.load(text) if each.exact)
     manager = PassManager(passes, verify_frames=0)
     small = manager.run(stack.model, Context(ModuleMap.whole())).model
-    (tmp_path / "small").mkdir()
 
-    for label, each in stack.first_files.items():
-        graph.save(each.model, tmp_path / "small" / f"{label}.onnx")
-    stack.save(small, tmp_path / "small" / "stack.toml")
+    made = again(dataclasses.replace(stack, model=small), tmp_path / "small")
 
-    again = JoinedStack.load(tmp_path / "small" / "stack.toml")
-    for label, each in stack.files.items():
-        assert again.files[label].inputs == each.inputs
-        assert again.files[label].outputs == each.outputs
-    whole = list(replay(open_session(again.path, threads=1), images()))
+    files = JoinedStack.load(made).joined.joints.graphs
+    for part, each in stack.joined.joints.graphs.items():
+        assert files[part].inputs == each.inputs
+        assert files[part].outputs == each.outputs
+    whole = list(replay(joined(made), images()))
     for one, other in zip(whole, by_files(path, images()), strict=True):
         for name, value in one.items():
             assert value == pytest.approx(other[name], rel=1e-5, abs=1e-6)
@@ -111,15 +104,16 @@ def test_names_that_two_parts_have_are_told_apart(tmp_path: Path) -> None:
 def test_weights_are_shared_with_the_files(tmp_path: Path) -> None:
     stack = JoinedStack.load(write_dense(tmp_path))
 
-    joined = stack.model.graph.initializers["backbone.w"].const_value
-    assert joined is stack.files["backbone"].model.graph.initializers["w"].const_value
+    weight = stack.model.graph.initializers["backbone.w"].const_value
+    file = stack.joined.joints.graphs["backbone"].model
+    assert weight is file.graph.initializers["w"].const_value
 
 
 def test_an_older_part_is_written_in_the_opset_of_the_newest(tmp_path: Path) -> None:
     path = write_stack(tmp_path, head=HEAD.replace('"" : 17', '"" : 16'))
 
     assert graph.opset_of(JoinedStack.load(path).model) == 17
-    plans = [each["plan"][0, 0, 0] for each in replay(open_session(path), ones(True))]
+    plans = [each["plan"][0, 0, 0] for each in replay(joined(path), ones(True))]
     assert plans == [1.0]
 
 
@@ -134,7 +128,7 @@ def test_a_name_that_the_state_bears_twice(tmp_path: Path) -> None:
         for at, each in enumerate(ones(True, False))
     ]
 
-    session = open_session(path, threads=1)
+    session = joined(path)
 
     assert session.recurrent == {"feats": "backbone.feats"}
     bevs = [float(each["next_bev"][0, 0]) for each in replay(session, frames)]
@@ -143,18 +137,14 @@ def test_a_name_that_the_state_bears_twice(tmp_path: Path) -> None:
 
 def test_what_a_part_passes_on_keeps_its_names(tmp_path: Path) -> None:
     passing = HEAD.replace("float[1,2,2] plan)", "float[1,2,2] plan, float[1,4] feats)")
-    path = write_stack(
-        tmp_path,
-        TWO_PARTS.replace("head", "neck") + "[edges]\nfeats = 'backbone.feats'\n",
-        neck=passing,
-    )
-    stack = JoinedStack.load(path)
+    toml = TWO_PARTS.replace("head", "neck") + "[edges]\nfeats = 'backbone.feats'\n"
+    stack = JoinedStack.load(write_stack(tmp_path, toml, neck=passing))
 
-    stack.save(stack.model, tmp_path / "again.toml")
+    made = JoinedStack.load(again(stack, tmp_path / "again", toml)).joined
 
-    again = JoinedStack.load(tmp_path / "again.toml")
-    assert list(again.outputs) == ["next_bev", "plan", "neck.feats", "backbone.feats"]
-    assert again.files["neck"].inputs == stack.files["neck"].inputs
+    assert list(made.outputs) == ["next_bev", "plan", "neck.feats", "backbone.feats"]
+    neck = stack.joined.joints.graphs["neck"]
+    assert made.joints.graphs["neck"].inputs == neck.inputs
 
 
 def test_a_part_that_would_need_what_no_file_gives_is_named(tmp_path: Path) -> None:
@@ -164,7 +154,7 @@ def test_a_part_that_would_need_what_no_file_gives_is_named(tmp_path: Path) -> N
     add.replace_input_with(0, image)
 
     with pytest.raises(GraphError, match=r"head cannot be cut out again: .* img"):
-        stack.save(stack.model, tmp_path / "again.toml")
+        stack.split(stack.model)
 
 
 def test_dense_parts_share_no_name_with_their_inner_values(tmp_path: Path) -> None:
@@ -178,9 +168,9 @@ def test_dense_parts_share_no_name_with_their_inner_values(tmp_path: Path) -> No
     head = head.replace("learned = {1,2,3,4}", f"learned = {{{','.join('1' * 16)}}}")
     graph.save(ir.from_onnx_text(head), tmp_path / "head.onnx")
 
-    joined = JoinedStack.load(path).model
+    body = JoinedStack.load(path).model.graph
 
-    names = [value.name for node in joined.graph for value in node.outputs]
+    names = [value.name for node in body for value in node.outputs]
     assert "backbone.plan" in names
     assert len(names) == len(set(names))
 
@@ -202,11 +192,10 @@ def test_functions_of_one_name_that_differ_are_told_apart(tmp_path: Path) -> Non
         head=CALL.format(name="head", taken="feats", given="plan", body="Mul(x, x)"),
     )
 
-    stack = JoinedStack.load(path)
-    stack.save(stack.model, tmp_path / "again.toml")
+    made = again(JoinedStack.load(path), tmp_path / "again")
 
-    for each in (path, tmp_path / "again.toml"):
-        (found,) = replay(open_session(each, threads=1), ones(True))
+    for each in (path, made):
+        (found,) = replay(joined(each), ones(True))
         assert found["plan"][0, 0] == 4.0
     assert len(JoinedStack.load(path).model.functions) == 2
 
@@ -230,11 +219,10 @@ def test_names_in_bodies_are_told_apart_too(tmp_path: Path) -> None:
         head=BRANCH.format(name="head", taken="feats", given="plan"),
     )
 
-    stack = JoinedStack.load(path)
-    stack.save(stack.model, tmp_path / "again.toml")
+    made = again(JoinedStack.load(path), tmp_path / "again")
 
-    for each in (path, tmp_path / "again.toml"):
-        (found,) = replay(open_session(each, threads=1), ones(True))
+    for each in (path, made):
+        (found,) = replay(joined(each), ones(True))
         assert found["plan"][0, 0] == 4.0
 
 
@@ -248,16 +236,14 @@ def test_large_weights_stay_on_disk(tmp_path: Path) -> None:
 
     weight = stack.model.graph.initializers["head.w"].const_value
     assert isinstance(weight, ir.ExternalTensor)
-    (tmp_path / "small").mkdir()
-    stack.save(stack.model, tmp_path / "small" / "stack.toml")
+    again(stack, tmp_path / "small")
     assert (tmp_path / "small" / "head.onnx.data").is_file()
     assert not (tmp_path / "small" / "backbone.onnx.data").exists()
 
 
 def test_what_a_pass_took_away_is_missing_from_its_part(tmp_path: Path) -> None:
-    toml = TWO_PARTS + '[state]\nprev_bev = {first = "head.learned"}\n'
-    stack = JoinedStack.load(write_stack(tmp_path, toml))
-    body, small = stack.model.graph, tmp_path / "small"
+    stack = JoinedStack.load(write_stack(tmp_path))
+    body = stack.model.graph
     (add,) = (each for each in body if each.op_type == "Add")
     (state,) = (each for each in body.inputs if each.name == "prev_bev")
     zeros = ir.tensor(np.zeros((1, 4), np.float32), name="zeros")
@@ -269,25 +255,11 @@ def test_what_a_pass_took_away_is_missing_from_its_part(tmp_path: Path) -> None:
         [each for each in body if each.op_type == "Mul" and each.name == "/head/Mul"]
     )
     body.inputs.remove(state)
-    small.mkdir()
 
-    stack.save(stack.model, small / "stack.toml")
+    made = again(stack, tmp_path / "small")
 
-    again = JoinedStack.load(small / "stack.toml")
-    assert list(again.joined.inputs) == ["img"]
-    assert again.recurrent == {}
-    (found,) = replay(open_session(again.path, threads=1), ones(True))
-    assert found["next_bev"][0, 0] == 2.0
-
-
-def test_a_part_without_an_output_is_left_out(tmp_path: Path) -> None:
-    stack = JoinedStack.load(write_stack(tmp_path))
-    body, small = stack.model.graph, tmp_path / "small"
-    for value in list(body.outputs):
-        if value.name != "feats":
-            body.outputs.remove(value)
-    small.mkdir()
-
-    stack.save(stack.model, small / "stack.toml")
-
-    assert list(JoinedStack.load(small / "stack.toml").files) == ["backbone"]
+    found = JoinedStack.load(made).joined
+    assert list(found.inputs) == ["img"]
+    assert found.recurrent == {}
+    (answer,) = replay(joined(made), ones(True))
+    assert answer["next_bev"][0, 0] == 2.0

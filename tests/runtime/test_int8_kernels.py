@@ -47,7 +47,7 @@ def test_what_drives_is_what_onnxruntime_runs(monkeypatch: pytest.MonkeyPatch) -
         given.update(options)
         raise GraphError("seen")
 
-    monkeypatch.setattr(onnx_policy, "open_session", refuse)
+    monkeypatch.setattr(onnx_policy, "Session", refuse)
     with pytest.raises(EvaluationError, match="seen"):
         OnnxPolicy.open(Path("m.onnx"))
 

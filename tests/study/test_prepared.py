@@ -78,21 +78,6 @@ def test_passes_make_a_model_of_their_own(study: Study, tmp_path: Path) -> None:
     assert source.read_bytes() == before
 
 
-def test_a_stack_of_files_is_made_smaller_once(study: Study, tmp_path: Path) -> None:
-    (variant,), source = study.variants, Path(study.variants[0].policy)
-    stack = source.with_name("stack.toml")
-    stack.write_text(f'[[part]]\nname = "whole"\nfile = "{source.name}"\n')
-    other = dataclasses.replace(variant, policy=str(stack), passes=recipe.load("exact"))
-    study = dataclasses.replace(study, variants=(other,))
-
-    found = made(study, tmp_path)
-
-    assert found.model is not None
-    assert found.model.name == "stack.toml"
-    assert found.model.with_name("whole.onnx").is_file()
-    assert made(study, tmp_path) == found
-
-
 def test_the_checkpoint_of_a_model_is_kept(study: Study, tmp_path: Path) -> None:
     source = Path(study.variants[0].policy)
     model = graph.load(source)

@@ -10,10 +10,9 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.stated import adapted
-from me2e_compress.errors import EvaluationError, FramesError, RecipeError
+from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.runtime.plan_adapter import PlanAdapter
-from me2e_compress.runtime.stack_session import open_session
 from me2e_compress.workflows.calibrate import calibrate
 from me2e_compress.workflows.calibrate_options import CalibrateOptions
 from me2e_compress.workflows.compare import compare
@@ -21,7 +20,6 @@ from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.inspect import inspect
 from me2e_compress.workflows.profile import ProfileOptions, profile
 from me2e_compress.workflows.sensitivity import SensitivityOptions, measure_sensitivity
-from tests.stacks import write_stack
 
 MINE = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -162,28 +160,6 @@ def test_the_command_that_picks_a_mode_has_the_name_of_the_graph() -> None:
     said = Adapter(inputs={"command": "navigation"}, plan=plan).metadata({})
 
     assert json.loads(said["me2e.plan"])["command_input"] == "navigation"
-
-
-def test_files_of_a_stack_take_no_adapter(
-    tmp_path: Path, frames: Path, adapter: Path
-) -> None:
-    stack, out = write_stack(tmp_path), tmp_path / "out"
-
-    with pytest.raises(RecipeError, match="--adapter is for one file"):
-        compress(stack, out, "exact", frames, CompressOptions(adapter=adapter))
-    with pytest.raises(RecipeError, match="--adapter is for one file"):
-        calibrate(stack, frames, out, CalibrateOptions(adapter=adapter))
-
-
-def test_what_is_said_of_a_stack_wins_over_its_own(tmp_path: Path) -> None:
-    stack = write_stack(tmp_path)
-    plain = open_session(stack)
-    name = next(iter(plain.recurrent))
-
-    silent = open_session(stack, said={"me2e.recurrent": json.dumps({name: None})})
-
-    assert name not in silent.recurrent
-    assert set(plain.recurrent) - set(silent.recurrent) == {name}
 
 
 def test_a_map_says_which_output_is_the_plan_and_what_is_fed_back(

@@ -113,13 +113,13 @@ def test_how_it_died(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_crash_of_a_stack_is_said(
+def test_a_crash_of_a_file_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def dies(*_: object, **__: object) -> None:
-        raise GraphError("stack.toml: onnxruntime dies of it")
+        raise GraphError("head.onnx: onnxruntime dies of it")
 
     monkeypatch.setattr(first_opening, "try_apart", dies)
 
     with pytest.raises(GraphError, match="dies of it"):
-        try_file(write_stack(tmp_path), SILENT)
+        try_file(write_stack(tmp_path).with_name("head.onnx"), SILENT)

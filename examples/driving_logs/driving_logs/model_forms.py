@@ -22,7 +22,7 @@ of DL4AGX."""
 
 
 def inputs_of_model(path: Path, size: tuple[int, int] | None) -> LoggedInputs:
-    """Return how an ONNX file, or a stack of several, is fed from a log.
+    """Return how an ONNX file is fed from a log.
 
     Files exported from UniAD or VAD see the ground in the axes of nuScenes' lidar, all
     others in those of the policy contract. `size` is rows and columns of the images,

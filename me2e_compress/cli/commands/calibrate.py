@@ -22,7 +22,7 @@ Table = Annotated[Path | None, typer.Option(help="write onnxruntime's too: a fol
 
 
 def calibrate(
-    model: given.AnyModel,
+    model: given.Model,
     frames: Frames = None,
     output: Output = Path("ranges.json"),
     recipe: Recipe = "exact",

@@ -16,7 +16,7 @@ from me2e_compress.workflows.first_difference import first_difference
 
 
 def compare(
-    reference: Annotated[str, typer.Argument(help="graph or stack to be true to")],
+    reference: Annotated[str, typer.Argument(help="graph to be true to")],
     candidate: Annotated[
         str, typer.Argument(help="the graph that is judged; not with --outputs")
     ],

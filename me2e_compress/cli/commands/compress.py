@@ -14,9 +14,7 @@ from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import compress as workflow
 from me2e_compress.workflows.checks import sizes
 
-Output = Annotated[
-    Path, typer.Option("-o", "--output", help="the smaller graph; of a stack a folder")
-]
+Output = Annotated[Path, typer.Option("-o", "--output", help="the smaller graph")]
 Passes = Annotated[str | None, typer.Option(help="a pipeline, as text; see above")]
 Verify = Annotated[int, typer.Option(min=0, help="frames to check exact passes on")]
 Unproven = Annotated[
@@ -34,7 +32,7 @@ Smaller = Annotated[
 
 
 def compress(
-    model: given.AnyModel,
+    model: given.Model,
     output: Output,
     recipe_name: given.Recipe = None,
     passes: Passes = None,

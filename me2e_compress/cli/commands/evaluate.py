@@ -14,9 +14,7 @@ from me2e_compress.workflows.check_model import check_model
 
 Policy = Annotated[
     str | None,
-    typer.Argument(
-        help="M.onnx, STACK.toml, highway, expert, module:function; see list"
-    ),
+    typer.Argument(help="M.onnx, highway, expert, module:function; see list"),
 ]
 Evaluator = Annotated[
     str, typer.Option(help="who drives it: highway, NAME{option=value}, or see list")

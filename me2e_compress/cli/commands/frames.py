@@ -28,8 +28,7 @@ def frames(
     stack: Annotated[
         str,
         typer.Argument(
-            help="vad-tiny, uniad-tiny, uniad-trt, tcp, highway, highway-2, M.onnx or"
-            " STACK.toml"
+            help="vad-tiny, uniad-tiny, uniad-trt, tcp, highway, highway-2, or M.onnx"
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="the folder")],
@@ -46,9 +45,9 @@ def frames(
     """Write calibration frames, coherent in time, seen by six cameras.
 
     A synthetic world is drawn for stacks of the zoo; for a driver that ships, or any
-    ONNX file or stack of files (STACK.toml) that keeps the policy contract (--adapter),
-    the expert drives fresh routes of a --road. With --from, recorded driving is laid
-    out as the file takes it (docs/writing-logs.md).
+    ONNX file that keeps the policy contract (--adapter), the expert drives fresh routes
+    of a --road. With --from, recorded driving is laid out as the file takes it
+    (docs/writing-logs.md).
     """
     options = workflow.FramesOptions(
         count,

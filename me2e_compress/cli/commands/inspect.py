@@ -12,7 +12,7 @@ from me2e_compress.workflows.checks import sizes
 
 
 def inspect(
-    model: given.AnyModel,
+    model: given.Model,
     module_map: given.ModuleMap = None,
     set_dim: given.SetDim = None,
     modelled_energy: Annotated[

@@ -15,7 +15,7 @@ from me2e_compress.workflows.import_profile import import_profile, refuse_both
 
 
 def profile(
-    model: given.AnyModel,
+    model: given.Model,
     output: Annotated[Path, typer.Option("-o", "--output", help="the trace")],
     frames: Annotated[
         Path | None, typer.Argument(help="the recorded FRAMES; none for --import")

@@ -21,9 +21,8 @@ from me2e_compress.driving.ego_track import EgoTrack
 from me2e_compress.driving.input_sources import INPUT_SOURCES, Observed
 from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE, Shape, fed, fits
 from me2e_compress.errors import EvaluationError
-from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.session import DTYPES, SessionPort
+from me2e_compress.runtime.session import DTYPES, Session, SessionPort
 
 IMAGES: Literal["img"] = "img"
 CONTRACT: Mapping[str, str] = {
@@ -51,7 +50,7 @@ class ModelInputs:
 
     @classmethod
     def of(
-        cls, session: AnySession, adapter: Adapter, recurrent: Mapping[str, str]
+        cls, session: Session, adapter: Adapter, recurrent: Mapping[str, str]
     ) -> Self:
         """Check the inputs of a graph against the contract.
 
@@ -66,7 +65,7 @@ class ModelInputs:
 
     @classmethod
     def found(
-        cls, session: AnySession, adapter: Adapter, recurrent: Mapping[str, str]
+        cls, session: Session, adapter: Adapter, recurrent: Mapping[str, str]
     ) -> tuple[Self, dict[str, str]]:
         """Return what can be fed, and by input why the rest cannot."""
         ports = {k: v for k, v in session.inputs.items() if k not in recurrent}
@@ -183,7 +182,7 @@ def _feeds(adapter: Adapter, ports: Mapping[str, SessionPort]) -> dict[str, Feed
 
 
 def _images(
-    session: AnySession, adapter: Adapter, tables: Mapping[str, ImageInput]
+    session: Session, adapter: Adapter, tables: Mapping[str, ImageInput]
 ) -> tuple[dict[str, InputImages], tuple[int, int], dict[str, str]]:
     """Return the image inputs, the size of the cameras, and what does not fit."""
     ports: dict[str, ImagePort] = {}
@@ -212,7 +211,7 @@ def _images(
 
 
 def _normalization(
-    session: AnySession, adapter: Adapter, name: str, table: ImageInput
+    session: Session, adapter: Adapter, name: str, table: ImageInput
 ) -> ImageNormalization | None:
     """Return how an image input is normalised; inputs of bytes are not."""
     if session.inputs[name].type == BYTES:
@@ -224,7 +223,7 @@ def _normalization(
 
 
 def _check_names(
-    session: AnySession, adapter: Adapter, recurrent: Mapping[str, str]
+    session: Session, adapter: Adapter, recurrent: Mapping[str, str]
 ) -> None:
     """Check that every name in the adapter exists and is used once."""
     for name, answer in recurrent.items():

@@ -11,9 +11,9 @@ from me2e_compress.driving.adapter.controls import ControlAdapter, output_named
 from me2e_compress.driving.contract import Answer, Observation, Trajectory
 from me2e_compress.driving.waypoint_pid import HeadFusion
 from me2e_compress.errors import EvaluationError
-from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
+from me2e_compress.runtime.session import Session
 
 COMMAND = "command"
 """Name of the navigator's command among the inputs."""
@@ -33,7 +33,7 @@ class ModelOutputs:
     fusion: HeadFusion | None
 
     @classmethod
-    def of(cls, session: AnySession, adapter: Adapter) -> Self:
+    def of(cls, session: Session, adapter: Adapter) -> Self:
         """Find the outputs of a graph to read."""
         outputs, control = list(session.outputs), adapter.control
         fusion = None if adapter.fusion is None else HeadFusion(adapter.fusion)

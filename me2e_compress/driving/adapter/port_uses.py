@@ -14,9 +14,8 @@ from me2e_compress.driving.adapter.recurrent import ZEROS
 from me2e_compress.driving.input_sources import INPUT_SOURCES
 from me2e_compress.driving.ports import Shape, zeros
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.plan_adapter import CONTRACT_STEP_S, PlanAdapter
-from me2e_compress.runtime.session import DTYPES, SessionPort
+from me2e_compress.runtime.session import DTYPES, Session, SessionPort
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ def element_type(of_port: str) -> str:
 
 
 def input_uses(
-    session: AnySession, adapter: Adapter, recurrent: Mapping[str, str]
+    session: Session, adapter: Adapter, recurrent: Mapping[str, str]
 ) -> tuple[PortUse, ...]:
     """List the inputs of a graph, in its order, with what each is fed."""
     found, problems = ModelInputs.found(session, adapter, recurrent)
@@ -103,7 +102,7 @@ class OutputUses:
     problems: tuple[str, ...]
 
     @classmethod
-    def of(cls, session: AnySession, adapter: Adapter) -> Self:
+    def of(cls, session: Session, adapter: Adapter) -> Self:
         """Find the uses of a graph's outputs."""
         try:
             found = ModelOutputs.of(session, adapter)
@@ -122,7 +121,7 @@ class OutputUses:
         return cls("its plan" if found.control is None else "its controls", uses, ())
 
     def ports(
-        self, session: AnySession, recurrent: Mapping[str, str]
+        self, session: Session, recurrent: Mapping[str, str]
     ) -> tuple[PortUse, ...]:
         """List the outputs of the graph, in its order."""
         back = {answer: f"fed back to {name}" for name, answer in recurrent.items()}

@@ -15,12 +15,12 @@ from pydantic import (
     model_validator,
 )
 
+from me2e_compress.display import reason
 from me2e_compress.driving.ports import fed, fits, zeros
-from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.graph.stack.first_values import read_value
-from me2e_compress.runtime.any_session import AnySession
+from me2e_compress.errors import EvaluationError
+from me2e_compress.registry.documents import UNREADABLE, check_regular
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.session import DTYPES, SessionPort
+from me2e_compress.runtime.session import DTYPES, Session, SessionPort
 
 ZEROS = "zeros"
 _FILES = (".npy", ".npz")
@@ -66,7 +66,7 @@ Entries = Mapping[str, RecurrentEntry] | None
 
 
 def answers_by_input(
-    session: AnySession, entries: Entries, fed_otherwise: set[str]
+    session: Session, entries: Entries, fed_otherwise: set[str]
 ) -> dict[str, str]:
     """Return each recurrent input with the output that answers it.
 
@@ -101,7 +101,7 @@ class FirstValues:
 
     @classmethod
     def of(
-        cls, session: AnySession, entries: Entries, recurrent: Mapping[str, str]
+        cls, session: Session, entries: Entries, recurrent: Mapping[str, str]
     ) -> Self:
         """Read the files, and check every value against its input."""
         held: dict[str, Array] = {}
@@ -124,12 +124,24 @@ class FirstValues:
 
 
 def _from_file(path: Path, name: str, port: SessionPort, where: str) -> Array:
-    try:
-        value = read_value(path, name, where)
-    except GraphError as error:
-        raise EvaluationError(str(error)) from error
+    value = _read(path, name, where)
     _check(value, port, where)
     return fed(value, port)
+
+
+def _read(path: Path, name: str, where: str) -> Array:
+    """Read an array; from an ``.npz``, the one named like the input."""
+    try:
+        check_regular(path)
+        held = np.load(path, allow_pickle=False)
+        if isinstance(held, np.ndarray):
+            return np.asarray(held)
+        with held:
+            return np.asarray(held[name])
+    except KeyError as error:
+        raise EvaluationError(f"{where} holds no array {name}") from error
+    except UNREADABLE as error:
+        raise EvaluationError(f"{where} cannot be read: {reason(error)}") from error
 
 
 def _input(

@@ -13,7 +13,7 @@ from me2e_compress.driving.policies import POLICIES, Driver, SizedPolicy
 from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import EvaluationError
-from me2e_compress.graph import LoadedModel, sha256_of
+from me2e_compress.graph import load, sha256_of
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.runtime.providers import CPU, Provider
 
@@ -58,10 +58,10 @@ class BlindDriver(Driver):
 
 @dataclass(frozen=True)
 class OnnxDriver(Driver):
-    """An ONNX file, or a stack of several, that keeps the policy contract.
+    """An ONNX file that keeps the policy contract.
 
     Attributes:
-        path: The file, or the TOML of the stack.
+        path: The file.
         adapter: TOML file that adapts the model to the contract, or the name of one
             that ships; None where the model keeps it as it is.
         module_map: Preset or TOML file that says which output is the plan and which are
@@ -102,7 +102,7 @@ class OnnxDriver(Driver):
 
         if self.module_map is None:
             return {}
-        return adapted(LoadedModel.load(self.path).model, None, self.module_map)
+        return adapted(load(self.path), None, self.module_map)
 
     @property
     def label(self) -> str:

@@ -2,7 +2,7 @@
 
 from me2e_compress.graph.modules.assign import assign
 from me2e_compress.graph.modules.assignment import Assignment, Placement
-from me2e_compress.graph.modules.detect import detect, map_of, map_of_files
+from me2e_compress.graph.modules.detect import detect, map_of
 from me2e_compress.graph.modules.inventory import Item, itemise
 from me2e_compress.graph.modules.module_map import (
     Module,
@@ -26,7 +26,6 @@ __all__ = [
     "detect",
     "itemise",
     "map_of",
-    "map_of_files",
     "presets",
     "scope_of",
 ]

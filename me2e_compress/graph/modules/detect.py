@@ -1,6 +1,6 @@
 """Find the preset that fits a graph."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import onnx_ir as ir
 
@@ -23,10 +23,7 @@ def detect(model: ir.Model) -> ModuleMap:
     Raises:
         ModuleMapError: no preset fits.
     """
-    return _detect(model.metadata_props.get(STACK), _paths(model))
-
-
-def _detect(stack: str | None, paths: list[str]) -> ModuleMap:
+    stack, paths = model.metadata_props.get(STACK), _paths(model)
     # the stack's own name decides
     for name in presets():
         if stack is not None and (stack == name or stack.startswith(f"{name}-")):
@@ -57,33 +54,6 @@ def map_of(model: ir.Model, name: str | None) -> ModuleMap:
         return detect(model)
     except ModuleMapError:
         return ModuleMap.whole()
-
-
-def map_of_files(
-    models: Sequence[ir.Model], stack: str | None, name: str | None
-) -> ModuleMap:
-    """Load the map of a stack of several files, or find the preset that fits them all.
-
-    No pattern is required to match in every file, but each in one. ``stack`` is the
-    name in the metadata; ``name`` a preset or a TOML file, None to look for a preset.
-    """
-    paths = [path for model in models for path in _paths(model)]
-    if name is None:
-        try:
-            return _detect(stack, paths).lenient()
-        except ModuleMapError:
-            return ModuleMap.whole()
-    # a named map must match in some file
-    found = ModuleMap.load(name)
-    claimed = {claim for path in paths for claim in found.claims(path)}
-    for module, pattern in found.required():
-        if (module, pattern) not in claimed:
-            raise ModuleMapError(
-                f"map {found.name}: pattern {pattern!r} of module {module} matches no"
-                " parameter and no scope in any of the files"
-                f"{behind_a_prefix(found, paths)}"
-            )
-    return found.lenient()
 
 
 _DEEPEST = 3

@@ -206,14 +206,6 @@ class ModuleMap(Displayed):
         """List every (module, pattern) that must match something."""
         return [(m.name, text) for m in self.modules for text in m.patterns]
 
-    def lenient(self) -> Self:
-        """Return this map with no pattern required: for a file with some modules."""
-        modules = (
-            dataclasses.replace(m, patterns=(), optional=m.patterns + m.optional)
-            for m in self.modules
-        )
-        return dataclasses.replace(self, modules=tuple(modules))
-
     @functools.cached_property
     def _globs(self) -> tuple[tuple[str, PathGlob], ...]:
         return tuple(

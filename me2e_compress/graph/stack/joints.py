@@ -1,4 +1,4 @@
-"""Connections between the files of a stack, at first and at other frames."""
+"""Connections between the files of a stack."""
 
 import dataclasses
 import graphlib
@@ -22,7 +22,7 @@ Sources = Mapping[str, Mapping[str, FeedSource]]
 
 @dataclasses.dataclass(frozen=True)
 class Joints:
-    """The connections of the files at one kind of frame, parts in topological order."""
+    """The connections of the files, parts in topological order."""
 
     order: tuple[str, ...]
     graphs: Mapping[str, PartGraph]
@@ -61,23 +61,12 @@ class Joints:
 def _check(
     graphs: Mapping[str, PartGraph], taker: PartGraph, name: str, source: FeedSource
 ) -> None:
-    # The part must run, have the output, and fit the input.
-    giver = graphs.get(source.part)
-    if giver is None:
-        raise GraphError(
-            f"{taker.label}.{name} is fed by {source.part}.{source.name} at every"
-            f" frame, and {source.part} runs at first frames alone"
-        )
-    given = giver.outputs.get(source.name)
-    if given is None:
-        raise GraphError(
-            f"{taker.label}.{name} is fed by {source.part}.{source.name}, and"
-            f" {giver.path} has no such output; it has {', '.join(giver.outputs)}"
-        )
+    giver = graphs[source.part]
+    given = giver.outputs[source.name]
     if misfit(given, taker.inputs[name]):
         raise GraphError(
-            f"{taker.label}.{name} takes {form(taker.inputs[name])}, and"
-            f" {giver.label}.{source.name}, which feeds it, is {form(given)}"
+            f"{taker.part}.{name} takes {form(taker.inputs[name])}, and"
+            f" {giver.part}.{source.name}, which feeds it, is {form(given)}"
         )
 
 
@@ -91,26 +80,13 @@ class Names:
     files: Sequence[PartGraph]
     taken: Collection[str] = ()
 
-    def parts(self) -> tuple[str, ...]:
-        """Return the parts, in the order of the file."""
-        return tuple(dict.fromkeys(each.part for each in self.files))
-
     def parts_giving(self, output: str) -> tuple[str, ...]:
         """Return the parts that have an output of that name."""
-        return tuple(
-            dict.fromkeys(each.part for each in self.files if output in each.outputs)
-        )
-
-    def outputs_of(self, part: str) -> tuple[str, ...]:
-        """Return the outputs of a part's files."""
-        files = (each for each in self.files if each.part == part)
-        return tuple(dict.fromkeys(name for each in files for name in each.outputs))
+        return tuple(each.part for each in self.files if output in each.outputs)
 
     def parts_taking(self, name: str) -> tuple[str, ...]:
         """Return the parts that have an input of that name."""
-        return tuple(
-            dict.fromkeys(each.part for each in self.files if name in each.inputs)
-        )
+        return tuple(each.part for each in self.files if name in each.inputs)
 
     def public(self, part: str, output: str) -> str:
         """Return the stack's name of an output, with its part if it is ambiguous."""
@@ -127,11 +103,7 @@ class Names:
         part, _, name = text.partition(".")
         if part in self.parts_giving(name):
             return FeedSource(part, name)
-        there = [
-            f"{each}.{output}"
-            for each in self.parts()
-            for output in self.outputs_of(each)
-        ]
+        there = (f"{file.part}.{each}" for file in self.files for each in file.outputs)
         raise GraphError(f"{where}: no part gives {text}; there is {', '.join(there)}")
 
     def inputs(self, text: str, where: str) -> tuple[tuple[str, str], ...]:
@@ -141,7 +113,7 @@ class Names:
             return tuple((each, text) for each in takers)
         if part in self.parts_taking(name):
             return ((part, name),)
-        there = (f"{file.label}.{each}" for file in self.files for each in file.inputs)
+        there = (f"{file.part}.{each}" for file in self.files for each in file.inputs)
         raise GraphError(f"{where}: no part takes {text}; there is {', '.join(there)}")
 
 

@@ -13,10 +13,10 @@ from me2e_compress.graph.stack.part_graph import PartGraph
 
 
 def merged(joints: Joints, names: Names, inputs: Collection[str]) -> ir.Model:
-    """Return one graph of the parts that run at one kind of frame.
+    """Return one graph of all parts.
 
-    Its inputs are those of the stack that a part takes, its outputs all that a part
-    gives, by their names in the stack. Other names that two parts have get the part in
+    Its inputs are those of the stack, its outputs all that a part gives, by their names
+    in the stack. Other names that two parts have get the part in
     front: ``head.w``, and ``/head/Mul`` for ``/Mul``. Weights are shared with the
     files' graphs, not copied.
     """
@@ -39,7 +39,7 @@ def merged(joints: Joints, names: Names, inputs: Collection[str]) -> ir.Model:
     }
     joined = ir.Model(
         ir.Graph(
-            [body.taken[name] for name in inputs if name in body.taken],
+            [body.taken[name] for name in inputs],
             body.outputs(),
             nodes=body.nodes,
             initializers=body.initializers,

@@ -9,7 +9,6 @@ import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.files import load
-from me2e_compress.graph.nodes import Array
 from me2e_compress.graph.recurrence import SessionPort, declared_pairs
 
 
@@ -17,11 +16,9 @@ from me2e_compress.graph.recurrence import SessionPort, declared_pairs
 class PartGraph:
     """One ONNX file of a stack, and its interface.
 
-    ``label`` is ``head`` or ``head.first_frame``; a port of unknown shape has an empty
-    one.
+    A port of unknown shape has an empty one.
     """
 
-    label: str
     part: str
     path: Path
     inputs: Mapping[str, SessionPort]
@@ -30,11 +27,11 @@ class PartGraph:
     model: ir.Model = dataclasses.field(repr=False)
 
     @classmethod
-    def load(cls, label: str, part: str, path: Path) -> Self:
+    def load(cls, part: str, path: Path) -> Self:
         """Read a file; GraphError if it is missing or not a graph."""
         model = load(path)
         sides = _ports(model.graph.inputs), _ports(model.graph.outputs)
-        return cls(label, part, path, *sides, dict(model.metadata_props), model)
+        return cls(part, path, *sides, dict(model.metadata_props), model)
 
     def recurrent(self) -> dict[str, str | None]:
         """Return the output declared for each input; None if it is not fed back."""
@@ -45,12 +42,6 @@ class PartGraph:
         if named == {}:
             return dict.fromkeys(self.inputs)
         return named or {}
-
-    def initializer(self, name: str) -> Array | None:
-        """Read an initializer; None if there is none of that name."""
-        found = self.model.graph.initializers.get(name)
-        tensor = None if found is None else found.const_value
-        return None if tensor is None else tensor.numpy()
 
 
 def misfit(given: SessionPort, taken: SessionPort) -> bool:

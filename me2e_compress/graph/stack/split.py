@@ -96,7 +96,7 @@ def _between(
             weights[value] = None
         elif node is None:
             raise GraphError(
-                f"{file.label} cannot be cut out again: a pass made it need"
+                f"{file.part} cannot be cut out again: a pass made it need"
                 f" {value.name}, which {file.path.name} does not take"
             )
         elif node not in needed:

@@ -3,28 +3,15 @@
 import json
 import re
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
 import pydantic
 
-from me2e_compress.errors import GraphError
+from me2e_compress.errors import FORMER, GraphError
 from me2e_compress.registry import documents
-from me2e_compress.registry.documents import toml_string
-
-SUFFIX = ".toml"
-"""Suffix of a file that describes a stack, wherever a model is expected."""
-
-
-def is_stack(path: str | Path) -> bool:
-    """Return whether a file name is that of a stack's TOML file."""
-    return Path(path).suffix == SUFFIX
-
-
-ZEROS = "zeros"
-"""The default first value of a state."""
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
-_STRICT = pydantic.ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+_STRICT = pydantic.ConfigDict(frozen=True, extra="forbid")
 
 
 class PartEntry(pydantic.BaseModel):
@@ -32,50 +19,26 @@ class PartEntry(pydantic.BaseModel):
 
     Attributes:
         name: letters, digits, ``_`` and ``-``.
-        file: the ONNX file, relative to the TOML; without one, the part runs at first
-            frames alone.
-        first_frame: the ONNX file that runs instead where a scene begins.
+        file: the ONNX file, relative to the TOML.
     """
 
     model_config = _STRICT
 
     name: str
-    file: Path | None = None
-    first_frame: Path | None = None
+    file: Path
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _without_first_frame(cls, value: Any) -> Any:
+        if isinstance(value, dict) and "first_frame" in value:
+            raise ValueError(FORMER["stack first_frame"])
+        return value
 
     @pydantic.model_validator(mode="after")
     def _named(self) -> Self:
         if not _NAME.fullmatch(self.name):
             raise ValueError(f"name {self.name!r}: letters, digits, _ and - alone")
-        if self.file is None and self.first_frame is None:
-            raise ValueError(f"{self.name} has neither file nor first_frame")
         return self
-
-    def files(self) -> tuple[tuple[str, Path], ...]:
-        """Return its files by label: ``head`` and ``head.first_frame``."""
-        named = ((self.name, self.file), (first_label(self.name), self.first_frame))
-        return tuple((label, path) for label, path in named if path is not None)
-
-
-class StateEntry(pydantic.BaseModel):
-    """One entry of ``[state]``.
-
-    Attributes:
-        answer: the output that is fed back; in the file ``from``. None leaves it to
-            the naming rules: ``X_out`` for ``X``, ``next_X`` for ``prev_X``.
-        first: the value where a scene begins: ``zeros``, a file ``.npy`` or ``.npz``
-            relative to the TOML, or ``PART.NAME``: an initializer of that part, or its
-            output at that frame.
-    """
-
-    model_config = _STRICT
-
-    answer: str | None = pydantic.Field(default=None, alias="from")
-    first: str = ZEROS
-
-
-def _entry(value: object) -> object:
-    return {"from": value} if isinstance(value, str) else value
 
 
 class StackFile(pydantic.BaseModel):
@@ -85,7 +48,8 @@ class StackFile(pydantic.BaseModel):
         part: the parts, in any order.
         edges: ``{input: output}``, each ``PART.NAME`` or a name that one part alone
             has; equal names are joined automatically.
-        state: what is fed back to each input; a text alone is the output.
+        state: ``{input: output}`` of what is fed back at the next frame, where names
+            do not say it.
         metadata: metadata that the ONNX files lack, such as ``me2e.plan``; values that
             are not text are written as JSON.
     """
@@ -94,10 +58,15 @@ class StackFile(pydantic.BaseModel):
 
     part: tuple[PartEntry, ...] = pydantic.Field(min_length=1)
     edges: dict[str, str] = pydantic.Field(default_factory=dict)
-    state: dict[str, Annotated[StateEntry, pydantic.BeforeValidator(_entry)]] = (
-        pydantic.Field(default_factory=dict)
-    )
+    state: dict[str, str] = pydantic.Field(default_factory=dict)
     metadata: dict[str, Any] = pydantic.Field(default_factory=dict)
+
+    @pydantic.field_validator("state", mode="before")
+    @classmethod
+    def _without_first(cls, state: Any) -> Any:
+        if isinstance(state, dict) and any(isinstance(e, dict) for e in state.values()):
+            raise ValueError(FORMER["stack first"])
+        return state
 
     @pydantic.field_validator("metadata")
     @classmethod
@@ -122,48 +91,9 @@ class StackFile(pydantic.BaseModel):
         with documents.reading(path, GraphError, "not a stack of several files"):
             return cls.model_validate(documents.from_toml(documents.content(path)))
 
-    def text(self) -> str:
-        """Return the content as TOML."""
-        lines = list[str]()
-        for each in self.part:
-            lines += ["[[part]]", *_lines(each.model_dump(mode="json")), ""]
-        for title, entries in (
-            ("edges", self.edges),
-            ("state", {name: _inline(each) for name, each in self.state.items()}),
-            ("metadata", self.said()),
-        ):
-            if entries:
-                lines += [f"[{title}]", *_lines(entries), ""]
-        return "\n".join(lines)
-
     def said(self) -> dict[str, str]:
         """Return the metadata as texts."""
         return {
             key: value if isinstance(value, str) else json.dumps(value)
             for key, value in self.metadata.items()
         }
-
-
-def first_label(part: str) -> str:
-    """Return the label of the file that runs where a scene begins."""
-    return f"{part}.first_frame"
-
-
-class _Inline(str):
-    """Ready-made TOML that is not quoted again."""
-
-    __slots__ = ()
-
-
-def _inline(entry: StateEntry) -> _Inline:
-    said = {"from": entry.answer, "first": entry.first}
-    return _Inline(f"{{{', '.join(_lines(said))}}}")
-
-
-def _lines(entries: dict[str, Any]) -> list[str]:
-    known = {key: value for key, value in entries.items() if value is not None}
-    return [
-        f"{key if _NAME.fullmatch(key) else toml_string(key)} ="
-        f" {value if isinstance(value, _Inline) else toml_string(value)}"
-        for key, value in known.items()
-    ]

@@ -15,8 +15,7 @@ from me2e_compress.runtime.energy.reader import Absent, Reader
 from me2e_compress.runtime.energy.schedule import EnergySchedule
 from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import replay
-from me2e_compress.runtime.stack_session import open_session
+from me2e_compress.runtime.session import Session, replay
 
 MOST_BYTES = 500_000_000
 """Bytes of frames held in memory: reading from disk takes energy too."""
@@ -37,7 +36,7 @@ def measure_energy(
 
     Recurrent state is fed forward and reset where scenes begin. The first frames, as
     many as fit into 500 MB, are repeated as often as needed. Nothing else may run on
-    the device. ``models`` has ONNX files, or TOML files of stacks, by name; ``counter``
+    the device. ``models`` has ONNX files by name; ``counter``
     is described at ``open_counter``; ``said`` is metadata that overrides the models'
     own; ``on_window`` is called with windows done, windows in all, and the model's
     name.
@@ -81,7 +80,7 @@ def _metered(
     try:
         held = _held(frames)
         sessions = {
-            name: open_session(
+            name: Session(
                 path, threads=threads, int8_kernels=True, provider=provider, said=said
             )
             for name, path in models.items()
