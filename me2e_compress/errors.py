@@ -32,6 +32,8 @@ FORMER = {
     "driving log bench2drive": f"bench2drive {_NOW} examples/driving_logs",
     "--shard": f"--shard {_NOW} one run, which goes on where it was killed",
     "--merge": f"--merge {_NOW} one run, which goes on where it was killed",
+    "rule set tensorrt": f"tensorrt {_NOW} safe",
+    "study scheme": f"[[scheme]] {_NOW} [[variant]]",
     "stack first_frame": f"first_frame {_NOW} a TOML of its own for the first frames",
     "stack first": f"first {_NOW} [recurrent] of the adapter",
 }

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from me2e_compress.driving.policies import PythonDriver, driver_named
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
-from me2e_compress.errors import StudyError
+from me2e_compress.errors import FORMER, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.evaluator import routes_named
 from me2e_compress.manager import recipe
@@ -161,8 +161,7 @@ class _Study(_Table):
     report: Literal["comparison", "paper"] = "comparison"
     questions: str | None = None
     latency: Timing = Field(default_factory=Timing)
-    variant: list[_Variant] = Field(validation_alias=AliasChoices("variant", "scheme"))
-    """Files written before variants had their name say ``[[scheme]]``."""
+    variant: list[_Variant]
     condition: tuple[Condition, ...]
     block: tuple[StudyBlock, ...] = ()
     pair: list[_Pair] = Field(default_factory=list)
@@ -170,7 +169,6 @@ class _Study(_Table):
 
 _KINDS: dict[object, type] = {
     "variant": _Variant,
-    "scheme": _Variant,
     "condition": Condition,
     "latency": Timing,
     "block": StudyBlock,
@@ -186,6 +184,8 @@ def _complaint(error: ValidationError) -> str:
     unknown = [each for each in found if each["type"] in kinds]
     first = (unknown or found)[0]
     where = ".".join(str(part) for part in first["loc"])
+    if gone := FORMER.get(f"study {where}"):
+        return gone
     if not unknown:
         return f"{where}: {first['msg']}"
     inside = _KINDS.get(first["loc"][0], _Study) if len(first["loc"]) > 1 else _Study

@@ -83,7 +83,7 @@ title = "one"
 baseline = "blind"
 routes = 1
 held_out = "frames"
-[[scheme]]
+[[variant]]
 name = "blind"
 policy = "blind"
 [[condition]]

@@ -28,11 +28,11 @@ held_out = "frames"
 samples = 10
 baseline_median_s = 0.2
 
-[[scheme]]
+[[variant]]
 name = "float"
 policy = "m.onnx"
 
-[[scheme]]
+[[variant]]
 name = "exact"
 policy = "m.onnx"
 recipe = "exact"

@@ -140,7 +140,7 @@ join (float[9,16] a, float[9,16] b, float[9,16] c, float[16,16] w, float[48,16] 
 """
 
 
-def joined(overrides: str = "", rules: str = "tensorrt") -> QuantPlan:
+def joined(overrides: str = "", rules: str = "safe") -> QuantPlan:
     model = net(
         CONCAT, {"w": np.ones((16, 16)), "v": np.ones((48, 16)), "u": np.ones((80, 16))}
     )

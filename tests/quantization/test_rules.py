@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from me2e_compress.errors import RecipeError
-from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.nets import MODULES, by_output, net, planned
@@ -239,15 +238,6 @@ def test_a_layer_that_averages_by_a_softmax_reads_it_in_float() -> None:
 
     assert by_output(planned(model, "paper"))["y"].rule == "layer"
     assert by_output(planned(model))["y"].rule == "attention-weights"
-
-
-def test_tensorrt_is_a_name_of_the_default() -> None:
-    model = net(SAMPLING % ONNX, {n: np.ones(s) for n, s in SIZES.items()})
-
-    safe, alias = planned(model, "safe"), planned(model, "tensorrt")
-
-    assert safe.decisions == alias.decisions == make_plan(model, HEAD).decisions
-    assert safe.groups == alias.groups
 
 
 def test_what_turns_points_before_they_are_looked_up_is_a_position_too() -> None:

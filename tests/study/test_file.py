@@ -125,10 +125,9 @@ def test_a_name_that_is_no_file_is_one_that_ships(models: Path) -> None:
     assert study.variants[0].policy == str(shipped("highway"))
 
 
-def test_variants_may_be_called_schemes(models: Path) -> None:
-    named = load_study(write(models, GOOD))
-
-    assert load_study(write(models, GOOD.replace("[[variant]]", "[[scheme]]"))) == named
+def test_variants_are_no_longer_called_schemes(models: Path) -> None:
+    with pytest.raises(StudyError, match=r"\[\[scheme\]\] is gone .* use \[\[variant"):
+        load_study(write(models, GOOD.replace("[[variant]]", "[[scheme]]")))
 
 
 def test_a_file_where_you_are_is_not_beside_the_study(

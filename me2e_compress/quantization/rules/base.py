@@ -198,7 +198,6 @@ RULE_SETS: Registry[RuleSet] = Registry(
     {
         "safe": f"{_HERE}.safe_rules:SafeRules",
         "paper": f"{_HERE}.paper_rules:PaperRules",
-        "tensorrt": f"{_HERE}.safe_rules:TensorRTRules",
     },
 )
 

@@ -203,10 +203,3 @@ class SafeRules(PaperRules):
             *(length, AttentionWeights(), vector),
             *(SmallProduct(), NarrowConvolution(), CostGate()),
         )
-
-
-@dataclasses.dataclass(frozen=True)
-class TensorRTRules(SafeRules):
-    """The rule set ``safe`` by its former name: the same plan."""
-
-    name: ClassVar[str] = "tensorrt"
