@@ -6,6 +6,7 @@ from pathlib import Path
 
 import onnx_ir as ir
 
+from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import EvaluationError, GraphError
@@ -15,7 +16,7 @@ from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.fidelity.liveness import LivenessTally
 from me2e_compress.fidelity.matched_sets import SetFidelity, SetOutputs, SetTally
 from me2e_compress.fidelity.output_liveness import Liveness
-from me2e_compress.graph import load, provenance
+from me2e_compress.graph import provenance
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
@@ -180,7 +181,7 @@ def compare(
     slow = dict[str, str]()
     # each graph must take the frames, and open in another process first
     for path in dict.fromkeys(paths):
-        loaded = load(path)
+        loaded = graph.load(path)
         said[path] = adapted(loaded, adapter, module_map)
         models.append(loaded)
         if why := slow_here(loaded, provider):

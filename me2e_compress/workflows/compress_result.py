@@ -112,8 +112,9 @@ class CompressResult(Result):
     @property
     def refusal(self) -> str | None:
         """Why the target that the user named refuses the file; None if it does not."""
-        asked = self.lint is not None and self.lint.asked
-        return self.lint.refusal if asked else None
+        if self.lint is None or not self.lint.asked:
+            return None
+        return self.lint.refusal
 
     def check(self) -> None:
         """Raise PreconditionError if the target that was asked for refuses the file."""

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import onnx_ir as ir
 
+from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.fidelity.first_difference import FirstDifference, Source
 from me2e_compress.fidelity.places import Place
-from me2e_compress.graph import load, provenance
+from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import ModuleMap, assign, map_of
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.checks import check_count, model_path
@@ -149,7 +150,7 @@ def first_difference(
     recording = CalibrationSet(Path(frames))
     models = dict[Path, ir.Model]()
     for path in dict.fromkeys(paths):
-        loaded = load(path)
+        loaded = graph.load(path)
         adapted(loaded, adapter, module_map)
         recording.check(loaded)
         try_first(

@@ -123,7 +123,7 @@ def test_it_ends_in_one_line(
         signal.raise_signal(number)
         time.sleep(60)  # another thread may have got it first
 
-    monkeypatch.setattr("me2e_compress.graph.files.load", interrupted)
+    monkeypatch.setattr("me2e_compress.graph.load", interrupted)
     before = signal.getsignal(signal.SIGTERM)
 
     ended = cli(line)
@@ -154,7 +154,7 @@ def test_a_signal_that_python_loses_ends_the_run_all_the_same(
         for _ in range(500):
             time.sleep(0.01)
 
-    monkeypatch.setattr("me2e_compress.graph.files.load", lose)
+    monkeypatch.setattr("me2e_compress.graph.load", lose)
     before, hook = sorted(files.iterdir()), sys.unraisablehook
 
     assert cli("compress in.onnx -o out.onnx -r exact").code == code

@@ -168,9 +168,9 @@ def test_dense_parts_share_no_name_with_their_inner_values(tmp_path: Path) -> No
     head = head.replace("learned = {1,2,3,4}", f"learned = {{{','.join('1' * 16)}}}")
     graph.save(ir.from_onnx_text(head), tmp_path / "head.onnx")
 
-    body = JoinedStack.load(path).model.graph
+    made = JoinedStack.load(path).model.graph
 
-    names = [value.name for node in body for value in node.outputs]
+    names = [value.name for node in made for value in node.outputs]
     assert "backbone.plan" in names
     assert len(names) == len(set(names))
 
