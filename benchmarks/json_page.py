@@ -27,7 +27,6 @@ from me2e_compress.registry.entries import Entry
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import TimeShare
-from me2e_compress.study.on_road.halving import Rung
 from me2e_compress.targets.base import LintFinding
 from me2e_compress.workflows.check_model import ModelCheck
 from me2e_compress.workflows.compare_dump import DumpResult
@@ -55,7 +54,7 @@ NAMED = (
         Decision,
         QuantPlan,
     ),
-    *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity, Rung),
+    *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity),
     *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
     *(Int8Outcome, RuleSummary, WeightsRecord, RangeFinding, DumpResult),
     *(FirstDifference, RuntimeLoss, JoinResult, SplitResult),

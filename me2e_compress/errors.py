@@ -36,6 +36,9 @@ FORMER = {
     "study scheme": f"[[scheme]] {_NOW} [[variant]]",
     "stack first_frame": f"first_frame {_NOW} a TOML of its own for the first frames",
     "stack first": f"first {_NOW} [recurrent] of the adapter",
+    "--on-road": f"search --on-road {_NOW} a study that names the schemes",
+    "--most-ablated": f"--most-ablated {_NOW} a study that names the schemes",
+    "--baseline-median-s": f"--baseline-median-s {_NOW} a study's key of that name",
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""
 

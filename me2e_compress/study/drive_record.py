@@ -180,16 +180,11 @@ class DriveRecord:
     def difference_from(self, made_by: Mapping[str, Any]) -> str:
         """Say how another fingerprint differs from its own; empty if it does not."""
         other = {key: each for key, each in made_by.items() if key != "routes"}
-        return first_difference(self.made_by, other)
-
-
-def first_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Say how two fingerprints differ, in the first key; empty if they do not."""
-    for key in sorted({*before, *now}):
-        old, new = before.get(key), now.get(key)
-        if old != new:
-            return f"its {key} is {str(old)[:60]}, this one's {str(new)[:60]}"
-    return ""
+        for key in sorted({*self.made_by, *other}):
+            old, new = self.made_by.get(key), other.get(key)
+            if old != new:
+                return f"its {key} is {str(old)[:60]}, this one's {str(new)[:60]}"
+        return ""
 
 
 def apart(

@@ -15,7 +15,6 @@ from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.differences import difference
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.scores import score
-from me2e_compress.simulator.routes import Route
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import DriveRecord, apart
@@ -150,21 +149,7 @@ class DriveSetup:
         job = self.job(prepared, condition)
         if job is None:
             return None
-        return tuple(self._evaluator(job, prepared, condition).episodes())
-
-    def some(
-        self, prepared: PreparedVariant, condition: Condition, routes: Sequence[Route]
-    ) -> tuple[Episode, ...]:
-        """Drive what is missing of some of the routes, and return these."""
-        job = self.job(prepared, condition)
-        if job is None:
-            raise StudyError(self._why_not(prepared))
-        return tuple(self._evaluator(job, prepared, condition).some(routes))
-
-    def _evaluator(
-        self, job: Job, prepared: PreparedVariant, condition: Condition
-    ) -> HighwayEvaluator:
-        return HighwayEvaluator(
+        evaluator = HighwayEvaluator(
             job,
             self.study.routes,
             self.workspace.results(prepared.variant, condition),
@@ -173,6 +158,7 @@ class DriveSetup:
             self._teller(f"{prepared.variant.name}, {condition.name}"),
             self.listener.on_warning,
         )
+        return tuple(evaluator.episodes())
 
     def _episodes_elsewhere(
         self, prepared: PreparedVariant, condition: Condition

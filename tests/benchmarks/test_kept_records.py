@@ -42,7 +42,6 @@ INTERVAL = re.compile(
 NOT_KEPT = {
     (37.2, 25.9, 50.4): "bench_closed_loop drives the front camera; no routes are kept",
     (25.0, 22.5, 27.1): "the same, the blind driver",
-    (5.63, 2.2, 9.0): "bench_search keeps no routes",
 }
 Triple = tuple[float, float, float]
 

@@ -19,7 +19,6 @@ EXACT = "in.onnx --map map.toml -o out.onnx --passes fold-constants"
 SPLIT = "in.onnx --map map.toml -o out.onnx --passes"
 BARE = "dense.onnx --map map.toml -o out.onnx"
 INT8 = f"{BARE} --scheme full --frames frames"
-ROAD = f"search {F} -o out --max-mb 1 --on-road"
 TIMED = "profile dense.onnx frames -o out.json --samples 2"
 
 COMPRESS = {
@@ -87,21 +86,11 @@ CALIBRATE = {
 }
 SEARCH = {
     f"search {F} -o out": "give a budget",
-    f"search {F} -o out --on-road": "give a budget: --max-mb, --max-ms or --max-joules",
     f"search {F} -o out --max-mb 1 --max-joules 0": "--max-joules is 0",
     f"search {F} -o out --max-mb 1 --max-ms 1e-9": r"nothing fits .* 0\.000000000001 s",
     f"search {F} -o out --max-ms 1 --target tensorrt": "use --target onnxruntime",
     f"search {F} -o out --max-mb 0.0000001": "nothing fits",
     f"search {F} -o out --max-mb 1 --scheme int4": "no scheme int4; there are .*int8",
-    f"search {F} -o out --max-mb 1 --routes 4": "--routes says how.*add --on-road",
-    f"search {F} -o out --max-mb 1 --workers 2": "--workers says how.*add --on-road",
-    f"search {F} -o out --max-ms 1 --on-road --target tensorrt": "--target onnxruntime",
-    f"{ROAD} --scheme prediction": "--modules",
-    f"{ROAD} --modules radar": "radar: no such module in the graph",
-    f"{ROAD} --ablate planner": "cannot do without it",
-    f"{ROAD} --latency trace:t.json": "a file is a variant's",
-    f"{ROAD} --routes 221": "221 routes were asked for",
-    f"{ROAD} --baseline-median-s 0": r"a median of 0\.0 s",
     f"sensitivity {F} -o out --drive 1": "camera",
 }
 OTHERS = {

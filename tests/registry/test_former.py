@@ -32,6 +32,13 @@ def test_an_option_that_is_gone_is_a_usage_error(
     )
 
 
+def test_search_on_the_road_is_gone(cli: Cli) -> None:
+    refused = cli("search highway frames -o r.toml --max-mb 5 --on-road")
+
+    assert refused.code == 2
+    assert "--on-road is gone since 0.3.0: use a study" in refused.err
+
+
 def test_what_is_named_instead_is_taken() -> None:
     assert RULE_SETS.parse("safe{without=[gemv]}").without == ("gemv",)
     assert recipe.parse("quantize-int8{without=[gemv]}")

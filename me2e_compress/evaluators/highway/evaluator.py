@@ -63,15 +63,7 @@ class HighwayEvaluator:
             EvaluationError: The policy cannot be opened, the folder belongs to another
                 evaluation or cannot be written, or a process was killed.
         """
-        yield from self.some(self.routes)
-
-    def some(self, routes: Sequence[Route]) -> Iterator[Episode]:
-        """Drive what is missing of some of the evaluator's routes, then yield these.
-
-        The folder belongs to all routes: the others may be driven later. It raises as
-        :meth:`episodes` does.
-        """
-        if not routes:
+        if not self.routes:
             raise EvaluationError("there is no route to drive")
         # fail early on a policy or folder that cannot be used
         opened(self.job.driver)
@@ -82,14 +74,14 @@ class HighwayEvaluator:
         for path, reason in folder.corrupt.items():
             self.on_warning(f"{path}: {reason}: driven again")
         # drive what is missing, in the order that wastes least time
-        missing = [route for route in routes if route.id not in done]
+        missing = [route for route in self.routes if route.id not in done]
         total = len(done) + len(missing)
         self.on_progress(progress_of(tuple(done.values()), total))
         for driven in self._engine.drive(self.job, longest_first(missing)):
             folder.save(driven)
             done[driven.episode.route] = driven.episode
             self.on_progress(progress_of(tuple(done.values()), total))
-        yield from (done[route.id] for route in routes)
+        yield from (done[route.id] for route in self.routes)
 
     @property
     def _engine(self) -> Engine:
