@@ -18,17 +18,17 @@ from pathlib import Path
 
 import onnx_ir as ir
 
+from benchmarks.paper.published import (
+    MODULES_AWAY,
+    MODULES_AWAY_OF_VAD,
+    PublishedDrive,
+)
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import Me2eError
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
-from me2e_compress.study.paper.published import (
-    MODULES_AWAY,
-    MODULES_AWAY_OF_VAD,
-    PublishedDrive,
-)
 from me2e_compress.workflows.export import export_stack
 from me2e_compress.workflows.inspect import weigh
 from me2e_compress.zoo.shipped import sample_frames

@@ -1,14 +1,14 @@
 """A study over all routes: what benchmarks/ keeps of it.
 
-    python -m benchmarks.bench_study shifts OUT [--tables A,B] [--workers N]
+    python -m benchmarks.bench_study benchmarks/shifts.toml OUT [--tables A,B]
     python -m benchmarks.bench_study benchmarks/observers/seed-10.toml OUT
     python -m benchmarks.bench_study benchmarks/road_2/study.toml OUT --so-far
 
-Drives what OUT lacks, as ``me2e-compress study NAME -o OUT`` does: hours, and it goes
-on where it was ended. OUT/NAME gets its report; benchmarks/NAME (of a file the folder
-beside it that has its name) its tables and a line a route; with ``--tables A`` they are
-kept in a folder A of it, so that what took hours lands by itself. ``--so-far`` drives
-nothing, and keeps a line of every route that OUT has.
+Drives what OUT lacks, as ``me2e-compress study FILE -o OUT`` does: hours, and it goes
+on where it was ended. OUT/NAME gets its report; the folder beside the file that has its
+name its tables and a line a route; with ``--tables A`` they are kept in a folder A of
+it, so that what took hours lands by itself. ``--so-far`` drives nothing, and keeps a
+line of every route that OUT has.
 """
 
 import argparse
@@ -26,11 +26,9 @@ from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.study.write import write_study
 
-KEPT = Path(__file__).parent
-
 
 def keep(name: str, part: str, study: Study, out: Path, workers: int) -> None:
-    """Drive a study in a folder, and keep its tables and routes beside this file.
+    """Drive a study in a folder, and keep its tables and routes.
 
     ``part`` names the blocks that are driven, if it is not all of them.
 
@@ -62,8 +60,7 @@ def keep_so_far(name: str, part: str, study: Study, out: Path) -> None:
 
 def kept_in(name: str, part: str) -> Path:
     """Return the folder of what is kept of a study, or of a part of its blocks."""
-    folder = KEPT / name if Path(name).suffix == "" else Path(name).with_suffix("")
-    folder /= part
+    folder = Path(name).with_suffix("") / part
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
@@ -72,7 +69,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("study", help="a name, or a study's file")
+    parser.add_argument("study", help="the study's file")
     parser.add_argument("out", type=Path)
     parser.add_argument("--tables", help="of its blocks only these")
     parser.add_argument("--workers", type=int, default=1)

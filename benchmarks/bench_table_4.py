@@ -8,7 +8,7 @@ for TensorRT by each scheme. How much becomes int8, and how large the file gets,
 not depend on what a scale's value is: nothing is calibrated, and every activation gets
 the range [-1, 1]. ``--lint`` also looks for what TensorRT would refuse; ``--trt-check``
 parses each file by TensorRT-RTX, if that is installed. The files stay in OUT/STACK, so
-that ``study paper --weigh OUT/STACK`` can read them (of the last rules).
+that ``benchmarks.paper --stack OUT/STACK`` can read them (of the last rules).
 """
 
 import argparse
@@ -20,6 +20,8 @@ from pathlib import Path
 
 import onnx_ir as ir
 
+from benchmarks.paper.published import INT8_COUNTS
+from benchmarks.paper.weigh import int8_counts
 from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import Me2eError
@@ -28,8 +30,6 @@ from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.quantization.plan import make_plan, stamp_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.study.paper.published import INT8_COUNTS
-from me2e_compress.study.paper.weigh import int8_counts
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.export import export_stack

@@ -3,12 +3,11 @@
     python -m benchmarks.files_entered [--call CALL] [-v] [--tree DIRECTORY]
 
 Runs a command in this process: ``compress m.onnx -r full --frames F -o o.onnx`` on the
-graph of `benchmarks.seven_nodes`, ``evaluate highway --routes 1`` or ``study paper
---records`` on drives that are kept. Counts the files of ``me2e_compress`` in
-which a function ran (a lambda, a comprehension and a generator too). What runs while a
-module is being imported, and methods that dataclasses generate, do not count; files
-that were only imported are counted apart. ``-v`` lists the files, each with its
-functions; ``--tree`` measures another checkout.
+graph of `benchmarks.seven_nodes`, or ``evaluate highway --routes 1``. Counts the
+files of ``me2e_compress`` in which a function ran (a lambda, a comprehension and a
+generator too). What runs while a module is being imported, and methods that dataclasses
+generate, do not count; files that were only imported are counted apart. ``-v`` lists
+the files, each with its functions; ``--tree`` measures another checkout.
 """
 
 import argparse
@@ -132,16 +131,9 @@ def evaluate(folder: Path) -> list[str]:
     return ["evaluate", "highway", "--routes", "1", "-o", str(folder / "driven")]
 
 
-def paper(folder: Path) -> list[str]:
-    """Make the paper's tables of drives that are kept."""
-    records = Path(__file__).parent / "paper"
-    return ["study", "paper", "--records", str(records), "-o", str(folder / "paper")]
-
-
 CALLS: Mapping[str, Callable[[Path], list[str]]] = {
     "compress": compress,
     "evaluate": evaluate,
-    "paper": paper,
 }
 
 

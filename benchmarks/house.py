@@ -3,7 +3,7 @@
     python -m benchmarks.house [--entered] [--write]
 
 Prints lines by room, lines of tests, words of docs, options and circles of files, each
-beside today's count and its ceiling; ``--entered`` runs three calls and counts the
+beside today's count and its ceiling; ``--entered`` runs two calls and counts the
 files and functions that they enter (a minute). ``--write`` notes lower counts as
 today's: a count may only fall, and a test holds it against the last commit's.
 """

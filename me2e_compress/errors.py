@@ -39,6 +39,14 @@ FORMER = {
     "--on-road": f"search --on-road {_NOW} a study that names the schemes",
     "--most-ablated": f"--most-ablated {_NOW} a study that names the schemes",
     "--baseline-median-s": f"--baseline-median-s {_NOW} a study's key of that name",
+    "--records": f"study --records {_NOW} python -m benchmarks.paper in the repository",
+    "--weigh": f"study --weigh {_NOW} python -m benchmarks.paper in the repository",
+    "study paper": f"the study paper {_NOW} benchmarks/paper/paper.toml",
+    "study shifts": f"the study shifts {_NOW} benchmarks/shifts.toml",
+    "study tail": f"the study tail {_NOW} benchmarks/tail.toml",
+    "study key like": f"like {_NOW} a study with keys of its own",
+    "study key questions": f"questions {_NOW} benchmarks/paper/questions.toml",
+    "study key report": f"report {_NOW} python -m benchmarks.paper of its folder",
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""
 

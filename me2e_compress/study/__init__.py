@@ -2,7 +2,7 @@
 
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
-from me2e_compress.study.file import load_study, study_path
+from me2e_compress.study.file import load_study
 from me2e_compress.study.run import run_study
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.workflows.listener import Listener
@@ -16,5 +16,4 @@ __all__ = [
     "Variant",
     "load_study",
     "run_study",
-    "study_path",
 ]

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.policies import driver_named
@@ -118,9 +117,6 @@ class Study:
         blocks: Which variants drive under which conditions; empty means all under all.
             Under each condition the baseline drives too.
         pairs: Drives to compare, ``VARIANT.CONDITION`` of both.
-        report: What is made of the results: a comparison, or the paper's tables, one
-            per block.
-        questions: What is asked of the paper's drives; None asks what ships.
         evaluator: ``highway``, or another evaluator by its name and options, with
             routes and conditions of its own.
 
@@ -143,8 +139,6 @@ class Study:
     to_record: FramesToRecord | None = None
     blocks: tuple[StudyBlock, ...] = ()
     pairs: tuple[tuple[str, str], ...] = ()
-    report: Literal["comparison", "paper"] = "comparison"
-    questions: Path | None = None
     evaluator: str = HIGHWAY
 
     def __post_init__(self) -> None:
@@ -188,7 +182,6 @@ class Study:
         adapted = [each.name for each in self.variants if each.adapter is not None]
         for what, given in (
             ("routes", bool(self.routes)),
-            ("report", self.report != "comparison"),
             (f"the adapter of {', '.join(adapted)}", bool(adapted)),
         ):
             if given:
@@ -221,7 +214,7 @@ class Study:
 
     def inputs(self) -> Iterator[str | Path]:
         """List the files and folders that it reads."""
-        yield from filter(None, (self.frames, self.held_out, self.questions))
+        yield from filter(None, (self.frames, self.held_out))
         yield from self.provider.plugins
         for each in self.variants:
             named = (each.policy, each.module_map, each.adapter, each.trace)
@@ -251,15 +244,14 @@ class Study:
         return tuple(each for each in self.variants if each.name in wanted)
 
     def of_blocks(self, names: Sequence[str]) -> "Study":
-        """Return the part that some blocks need; ``2`` names ``table-2``."""
+        """Return the part that some blocks need."""
         there = {each.name: each for each in self.blocks}
         chosen = list[StudyBlock]()
         for name in names:
-            block = there.get(name) or there.get(f"table-{name}")
-            if block is None:
+            if name not in there:
                 known = ", ".join(there) or "none"
                 raise StudyError(f"no block {name}; there are {known}")
-            chosen.append(block)
+            chosen.append(there[name])
         drive = {self.baseline, *(name for each in chosen for name in each.variants)}
         under = {name for each in chosen for name in each.conditions}
         return replace(

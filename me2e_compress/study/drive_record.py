@@ -5,7 +5,7 @@ A drive of 220 routes takes 30 MB of episodes and 0.1 MB of these lines.
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
@@ -30,7 +30,6 @@ class _Head:
     variant: str
     condition: str
     made_by: dict[str, Any]
-    questions: str = ""
 
 
 _HEAD, _ROUTE = TypeAdapter(_Head), TypeAdapter(RouteSummary)
@@ -54,7 +53,6 @@ class DriveRecord:
         made_by: Its fingerprint without the routes.
         difference: Paired by route with the baseline under the same condition; None for
             the baseline itself.
-        questions: Digest of the questions that it was driven for; empty if unknown.
         apart: By route, how far it was from the baseline; without routes that have no
             frames.
     """
@@ -67,7 +65,6 @@ class DriveRecord:
     difference: PairedDifference | None = None
     apart: Mapping[str, Apart] = field(default_factory=dict)
     reason: str = ""
-    questions: str = ""
 
     @classmethod
     def of(
@@ -88,30 +85,15 @@ class DriveRecord:
         return f"{self.variant}.{self.condition}"
 
     @property
-    def set_size(self) -> int:
-        """Number of routes of the whole set."""
-        return int(self.made_by["set_size"])
-
-    @property
     def mean_latency_us(self) -> int | None:
         """Mean latency of a decision; None without decisions."""
         decisions = sum(each.decisions for each in self.routes)
         taken = sum(each.latency_sum_us for each in self.routes)
         return round(taken / decisions) if decisions else None
 
-    @property
-    def decisions_a_second(self) -> float:
-        """Decisions over the time driven; 0 if no time passed."""
-        time_us = sum(each.duration_us for each in self.routes)
-        return 1e6 * sum(each.decisions for each in self.routes) / max(time_us, 1)
-
     def values(self, column: RouteColumn) -> RouteValues:
         """Return one number of every route; of a drive not made, the reason."""
         return column.values(self.routes, self.reason)
-
-    def mean(self, column: RouteColumn, seed: int = 0) -> Estimate:
-        """Return a mean over routes with its intervals."""
-        return self.values(column).mean(seed)
 
     def minus(
         self, reference: "DriveRecord", column: RouteColumn = DS, seed: int = 0
@@ -150,7 +132,6 @@ class DriveRecord:
             "variant": self.variant,
             "condition": self.condition,
             "made_by": self.made_by,
-            **({"questions": self.questions} if self.questions else {}),
         }
         rows = [_ROUTE.dump_python(each, mode="json") for each in self.routes]
         lines = [json.dumps(row, ensure_ascii=False) for row in (head, *rows)]
@@ -174,17 +155,7 @@ class DriveRecord:
                 raise documents.MalformedError(f"names route {twice[0]} twice")
             if not isinstance(head.made_by.get("set_size"), int):
                 raise documents.MalformedError("it does not say of how many routes")
-            found = cls(head.variant, head.condition, routes, head.made_by)
-            return replace(found, questions=head.questions)
-
-    def difference_from(self, made_by: Mapping[str, Any]) -> str:
-        """Say how another fingerprint differs from its own; empty if it does not."""
-        other = {key: each for key, each in made_by.items() if key != "routes"}
-        for key in sorted({*self.made_by, *other}):
-            old, new = self.made_by.get(key), other.get(key)
-            if old != new:
-                return f"its {key} is {str(old)[:60]}, this one's {str(new)[:60]}"
-        return ""
+            return cls(head.variant, head.condition, routes, head.made_by)
 
 
 def apart(

@@ -2,15 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from statistics import fmean
 
 from me2e_compress.driving.latency import FixedLatency, LatencySource
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import Engine
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
-from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
+from me2e_compress.evaluators.highway.results import fingerprint
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.differences import difference
 from me2e_compress.metrics.episode import Episode
@@ -32,10 +30,7 @@ from me2e_compress.workflows.other_evaluators import (
 
 @dataclass(frozen=True)
 class DriveSetup:
-    """What all drives share; ``means_us`` caches means for ``mean_of`` conditions.
-
-    ``questions`` is the digest of the questions that its drives are to answer.
-    """
+    """What all drives share; ``means_us`` caches means for ``mean_of`` conditions."""
 
     study: Study
     clock: Clock
@@ -44,7 +39,6 @@ class DriveSetup:
     listener: Listener
     means_us: dict[str, int] = field(default_factory=dict)
     image_sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
-    questions: str = ""
 
     def under(
         self, condition: Condition, prepared: Sequence[PreparedVariant]
@@ -92,49 +86,13 @@ class DriveSetup:
         variant, under = condition.mean_cell
         by_name = {each.name: each for each in self.study.variants}
         conditions = {each.name: each for each in self.study.conditions}
-        cell = by_name[variant], conditions[under]
-        if self.workspace.record(*cell).is_file():
-            kept = DriveRecord.load(self.workspace.record(*cell)).mean_latency_us
-            if kept is not None:
-                return kept
-        path = self.workspace.results(*cell)
-        driven = ResultsFolder.open(path).episodes().values() if path.exists() else ()
-        taken = [each.latency_us for episode in driven for each in episode.decisions]
-        if not taken:
+        path = self.workspace.record(by_name[variant], conditions[under])
+        mean_us = DriveRecord.load(path).mean_latency_us if path.is_file() else None
+        if mean_us is None:
             raise StudyError(
                 f"condition {condition.name}: {condition.mean_of} took no decision"
             )
-        return round(fmean(taken))
-
-    def record(self, prepared: PreparedVariant, condition: Condition) -> DriveRecord:
-        """Drive, and keep the result without frames; kept drives are not repeated."""
-        variant, job = prepared.variant, self.job(prepared, condition)
-        if job is None:
-            raise StudyError(self._why_not(prepared))
-        study, path = self.study, self.workspace.record(variant, condition)
-        made_by = fingerprint(job, study.routes, study.set_size)
-        kept = self._kept(path)
-        if kept is not None:
-            if other := kept.difference_from(made_by):
-                raise StudyError(f"{path}: of another evaluation: {other}")
-            return kept
-        episodes = self._episodes(prepared, condition) or ()
-        record = replace(
-            DriveRecord.of(variant.name, condition.name, made_by, episodes),
-            questions=self.questions,
-        )
-        record.save(path)
-        return record
-
-    def _kept(self, path: Path) -> DriveRecord | None:
-        """Read a kept drive; an invalid file is made again."""
-        if not path.is_file():
-            return None
-        try:
-            return DriveRecord.load(path)
-        except StudyError as error:
-            self.listener.on_warning(f"{error}: made again of the results")
-            return None
+        return mean_us
 
     def _why_not(self, prepared: PreparedVariant) -> str:
         if prepared.failure or prepared.model is None:
@@ -189,9 +147,16 @@ class DriveSetup:
         names = prepared.variant.name, condition.name
         if episodes is None:
             return DriveRecord(*names, reason=self._why_not(prepared))
-        expected = self.study.set_size or len(episodes)
-        scores = score(episodes, expected, self.study.seed)
-        return replace(DriveRecord.of(*names, {}, episodes), scores=scores)
+        study, made_by = self.study, dict[str, object]()
+        job = None if study.elsewhere else self.job(prepared, condition)
+        if job is not None:
+            made_by = fingerprint(job, study.routes, study.set_size)
+        record = DriveRecord.of(*names, made_by, episodes)
+        # a drive without its frames; another evaluator keeps its own
+        if job is not None:
+            record.save(self.workspace.record(prepared.variant, condition))
+        scores = score(episodes, study.set_size or len(episodes), study.seed)
+        return replace(record, scores=scores)
 
     def _compared(
         self,

@@ -4,7 +4,6 @@ import inspect
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -20,21 +19,10 @@ from me2e_compress.runtime.providers import provider_named
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
-from me2e_compress.study.paper.questions import PaperQuestions
 from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.other_evaluators import HIGHWAY, is_highway
 from me2e_compress.zoo.shipped import SHIPPED
-
-STUDIES = Path(__file__).parent / "shipped"
-"""Shipped studies, one TOML file each."""
-
-
-def study_path(study: str | Path) -> Path:
-    """Return a study's file, or the shipped study of that name."""
-    path = Path(study)
-    shipped = STUDIES / f"{path}.toml"
-    return shipped if not path.exists() and shipped.is_file() else path
 
 
 def load_study(
@@ -48,11 +36,10 @@ def load_study(
     """Read a study.
 
     Files are looked up next to the study's own file; a policy that is not a file there
-    is a shipped model. Nothing that it names is run here. With ``like = "paper"`` it is
-    the shipped study of that name, but for the keys of the file.
+    is a shipped model. Nothing that it names is run here.
 
     Args:
-        path: The TOML file, or the name of a shipped study.
+        path: The TOML file.
         routes: Routes to drive instead of the study's.
         provider: Execution provider instead of the study's, as a text.
         plugins: Libraries of operators or plugins, in addition to the study's.
@@ -61,18 +48,16 @@ def load_study(
 
     Raises:
         GraphError: A policy is neither a file nor a shipped model.
-        StudyError: The file or its questions are missing or not valid TOML, a key is
-            unknown, missing or of another type, frames are invalid, code is not
-            trusted, or the study is inconsistent.
+        StudyError: The file is missing or not valid TOML, a key is unknown, missing or
+            of another type, frames are invalid, code is not trusted, or the study is
+            inconsistent.
         RecipeError: A recipe or pass is unknown.
         EvaluationError: Routes or latency are unknown.
         ProviderError: A provider or library is missing.
     """
-    path = study_path(path)
-    # read the file, over the study that it is like, and check its form
+    # read the file, and check its form
+    path = Path(path)
     content = _content(path)
-    if "like" in content:
-        content = _content(_shipped(content.pop("like"), path)) | content
     try:
         # JSON has tables and lists for dataclasses and tuples, but no dates
         text = json.dumps(content, default=lambda date: {"date": str(date)})
@@ -95,8 +80,6 @@ def load_study(
     # resolve its names, and check what it refers to
     study = _Reader(path).study(table, routes, plugins)
     study.check_recordings()
-    if study.report == "paper":
-        PaperQuestions.load(study.questions)
     return study
 
 
@@ -105,23 +88,12 @@ def _content(path: Path) -> dict[str, object]:
     try:
         return documents.from_toml(documents.content(path))
     except FileNotFoundError as error:
-        raise StudyError(f"no study {path}: no such file; we ship {_ours()}") from error
+        gone = FORMER.get(f"study {path}")
+        raise StudyError(gone or f"no study {path}: no such file") from error
     except OSError as error:
         raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
     except documents.MalformedError as error:
         raise StudyError(f"{path}: not TOML: {error}") from error
-
-
-def _shipped(name: object, path: Path) -> Path:
-    """Return the file of the shipped study that another's ``like`` names."""
-    found = STUDIES / f"{name}.toml"
-    if not isinstance(name, str) or Path(name).name != name or not found.is_file():
-        raise StudyError(f"{path}: like {name}: no such study; we ship {_ours()}")
-    return found
-
-
-def _ours() -> str:
-    return ", ".join(sorted(each.stem for each in STUDIES.glob("*.toml")))
 
 
 class _Table(BaseModel):
@@ -158,8 +130,6 @@ class _Study(_Table):
     provider: str = "cpu"
     plugins: list[str] = Field(default_factory=list)
     record: FramesToRecord | None = None
-    report: Literal["comparison", "paper"] = "comparison"
-    questions: str | None = None
     latency: Timing = Field(default_factory=Timing)
     variant: list[_Variant]
     condition: tuple[Condition, ...]
@@ -189,6 +159,8 @@ def _complaint(error: ValidationError) -> str:
     if not unknown:
         return f"{where}: {first['msg']}"
     inside = _KINDS.get(first["loc"][0], _Study) if len(first["loc"]) > 1 else _Study
+    if gone := FORMER.get(f"study key {where}"):
+        return gone
     keys = inspect.signature(inside).parameters
     return f"no key {where}; there are {', '.join(keys)}"
 
@@ -233,8 +205,6 @@ class _Reader:
             to_record=table.record,
             blocks=table.block,
             pairs=tuple((each.of, each.against) for each in table.pair),
-            report=table.report,
-            questions=self._file(table.questions),
         )
 
     def _variant(self, table: _Variant) -> Variant:

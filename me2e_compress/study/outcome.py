@@ -117,17 +117,6 @@ class StudyOutcome:
             return drive.variant
         return f"{drive.variant}, {drive.condition}"
 
-    def drive(self, variant: str, condition: str) -> DriveRecord:
-        """Return a drive; one that was not made says why."""
-        names = variant, condition
-        found = (e for e in self.drives if (e.variant, e.condition) == names)
-        why = self.why_not(variant, condition)
-        return next(found, DriveRecord(variant, condition, reason=why))
-
-    def why_not(self, variant: str, condition: str) -> str:
-        """Say why there is no record of a drive."""
-        return f"{variant} under {condition}: not driven"
-
     def under(self, condition: Condition) -> tuple[DriveRecord, ...]:
         """Return the drives under one condition."""
         return tuple(each for each in self.drives if each.condition == condition.name)

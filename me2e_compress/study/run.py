@@ -1,6 +1,6 @@
 """Run a study, and write its report."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +11,6 @@ from me2e_compress.study.definition import Study
 from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.file import load_study
 from me2e_compress.study.outcome import VariantOutcome, this_machine
-from me2e_compress.study.paper.paper_run import drive_blocks, read_paper
-from me2e_compress.study.paper.weigh import weighed
 from me2e_compress.study.plan_fidelity import judge
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
 from me2e_compress.study.side_by_side import take_pictures
@@ -32,17 +30,14 @@ def run_study(
     engine: Engine | None = None,
     listener: Listener = SILENT,
     pictures: int = 3,
-    on_block: Callable[[StudyResult], None] | None = None,
-    weigh: Sequence[Path] = (),
     *,
     force: bool = False,
 ) -> StudyResult:
     """Make the models, time them, compare them with the baseline, drive them.
 
     With the same folder it resumes: finished models, traces and routes are reused.
-    Studies may share a folder if they share variants. A study with the paper's tables
-    is driven block by block and gives a `PaperResult`; there a drive that fails does
-    not stop the others.
+    Studies may share a folder if they share variants. Every drive of highway leaves a
+    line a route in ``records/``.
 
     Args:
         study: A study, or its TOML file.
@@ -51,9 +46,6 @@ def run_study(
             evaluator other than highway ignores it.
         listener: Is called with progress and warnings.
         pictures: Number of routes on which two drives are shown side by side.
-        on_block: Is called with the result so far after each block of a study with the
-            paper's tables that was driven now.
-        weigh: Folders of other stacks' files, for the paper's table 4.
         force: Also replace a report that we did not write.
 
     Raises:
@@ -69,11 +61,8 @@ def run_study(
     check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
     check_ours([folder / name for name in (JSON, MARKDOWN, HTML)], force=force)
     with writing(folders=[folder]):
-        others = tuple(found for each in weigh for found in weighed(each))
-        setup, prepared = _begun(study, folder, engine or LocalEngine(), listener)
-        if study.report == "paper":
-            return drive_blocks(setup, prepared, on_block, others)
-        return _compared(setup, prepared, pictures)
+        begun = prepare_study(study, folder, engine or LocalEngine(), listener)
+        return _compared(*begun, pictures)
 
 
 def run_and_report(
@@ -82,39 +71,22 @@ def run_and_report(
     command: Sequence[str] = (),
     engine: Engine | None = None,
     listener: Listener = SILENT,
-    records: Path | None = None,
-    weigh: Sequence[Path] = (),
     *,
     force: bool = False,
 ) -> tuple[StudyResult, StudyFiles]:
-    """Run a study and write its report; the paper's tables are written block by block.
+    """Run a study and write its report.
 
-    ``command`` is the command line that reproduces it. With ``records``, a folder of
-    finished drives, the paper's tables are made of these and nothing is driven;
-    ``weigh`` are folders of other stacks' files for the paper's table 4. Returns the
-    results and the files.
+    ``command`` is the command line that reproduces it. Returns the results and the
+    files.
 
     Raises:
-        StudyError: Records are given for a study that is not the paper's.
         Me2eError: See `run_study`.
     """
-    if study.report == "comparison" and (records is not None or weigh):
-        option = "--weigh" if records is None else "--records"
-        raise StudyError(f"{option} is for a study with the paper's tables")
-    if records is not None:
-        read = read_paper(study, records, weigh)
-        return read, write_study(read, folder, command, force=force)
-
-    def land(so_far: StudyResult) -> None:
-        write_study(so_far, folder, command, force=force)
-
-    found = run_study(
-        study, folder, engine, listener, on_block=land, weigh=weigh, force=force
-    )
+    found = run_study(study, folder, engine, listener, force=force)
     return found, write_study(found, folder, command, force=force)
 
 
-def _begun(
+def prepare_study(
     study: Study, folder: Path, engine: Engine, listener: Listener
 ) -> tuple[DriveSetup, list[PreparedVariant]]:
     """Record frames, make the models and time them; return what drives them."""

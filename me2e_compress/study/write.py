@@ -8,7 +8,6 @@ from me2e_compress.display import in_markdown
 from me2e_compress.errors import StudyError
 from me2e_compress.registry import drafts, marks
 from me2e_compress.runtime.atomic import write_bytes, write_document
-from me2e_compress.study.paper.paper_result import PaperResult, paper_page
 from me2e_compress.study.report.page import Section
 from me2e_compress.study.report.study_page import study_page
 from me2e_compress.study.study_result import StudyResult
@@ -39,7 +38,7 @@ def write_study(
         outcome: Results to write.
         folder: Created if needed.
         command: The command line that reproduces the study, word by word.
-        sections: Additional sections of the page; the paper's has its own.
+        sections: Additional sections of the page.
         force: Also replace files that we did not write.
 
     Raises:
@@ -51,10 +50,7 @@ def write_study(
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
     heading = f"{marks.IN_MARKDOWN}# {in_markdown(outcome.title)}\n\n"
     text = heading + "\n".join(table.markdown() for table in outcome.tables())
-    if isinstance(outcome, PaperResult):
-        page = paper_page(outcome, command)
-    else:
-        page = study_page(outcome, command, sections)
+    page = study_page(outcome, command, sections)
     # all files are written, or none
     with drafts.written(folder, StudyError):
         folder.mkdir(parents=True, exist_ok=True)

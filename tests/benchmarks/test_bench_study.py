@@ -6,8 +6,9 @@ from statistics import mean
 
 import pytest
 
-from benchmarks.bench_study import KEPT
+from me2e_compress.study import load_study
 
+KEPT = Path(__file__).parents[2] / "benchmarks"
 STUDIES = sorted(
     str(each.parent.relative_to(KEPT))
     for each in KEPT.glob("**/tables.md")
@@ -49,6 +50,13 @@ def test_tables_are_of_the_routes_that_are_kept(name: str) -> None:
 
     assert {len(each) for each in found.values()} == {220}
     assert {drive: round(mean(each), 1) for drive, each in found.items()} == scores
+
+
+@pytest.mark.parametrize("name", ["tail", "shifts"])
+def test_a_study_of_the_repository_is_whole(name: str) -> None:
+    study = load_study(KEPT / f"{name}.toml", "2")
+
+    assert study.pairs or any(each.against for each in study.conditions)
 
 
 def test_the_page_says_what_the_tables_of_shifts_say() -> None:

@@ -1,4 +1,4 @@
-"""``study``: a report, the paper's tables, and code that nobody trusted."""
+"""``study``: a report, and code that nobody trusted."""
 
 import json
 from pathlib import Path
@@ -41,15 +41,6 @@ recipe = "exact"
 name = "device"
 latency = "trace"
 """
-PAPER = (
-    STUDY.replace('"Try"', '"Again"\nreport = "paper"')
-    + """
-[[block]]
-name = "table-3"
-variants = ["float"]
-conditions = ["device"]
-"""
-)
 
 
 @pytest.fixture(autouse=True)
@@ -79,7 +70,7 @@ def test_a_study_leaves_a_report_and_prints_its_tables(
     assert "Scoreboard, device" in shown
     assert "Difference to float" in shown
     files = {path.name for path in (tmp_path / "out").iterdir()}
-    assert files >= {"study.json", "tables.md", "report.html", "results", "traces"}
+    assert files >= {"study.json", "tables.md", "report.html", "records", "traces"}
     text = (tmp_path / "out" / "report.html").read_text()
     assert "me2e-compress study study.toml -o" in text
 
@@ -147,21 +138,6 @@ def test_an_engine_nobody_knows(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> No
     assert "engine 'cloud'" in said.err
 
 
-def test_the_papers_tables_are_written_and_read_again(
-    cli: Cli, toml: Path, tmp_path: Path, here: Here
-) -> None:
-    toml.write_text(PAPER)
-    shown = cli.document("study study.toml -o out")
-    driven = list(here.driven)
-
-    cli.done("study study.toml -o again --records out/records")
-
-    assert [each["scheme"] for each in shown["drives"]] == ["float"]
-    assert here.driven == driven
-    out, again = tmp_path / "out", tmp_path / "again"
-    assert (again / "tables.md").read_bytes() == (out / "tables.md").read_bytes()
-
-
 @pytest.mark.usefixtures("toml")
 def test_a_dry_run_drives_nothing(cli: Cli, tmp_path: Path, here: Here) -> None:
     shown = cli.document("study study.toml -o out --dry-run")
@@ -169,12 +145,6 @@ def test_a_dry_run_drives_nothing(cli: Cli, tmp_path: Path, here: Here) -> None:
     assert len(shown["drives"]) == 2
     assert here.driven == []
     assert not (tmp_path / "out").exists()
-
-
-def test_the_study_that_ships_is_found_by_its_name(cli: Cli) -> None:
-    shown = cli.done("study paper -o out --routes 44 --dry-run").out
-
-    assert "The paper, re-tested: 41 drives, 1,804 routes, 0 of them driven" in shown
 
 
 THEIRS = """

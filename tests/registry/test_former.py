@@ -32,11 +32,20 @@ def test_an_option_that_is_gone_is_a_usage_error(
     )
 
 
-def test_search_on_the_road_is_gone(cli: Cli) -> None:
-    refused = cli("search highway frames -o r.toml --max-mb 5 --on-road")
+@pytest.mark.parametrize(
+    ("line", "instead"),
+    [
+        ("search highway frames -o r.toml --max-mb 5 --on-road", "a study"),
+        ("study s.toml -o out --records out/records", "python -m benchmarks.paper"),
+    ],
+)
+def test_an_option_of_another_command_that_is_gone(
+    line: str, instead: str, cli: Cli
+) -> None:
+    refused = cli(line)
 
     assert refused.code == 2
-    assert "--on-road is gone since 0.3.0: use a study" in refused.err
+    assert f"is gone since 0.3.0: use {instead}" in refused.err
 
 
 def test_what_is_named_instead_is_taken() -> None:

@@ -13,41 +13,19 @@ from me2e_compress.evaluators.highway.worker import Driven, Job
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study import (
     Condition,
-    Listener,
     Study,
     StudyResult,
     Timing,
     Variant,
-    load_study,
     run_study,
 )
-from me2e_compress.study.paper.paper_result import PaperResult
-from me2e_compress.study.paper.paper_run import read_paper
-from me2e_compress.study.study_blocks import StudyBlock
-from me2e_compress.workflows.listener import SILENT
 from tests.command import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
-from tests.study.paper_records import write_records
 
 ROUTES = (CROSSING, PARKED)
 IDEAL, SLOW = Condition("ideal", "none"), Condition("slow", "fps:2")
 BLIND = Variant("blind", "blind:6")
 FASTER = Variant("faster", "blind:9")
-BROKEN = Variant("broken", "gone.onnx")
-ASKED = Study(
-    "Asked again",
-    (BLIND, FASTER, BROKEN),
-    (IDEAL, SLOW),
-    "blind",
-    ROUTES,
-    220,
-    report="paper",
-    blocks=(
-        StudyBlock("table-2", ("blind",), ("ideal", "slow")),
-        StudyBlock("table-3", ("blind", "faster", "broken"), ("ideal",)),
-    ),
-)
-"""A study of the paper's form; one of its variants fails."""
 TWICE_AS_FAR = "factor = Constant <value_float = 2.0> () plan = Mul (ahead, factor)"
 
 Make = Callable[..., Study]
@@ -109,52 +87,3 @@ def asked(models: Path) -> Study:
         held_out=models / "frames",
         timing=Timing(20, baseline_median_s=0.2),
     )
-
-
-@pytest.fixture(scope="session")
-def result(tmp_path_factory: pytest.TempPathFactory) -> PaperResult:
-    """What the paper's study finds in drives that nobody drove."""
-    folder = tmp_path_factory.mktemp("records")
-    write_records(load_study("paper", "11"), folder)
-    return read_paper(load_study("paper"), folder)
-
-
-def run_paper(
-    study: Study,
-    folder: Path,
-    engine: Here,
-    listener: Listener = SILENT,
-    on_block: Callable[[StudyResult], None] | None = None,
-) -> PaperResult:
-    found = run_study(study, folder, engine, listener, on_block=on_block)
-    assert isinstance(found, PaperResult)
-    return found
-
-
-@dataclass(frozen=True)
-class First:
-    """The first run of the study in the paper's form."""
-
-    folder: Path
-    engine: Here
-    landed: list[int]
-
-
-@pytest.fixture(scope="session")
-def first(tmp_path_factory: pytest.TempPathFactory) -> First:
-    made = First(tmp_path_factory.mktemp("paper"), Here(), [])
-    run_paper(
-        ASKED,
-        made.folder,
-        made.engine,
-        on_block=lambda found: made.landed.append(
-            sum(not each.reason for each in found.drives)
-        ),
-    )
-    return made
-
-
-@pytest.fixture
-def driven(first: First) -> Path:
-    """The folder of that run."""
-    return first.folder

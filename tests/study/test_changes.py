@@ -4,10 +4,9 @@ from dataclasses import replace
 import pytest
 
 from me2e_compress.metrics.route_summary import RouteSummary
-from me2e_compress.study import Condition, Study, load_study
+from me2e_compress.study import Condition, Study
 from me2e_compress.study.changes import changes, held_against
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.file import STUDIES
 from me2e_compress.study.tables import change_tables
 from tests.study.conftest import IDEAL, Make
 
@@ -89,10 +88,3 @@ def test_tables_of_changes_and_pairs(make: Make) -> None:
     assert [len(row) for row in one.rows] == [9, 9]
     assert one.rows[0][6].reason == "the baseline itself"
     assert [len(row) for row in other.rows] == [6]
-
-
-@pytest.mark.parametrize("name", ["tail", "shifts"])
-def test_a_study_that_ships_is_whole(name: str) -> None:
-    study = load_study(STUDIES / f"{name}.toml", "2")
-
-    assert study.pairs or any(each.against for each in study.conditions)

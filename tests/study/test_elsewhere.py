@@ -126,7 +126,6 @@ def test_the_hours_are_the_evaluators_own(asked: Path, tmp_path: Path) -> None:
             "condition lane: lanes",
         ),
         ("[[variant]]", "routes = 3\n[[variant]]", "routes: only highway understands"),
-        ("[[variant]]", 'report = "paper"\n[[variant]]', "report: only highway"),
     ],
 )
 def test_what_highway_alone_understands(

@@ -230,9 +230,35 @@ def test_no_such_file(tmp_path: Path) -> None:
         load_study(tmp_path / "none.toml")
 
 
-def test_an_unknown_study_is_told_which_ones_ship() -> None:
-    with pytest.raises(StudyError, match=r"^no study smoke: .* we ship paper, shifts"):
-        load_study("smoke")
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("smoke", r"^no study smoke: no such file$"),
+        (
+            "paper",
+            r"^the study paper is gone since 0\.3\.0: use benchmarks/paper",
+        ),
+    ],
+)
+def test_no_study_ships(name: str, message: str) -> None:
+    with pytest.raises(StudyError, match=message):
+        load_study(name)
+
+
+@pytest.mark.parametrize("key", ["like", "questions", "report"])
+def test_a_key_that_is_gone_says_what_is_used_instead(models: Path, key: str) -> None:
+    with pytest.raises(StudyError, match=rf"^\S+study\.toml: {key} is gone since 0\.3"):
+        load_study(write(models, f'{key} = "paper"\n{GOOD}'))
+
+
+def test_variants_that_name_no_policy_take_the_study_s(models: Path) -> None:
+    text = GOOD.replace('policy = "slow.onnx"\n', "", 2)
+
+    study = load_study(write(models, 'policy = "highway"\n' + text))
+
+    ours = str(shipped("highway"))
+    named = str(models / "slow.onnx")
+    assert [each.policy for each in study.variants] == [ours, ours, named]
 
 
 def test_the_study_of_the_documents_is_one(tmp_path: Path) -> None:
@@ -254,14 +280,6 @@ def test_the_study_of_the_documents_is_one(tmp_path: Path) -> None:
 
     assert [each.name for each in of_parts.blocks] == ["table-3"]
     assert of_parts.to_record == FramesToRecord(256, 64)
-
-
-def test_a_study_that_ships_is_found_where_no_file_is() -> None:
-    study = load_study("paper")
-
-    assert study.report == "paper"
-    assert len(study.variants) == 17
-    assert [each.name for each in study.blocks][:2] == ["table-2", "table-3"]
 
 
 def test_frames_are_given_or_recorded(models: Path) -> None:

@@ -57,7 +57,7 @@ The plan of these random weights is 2.34 m long. Measured: int8 heads move it by
 (0.014 of it), an int8 backbone by 0.88 m (0.38), both by 0.86 m, on onnxruntime by
 0.81 m; on the other frame, a plan of 1.70 m, by 1.04 m at most. In small the shares are
 0.034, 0.17 and 0.18. At 1 it would be noise,
-and there the files of other tools stand (docs/benchmarks.md)."""
+and there the files of other tools stand (benchmarks/README.md)."""
 
 
 @pytest.fixture(scope="module")

@@ -10,22 +10,11 @@ from me2e_compress.cli.console import listening, say, show, tell
 from me2e_compress.cli.verbosity import is_json
 from me2e_compress.extras import need_extra
 
-STUDY = "STUDY.toml, or a shipped study's name: paper"
 Provider = Annotated[
     str | None, typer.Option(help="runs the graph: cpu, cuda, ...; default the study's")
 ]
 Routes = Annotated[str | None, typer.Option(help=f"{given.ROUTES}; not the study's")]
-Tables = Annotated[
-    str | None, typer.Option(help="only these of its blocks: 2,3 or names")
-]
-Records = Annotated[
-    Path | None,
-    typer.Option(help="the paper's tables from finished drives: drives nothing"),
-]
-Weigh = Annotated[
-    list[Path] | None,
-    typer.Option(help="a stack's exact.onnx, full.onnx, ...: for table 4; once each"),
-]
+Tables = Annotated[str | None, typer.Option(help="only these of its blocks: A,B")]
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="count drives and hours, drive nothing")
 ]
@@ -35,12 +24,10 @@ TrustCode = Annotated[
 
 
 def study(
-    definition: Annotated[Path, typer.Argument(help=STUDY)],
+    definition: Annotated[Path, typer.Argument(help="STUDY.toml")],
     output: Annotated[Path, typer.Option("-o", "--output", help="the folder")],
     routes: Routes = None,
     tables: Tables = None,
-    records: Records = None,
-    weigh: Weigh = None,
     dry_run: DryRun = False,
     provider: Provider = None,
     plugins: given.Plugins = None,
@@ -53,7 +40,7 @@ def study(
     need_extra("highway", "a study")
     # takes highway-env and matplotlib two seconds to import
     from me2e_compress.evaluators.highway.evaluator import engine_of
-    from me2e_compress.study import load_study, study_path
+    from me2e_compress.study import load_study
     from me2e_compress.study.run import run_and_report
     from me2e_compress.study.workload import workload
     from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
@@ -64,7 +51,7 @@ def study(
     asked = load_study(definition, routes, provider, more, trust_code=trust_code)
     if tables is not None:
         asked = asked.of_blocks(tables.split(","))
-    inputs = (study_path(definition), *asked.inputs())
+    inputs = (definition, *asked.inputs())
     check_folder(output, inputs, (JSON, MARKDOWN, HTML))
     ahead = workload(asked, output, workers)
     if dry_run:
@@ -74,8 +61,6 @@ def study(
     options: list[tuple[str, str | Path | None]] = [
         ("--routes", routes),
         ("--tables", tables),
-        ("--records", records),
-        *(("--weigh", each) for each in weigh or ()),
         ("--provider", provider),
         *(("--plugins", each) for each in more),
     ]
@@ -83,15 +68,12 @@ def study(
     chosen += ["--trust-code"] * trust_code
     words = ("me2e-compress", "study", str(definition), "-o", str(output), *chosen)
     # drive, or go on, and write the report
-    if records is None:
-        tell(ahead.headline)
+    tell(ahead.headline)
     with listening() as listener:
         name, address = given.engine_and_address(engine)
         chosen_engine = engine_of(name, workers, address)
         found, files = run_and_report(
-            *(asked, output, words, chosen_engine, listener, records),
-            weigh or (),
-            force=force,
+            asked, output, words, chosen_engine, listener, force=force
         )
     show(found)
     if not is_json():

@@ -5,6 +5,14 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from benchmarks.paper.drives import (
+    FILE,
+    SCHEMES,
+    Int8Counts,
+    KeptFacts,
+    ModelFacts,
+)
+from benchmarks.paper.evidence import FEWEST_RUNS
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import StudyError
@@ -17,14 +25,6 @@ from me2e_compress.runtime.providers import CPU
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.outcome import this_machine
-from me2e_compress.study.paper.evidence import FEWEST_RUNS
-from me2e_compress.study.paper.paper_drives import (
-    FILE,
-    SCHEMES,
-    Int8Counts,
-    KeptFacts,
-    ModelFacts,
-)
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.timing import Clock
 from me2e_compress.workflows.inspect import inspect
@@ -75,9 +75,9 @@ def int8_counts(path: Path) -> Int8Counts | None:
 def weigh(
     setup: DriveSetup,
     prepared: Sequence[PreparedVariant],
-    others: tuple[ModelFacts, ...],
-) -> tuple[ModelFacts, ...]:
-    """Collect facts of every variant, and profile the baseline, unless known.
+    others: Sequence[ModelFacts],
+) -> None:
+    """Keep facts of every variant, and a profile of the baseline, unless known.
 
     ``others`` are facts about other stacks' files, for table 4.
     """
@@ -97,7 +97,6 @@ def weigh(
     names = [each.variant for each in found]
     more = [each for name, each in known.items() if name not in names]
     KeptFacts(clock.scale, (*found, *more), this_machine(clock.load)).save(path)
-    return (*found, *(each for each in more if each.of_another_stack))
 
 
 def _facts_of(

@@ -4,16 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.paper.drives import FILE, Int8Counts, KeptFacts, ModelFacts
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.study import Study
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.paper.paper_drives import (
-    FILE,
-    Int8Counts,
-    KeptFacts,
-    ModelFacts,
-)
 from me2e_compress.study.workload import held_frames
 
 LOST = {"minus-map": 60.0, "minus-motion": 10.0, "full": 6.0, "prediction": 3.0}

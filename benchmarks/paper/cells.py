@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 from typing import Literal
 
+from benchmarks.paper.drives import ModelFacts, PaperDrives
+from benchmarks.paper.published import PublishedDrive
 from me2e_compress.driving.realtime import DT_US, skipped_decisions
 from me2e_compress.metrics.eer import POINTS, eer, rankings
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
 from me2e_compress.metrics.route_values import DS, ROOM
 from me2e_compress.study.cells import MISSING, estimate_cell, number
-from me2e_compress.study.paper.paper_drives import ModelFacts, PaperDrives
-from me2e_compress.study.paper.published import PublishedDrive
 from me2e_compress.workflows.result import Cell
 
 GIVEN = ("paper's DS", "paper's DE %", "paper's DC")
@@ -30,7 +30,7 @@ EER = (
 def score_cells(result: PaperDrives, name: str, condition: str) -> list[Cell]:
     """Show the scores of a drive, or why there are none."""
     drive, seed = result.drive(name, condition), result.study.seed
-    return [estimate_cell(drive.mean(each, seed)) for each in result.columns]
+    return [estimate_cell(drive.values(each).mean(seed)) for each in result.columns]
 
 
 def against(

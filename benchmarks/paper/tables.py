@@ -6,10 +6,8 @@ their own.
 
 from collections.abc import Iterator, Sequence
 
-from me2e_compress.metrics.route_summary import PERCENTS
-from me2e_compress.study.cells import MISSING
-from me2e_compress.study.paper import published
-from me2e_compress.study.paper.paper_cells import (
+from benchmarks.paper import published
+from benchmarks.paper.cells import (
     EER,
     ENERGY,
     GIVEN,
@@ -24,9 +22,11 @@ from me2e_compress.study.paper.paper_cells import (
     score_cells,
     times,
 )
-from me2e_compress.study.paper.paper_counts import partners, table_4
-from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.study.paper.published import PublishedDrive
+from benchmarks.paper.counts import partners, table_4
+from benchmarks.paper.drives import PaperDrives
+from benchmarks.paper.published import PublishedDrive
+from me2e_compress.metrics.route_summary import PERCENTS
+from me2e_compress.study.cells import MISSING
 from me2e_compress.study.study_blocks import StudyBlock
 from me2e_compress.study.workload import held_frames
 from me2e_compress.workflows.result import Cell, Table
@@ -288,8 +288,10 @@ def _latency(result: PaperDrives, name: str, condition: str) -> tuple[Cell, Cell
         return missing, missing, missing
     slowest = PERCENTS.index(100)
     ends = [each.latency_us[slowest] for each in drive.routes if each.decisions]
+    decisions = sum(each.decisions for each in drive.routes)
+    time_us = sum(each.duration_us for each in drive.routes)
     return (
         Cell(f"{mean_us / 1e3:.0f}"),
         Cell(f"{max(ends) / 1e3:.0f}"),
-        Cell(f"{drive.decisions_a_second:.2f}"),
+        Cell(f"{1e6 * decisions / max(time_us, 1):.2f}"),
     )

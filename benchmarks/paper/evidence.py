@@ -7,6 +7,9 @@ from functools import partial
 
 import numpy as np
 
+from benchmarks.paper.cells import Energy, measures_by_variant
+from benchmarks.paper.drives import ModelFacts, PaperDrives
+from benchmarks.paper.questions import PaperQuestion, PAt
 from me2e_compress.metrics.eer import Normalization, eer
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.metrics.intervals import (
@@ -20,9 +23,6 @@ from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.route_values import COLUMNS, POINTS
 from me2e_compress.study.cells import number
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.paper.paper_cells import Energy, measures_by_variant
-from me2e_compress.study.paper.paper_drives import ModelFacts, PaperDrives
-from me2e_compress.study.paper.questions import PaperQuestion, PAt
 
 FEWEST_STATIC = 5
 """Collisions with static things below which their shares are not compared: with fewer,

@@ -2,10 +2,10 @@
 
 from collections import Counter
 
+from benchmarks.paper.drives import SCHEMES, ModelFacts, PaperDrives
+from benchmarks.paper.published import INT8_COUNTS
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.study.cells import MISSING
-from me2e_compress.study.paper.paper_drives import SCHEMES, ModelFacts, PaperDrives
-from me2e_compress.study.paper.published import INT8_COUNTS
 from me2e_compress.workflows.result import Cell, Table
 
 PARTNERS = (

@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from benchmarks.paper.cells import held_at
+from benchmarks.paper.drives import PaperDrives
+from benchmarks.paper.published import RATES
 from me2e_compress.metrics.route_values import DC, DE, DS, RouteColumn
-from me2e_compress.study.paper.paper_cells import held_at
-from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.study.paper.published import RATES
 from me2e_compress.study.report.figures import WIDTH_IN
 from me2e_compress.study.report.style import ACCENT, BASELINE, INK, MUTED, RULE, styled
 from me2e_compress.study.workload import held_frames
@@ -102,7 +102,8 @@ def _draw_rates(
     # mean and interval at each rate
     seed = result.study.seed
     found = [
-        (fps, result.drive(name, where).mean(column, seed)) for fps, where in driven
+        (fps, result.drive(name, where).values(column).mean(seed))
+        for fps, where in driven
     ]
     known = [(fps, each) for fps, each in found if each.value is not None]
     sure = [
@@ -138,7 +139,7 @@ def _draw_own(axes: Axes, result: PaperDrives, name: str, column: RouteColumn) -
     traced = [each.name for each in result.study.conditions if each.traced]
     if fps is None or not traced:
         return
-    own = result.drive(name, traced[0]).mean(column, result.study.seed)
+    own = result.drive(name, traced[0]).values(column).mean(result.study.seed)
     if own.value is None:
         return
     # a diamond with its interval

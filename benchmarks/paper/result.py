@@ -1,32 +1,29 @@
 """Results of the paper's study so far, and their page."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from matplotlib.figure import Figure
 
-from me2e_compress.metrics.route_values import COLUMNS
-from me2e_compress.study.paper import paper_figures
-from me2e_compress.study.paper.accident import plans_before
-from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.study.paper.paper_findings import (
+from benchmarks.paper import figures
+from benchmarks.paper.accident import plans_before
+from benchmarks.paper.drives import PaperDrives
+from benchmarks.paper.findings import (
     Finding,
     findings,
     findings_table,
     told_of_questions,
 )
-from me2e_compress.study.paper.paper_tables import all_paper_tables
+from benchmarks.paper.tables import all_paper_tables
 from me2e_compress.study.report.page import Drawing, Page, Section
 from me2e_compress.study.report.style import styled, svg
-from me2e_compress.study.study_result import StudyResult
 from me2e_compress.workflows.result import Table
 
 
-@dataclass(frozen=True, repr=False)
-class PaperResult(PaperDrives, StudyResult):
-    """A study's result in the paper's tables, with its findings as questions."""
+@dataclass(frozen=True)
+class PaperResult(PaperDrives):
+    """The drives in the paper's tables, with its findings as questions."""
 
     @property
     def headline(self) -> str:
@@ -51,56 +48,6 @@ class PaperResult(PaperDrives, StudyResult):
         """Return how many drives there are, and which questions were asked."""
         return self.headline, told_of_questions(self, self.findings)
 
-    def alerts(self) -> tuple[str, ...]:
-        """Return the drives that failed, and why."""
-        return tuple(
-            f"{each.variant} under {each.condition} was left out: {each.reason}"
-            for each in self.drives
-            if each.reason
-        )
-
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per drive."""
-        return [
-            {
-                "variant": each.variant,
-                "condition": each.condition,
-                "routes": len(each.routes),
-                **{column.name: each.mean(column).value for column in COLUMNS},
-            }
-            for each in self.finished
-        ]
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the scores of every drive, and the facts about the files."""
-        study, seed = self.study, self.study.seed
-        return {
-            "title": self.title,
-            "baseline": study.baseline,
-            "seed": seed,
-            "routes": {"driven": len(study.routes), "set": study.set_size},
-            "device_scale": self.device_scale,
-            "machine": self.machine,
-            "drives": [
-                {
-                    "scheme": drive.variant,
-                    "condition": drive.condition,
-                    "routes": len(drive.routes),
-                    "scores": {
-                        each.name: drive.mean(each, seed).to_json() for each in COLUMNS
-                    },
-                }
-                for drive in self.finished
-            ],
-            "questions": told_of_questions(self, self.findings),
-            "findings": [each.to_json() for each in self.findings],
-            "failures": [
-                {"scheme": e.variant, "condition": e.condition, "reason": e.reason}
-                for e in self.drives
-                if e.reason
-            ],
-        }
-
 
 def _figure_6(result: PaperResult) -> Figure | None:
     return None if result.accident is None else plans_before(result.accident)
@@ -109,15 +56,15 @@ def _figure_6(result: PaperResult) -> Figure | None:
 FIGURES: dict[str, tuple[tuple[Callable[[PaperResult], Figure | None], str], ...]] = {
     "Table 2": (
         (
-            paper_figures.safety,
+            figures.safety,
             "Figure 5a. Rates of one n of equation 4 are one drive: 14 to 30 FPS, grey,"
             " and 8 and 10. Right, the paper's own figures.",
         ),
-        (paper_figures.efficiency_and_comfort, "Figure 5b."),
+        (figures.efficiency_and_comfort, "Figure 5b."),
     ),
     "Table 3": (
         (
-            paper_figures.where_the_time_goes,
+            figures.where_the_time_goes,
             "Figure 7. Left, the modules of the whole driver, inference by inference;"
             " right, the longest tails: the share of decisions that take longer.",
         ),
@@ -132,7 +79,7 @@ FIGURES: dict[str, tuple[tuple[Callable[[PaperResult], Figure | None], str], ...
 }
 
 
-def paper_page(result: PaperResult, command: Sequence[str] = ()) -> Page:
+def paper_page(result: PaperResult, command: str = "") -> Page:
     """Return the page of the questions, their answers, figures and tables."""
     findings, *tables = result.tables()
     return Page(
@@ -140,7 +87,7 @@ def paper_page(result: PaperResult, command: Sequence[str] = ()) -> Page:
         result.headline,
         [Section("Findings", (findings,)), *(_section(e, result) for e in tables)],
         [
-            ("Command", " ".join(command)),
+            ("Command", command),
             ("Machine", result.machine),
             ("Device", f"{result.device_scale:.3g} times slower, for all alike"),
             ("Seed", str(result.study.seed)),

@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
 
+from benchmarks.paper.drives import PaperDrives
+from benchmarks.paper.evidence import Found, evidence
+from benchmarks.paper.questions import BEFORE, PaperQuestion, PaperQuestions
 from me2e_compress.metrics.differences import holm
 from me2e_compress.study.cells import MISSING, estimate_cell
-from me2e_compress.study.paper.evidence import Found, evidence
-from me2e_compress.study.paper.paper_drives import PaperDrives
-from me2e_compress.study.paper.questions import BEFORE, PaperQuestion, PaperQuestions
 from me2e_compress.workflows.result import Cell, Table
 
 FIRST = "first form"
@@ -40,30 +39,13 @@ class Finding:
     p: float | None
     asked: str
 
-    def to_json(self) -> dict[str, Any]:
-        """Return question, verdict, and the estimate or why there is none."""
-        estimate = self.found.estimate
-        reason = estimate.measure.reason
-        return {
-            "name": self.question.name,
-            "question": self.question.asks,
-            "paper": self.question.paper,
-            "test": self.question.test,
-            "verdict": self.verdict.value,
-            "estimate": None if reason else estimate.to_json(),
-            "p": self.p,
-            "asked": self.asked,
-            "notes": list(self.found.notes),
-            "reason": reason or None,
-        }
-
 
 def findings(result: PaperDrives) -> tuple[Finding, ...]:
     """Answer every question; the p-values are corrected by Holm over all tested.
 
     Two claims about one difference are one test, with the larger of their p-values.
     """
-    asked = PaperQuestions.load(result.study.questions)
+    asked = PaperQuestions.load(result.questions)
     found = [evidence(each, result, asked.step) for each in asked.question]
     judged = [_judged(*each) for each in zip(asked.question, found, strict=True)]
     largest = dict[object, float]()
@@ -103,15 +85,17 @@ def _asked(question: PaperQuestion, now: PaperQuestions, result: PaperDrives) ->
     if question.untested or any(each.reason for each in drives):
         return question.seen
     then = result.asked
-    if then is None or any(each.questions != then.sha256 for each in drives):
+    if then is None or any(
+        result.asked_of.get(each.name) != then.sha256 for each in drives
+    ):
         return question.seen or FIRST
     return then.since(question, now)
 
 
 def told_of_questions(result: PaperDrives, found: tuple[Finding, ...]) -> str:
     """Say which questions were asked, and whether the drives were made for them."""
-    now = PaperQuestions.load(result.study.questions)
-    known = {each.questions for each in result.finished}
+    now = PaperQuestions.load(result.questions)
+    known = {result.asked_of.get(each.name, "") for each in result.finished}
     said = f"The questions: {now.name}, sha256 {now.sha256}"
     if not known - {""}:
         return (
@@ -132,7 +116,7 @@ def told_of_questions(result: PaperDrives, found: tuple[Finding, ...]) -> str:
 def findings_table(result: PaperDrives, found: tuple[Finding, ...]) -> Table:
     """Show every question with its verdict and intervals."""
     tested = len({each.question.compared for each in found if each.p is not None})
-    asked = PaperQuestions.load(result.study.questions)
+    asked = PaperQuestions.load(result.questions)
     return Table(
         f"The paper's findings{result.study.preview}",
         (

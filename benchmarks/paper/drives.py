@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter, with_config
 
+from benchmarks.paper.accident import Accident
+from benchmarks.paper.questions import SHIPPED, PaperQuestions
 from me2e_compress.errors import StudyError
 from me2e_compress.metrics.route_values import COLUMNS, RouteColumn
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.energy import EnergyResult
+from me2e_compress.study import Study
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.outcome import StudyOutcome
-from me2e_compress.study.paper.accident import Accident
-from me2e_compress.study.paper.questions import PaperQuestions
 
 FILE = "variants.json"
 SCHEMES = ("exact", "prediction", "feature-ext", "full")
@@ -132,17 +132,32 @@ class KeptFacts:
 _KEPT = TypeAdapter(KeptFacts)
 
 
-@dataclass(frozen=True, repr=False)
-class PaperDrives(StudyOutcome):
+@dataclass(frozen=True)
+class PaperDrives:
     """The drives of the paper's study so far, and facts about the files that drove.
 
-    Its drives have no scores, its facts stand for variants; ``asked`` are the questions
-    as they were before the first drive, if that is known.
+    Attributes:
+        device_scale: How many times slower the device is than the machine timed on.
+        questions: File of the questions that are asked now.
+        asked: The questions as they were before the first drive, if that is known.
+        asked_of: Digest of the questions that a drive was made for, by its name; none
+            of a drive whose record does not know it.
     """
 
+    study: Study
+    drives: tuple[DriveRecord, ...]
+    device_scale: float
+    machine: str
     facts: tuple[ModelFacts, ...] = ()
     accident: Accident | None = None
+    questions: Path = SHIPPED
     asked: PaperQuestions | None = None
+    asked_of: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """The study's title, with a note if not all routes were driven."""
+        return f"{self.study.title}{self.study.preview}"
 
     @property
     def finished(self) -> tuple[DriveRecord, ...]:
@@ -170,6 +185,10 @@ class PaperDrives(StudyOutcome):
         found = (each for each in self.facts if each.variant == variant)
         return next(found, ModelFacts(variant))
 
-    def why_not(self, variant: str, condition: str) -> str:
-        """Say why there is no record of a drive."""
-        return self.fact(variant).failure or super().why_not(variant, condition)
+    def drive(self, variant: str, condition: str) -> DriveRecord:
+        """Return a drive; one that was not made says why."""
+        for each in self.drives:
+            if (each.variant, each.condition) == (variant, condition):
+                return each
+        why = self.fact(variant).failure or f"{variant} under {condition}: not driven"
+        return DriveRecord(variant, condition, reason=why)
