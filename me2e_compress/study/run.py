@@ -1,6 +1,5 @@
-"""Run a study, and write its report."""
+"""Run a study."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from me2e_compress.study.side_by_side import take_pictures
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.timing import time_all
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
-from me2e_compress.study.write import StudyFiles, write_study
 from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.claims import check_ours, writing
 from me2e_compress.workflows.frames import FramesOptions, record_frames
@@ -63,27 +61,6 @@ def run_study(
     with writing(folders=[folder]):
         begun = prepare_study(study, folder, engine or LocalEngine(), listener)
         return _compared(*begun, pictures)
-
-
-def run_and_report(
-    study: Study,
-    folder: str | Path,
-    command: Sequence[str] = (),
-    engine: Engine | None = None,
-    listener: Listener = SILENT,
-    *,
-    force: bool = False,
-) -> tuple[StudyResult, StudyFiles]:
-    """Run a study and write its report.
-
-    ``command`` is the command line that reproduces it. Returns the results and the
-    files.
-
-    Raises:
-        Me2eError: See `run_study`.
-    """
-    found = run_study(study, folder, engine, listener, force=force)
-    return found, write_study(found, folder, command, force=force)
 
 
 def prepare_study(

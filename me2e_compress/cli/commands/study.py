@@ -41,9 +41,10 @@ def study(
     # takes highway-env and matplotlib two seconds to import
     from me2e_compress.evaluators.highway.evaluator import engine_of
     from me2e_compress.study import load_study
-    from me2e_compress.study.run import run_and_report
+    from me2e_compress.study.run import run_study
     from me2e_compress.study.workload import workload
     from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
+    from me2e_compress.study.write import write_study
     from me2e_compress.workflows.checks import check_folder
 
     more = plugins or ()
@@ -72,9 +73,8 @@ def study(
     with listening() as listener:
         name, address = given.engine_and_address(engine)
         chosen_engine = engine_of(name, workers, address)
-        found, files = run_and_report(
-            asked, output, words, chosen_engine, listener, force=force
-        )
+        found = run_study(asked, output, chosen_engine, listener, force=force)
+        files = write_study(found, output, words, force=force)
     show(found)
     if not is_json():
         say(f"wrote {files.report}, {files.tables} and {files.record}")
