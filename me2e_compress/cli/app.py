@@ -93,10 +93,7 @@ _PANELS = {
             "Measure what int8 costs module by module, and write a recipe within a"
             " limit."
         ),
-        "search": (
-            "Find the scheme within the budgets that costs the plan, or the road,"
-            " least."
-        ),
+        "search": "Find the scheme within the budgets that costs the plan least.",
     },
     "Compare and measure": {
         "compare": (

@@ -80,8 +80,8 @@ def _registered(kind: str) -> tuple[Entry, ...]:
     return describe(REGISTRIES[kind])
 
 
-def _shipped(*folder: str) -> tuple[Entry, ...]:
-    found = resources.files("me2e_compress").joinpath(*folder).iterdir()
+def _recipes() -> tuple[Entry, ...]:
+    found = resources.files("me2e_compress").joinpath("recipes").iterdir()
     files = sorted(found, key=lambda path: path.name.removesuffix(".toml"))
     return tuple(_file(path) for path in files if path.name.endswith(".toml"))
 
@@ -131,8 +131,7 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
 """Registries to which other packages add."""
 KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
     **{kind: partial(_registered, kind) for kind in REGISTRIES},
-    "recipes": partial(_shipped, "recipes"),
-    "studies": partial(_shipped, "study", "shipped"),
+    "recipes": _recipes,
     "adapters": _adapters,
     "module-maps": _module_maps,
     "stacks": _stacks,
