@@ -44,9 +44,9 @@ FORMER = {
     "study paper": f"the study paper {_NOW} benchmarks/paper/paper.toml",
     "study shifts": f"the study shifts {_NOW} benchmarks/shifts.toml",
     "study tail": f"the study tail {_NOW} benchmarks/tail.toml",
-    "study key like": f"like {_NOW} a study with keys of its own",
-    "study key questions": f"questions {_NOW} benchmarks/paper/questions.toml",
-    "study key report": f"report {_NOW} python -m benchmarks.paper of its folder",
+    "study like": f"like {_NOW} a study with keys of its own",
+    "study questions": f"questions {_NOW} benchmarks/paper/questions.toml",
+    "study report": f"report {_NOW} python -m benchmarks.paper of its folder",
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""
 

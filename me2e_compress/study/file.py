@@ -159,8 +159,6 @@ def _complaint(error: ValidationError) -> str:
     if not unknown:
         return f"{where}: {first['msg']}"
     inside = _KINDS.get(first["loc"][0], _Study) if len(first["loc"]) > 1 else _Study
-    if gone := FORMER.get(f"study key {where}"):
-        return gone
     keys = inspect.signature(inside).parameters
     return f"no key {where}; there are {', '.join(keys)}"
 
