@@ -18,8 +18,8 @@ from me2e_compress.calibration.review import RangeFinding
 from me2e_compress.driving.adapter.port_uses import PortUse
 from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.first_difference import FirstDifference
+from me2e_compress.fidelity.liveness import Liveness
 from me2e_compress.fidelity.matched_sets import SetFidelity
-from me2e_compress.fidelity.output_liveness import Liveness
 from me2e_compress.fidelity.sensitivity import Candidate, Sensitivity
 from me2e_compress.manager import Step, Verification
 from me2e_compress.quantization.plan import Decision, QuantPlan

@@ -2,14 +2,13 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
 from me2e_compress.fidelity.engine_run import EngineRun
 from me2e_compress.fidelity.floor import ALIVE
-from me2e_compress.fidelity.output_liveness import Movement
-from me2e_compress.fidelity.saturation import Cause
+from me2e_compress.fidelity.liveness import OutputTally
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import Session
 
@@ -26,8 +25,8 @@ class OutputLoss:
         compilation_db: The engine, and the host that feeds it, against the graph.
         all_db: The engine against the float source, or against the graph without one;
             None if it cannot be compared.
-        moves: How far the engine's answers move from frame to frame, as a share of the
-            source's, or the graph's without one; None if those rest.
+        moves: Standard deviation of the engine's answers over the frames, as a share of
+            the source's, or the graph's without one; None if those rest.
         dead: What is wrong if it moves hardly at all; empty otherwise.
     """
 
@@ -81,7 +80,7 @@ def losses(
             is not finite.
     """
     names = run.names
-    movements, last = {name: Movement() for name in names}, dict[str, Sequence[Array]]()
+    movements = {name: OutputTally(name) for name in names}
     parts = ("quantization", "compilation", "all")
     sums = {name: {part: _Sums() for part in parts} for name in names}
     floats: Iterator[tuple[object, Mapping[str, Array]]] = iter(())
@@ -97,13 +96,8 @@ def losses(
                 parted["quantization"].add(right, truth[name])
             parted["compilation"].add(truth[name], dumped[name])
             parted["all"].add(right, dumped[name])
-            pair = np.array(right), np.array(dumped[name])
-            movements[name].add(pair, last.get(name))
-            last[name] = pair
-    moved = {
-        name: movement.judged(name, {}, alive, Cause, ablated=False)
-        for name, movement in movements.items()
-    }
+            movements[name].add(right, dumped[name])
+    moved = {name: movement.result(alive) for name, movement in movements.items()}
     return tuple(
         OutputLoss(
             name,

@@ -1,52 +1,45 @@
-"""The first module and node after which a graph differs from its source.
+"""The first module after which a graph differs from its source.
 
-Both graphs run once with a sketch of every value. A value that differs, computed of
-values that do not, comes from a wrong place; but rounding that grew on the way looks
-alike. So the nodes of every suspected place run once more, alone, on what the source
-computed there: what they still get wrong is their own.
+Both graphs run on one frame, with every tensor that one module hands to another as one
+more output, and those that both name alike are compared, whole.
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Self
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+import numpy as np
 import onnx_ir as ir
 
+from me2e_compress import graph
 from me2e_compress.errors import EvaluationError
-from me2e_compress.fidelity.correspondence import Held, hold
+from me2e_compress.fidelity.compare import decibels
+from me2e_compress.fidelity.engine_run import EngineRun
 from me2e_compress.fidelity.floor import SQNR_FLOOR_DB
-from me2e_compress.fidelity.places import Place, Region, Regions, merged
-from me2e_compress.fidelity.run_alone import Arrays, Truth, own_gaps
-from me2e_compress.fidelity.sketches import decibels
-from me2e_compress.fidelity.values import Fed, Values
-from me2e_compress.graph.nodes import nodes_of
+from me2e_compress.graph.nodes import constant_values, nodes_of, reads_of
 from me2e_compress.graph.provenance import module_of
-from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.session import Session, detached
 
-ROUNDING_DB = 100.0
-"""Above this SQNR two float32 values are equal but for rounding: 1e-5 of the amplitude.
-Of VAD-tiny's values after the exact passes those below it are right when computed of
-equal inputs, or reach no output (``benchmarks/bench_locate.py``)."""
-
-AT_ONCE, MOST = 4, 32
-"""Places that run alone in one round, whose values fit in memory together; and in all.
-"""
+ROUNDING_DB = 80.0
+"""SQNR of two float32 values that differ by rounding alone: two runtimes are 3e-5 to
+6e-5 apart on UniAD-tiny (docs/uniad.md)."""
 
 NARROW = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
 
 
 @dataclasses.dataclass(frozen=True)
-class ModuleLoss:
-    """What a module was given and what it gave: the lowest SQNR, dB, of those values.
-
-    None where nothing was compared.
-    """
+class BorderValue:
+    """A tensor that a module hands on: the node that makes it, and its SQNR."""
 
     module: str
-    compared: int
-    before_db: float | None
-    after_db: float | None
+    value: str
+    node: str
+    sqnr_db: float
+
+    def __str__(self) -> str:
+        module = f"module {self.module}, " if self.module else ""
+        return f"{module}{self.value} of {self.node} is at {self.sqnr_db:.1f} dB"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,166 +47,158 @@ class FirstDifference:
     """Where a graph begins to differ from its source.
 
     Attributes:
-        places: the wrong ones, in the order in which they are computed.
-        modules: what every module was given and gave, in that order too.
+        values: what was compared, in the order in which it is computed.
         floor_db: the SQNR below which a value counts as another.
-        lossy: a graph holds int8 or mostly narrow floats: a place need not be
-            wrong by itself, the loss adds up.
-        compared: how many values were held against another.
-        different: how many of them are below the floor.
-        unknown: how many have no counterpart in the source.
+        unknown: how many borders of either graph have no namesake in the other.
         outputs_differ: whether an output is below the floor.
-        inherited: suspected places that, run alone on the source's values, were right.
-        frames: how many were run.
     """
 
-    places: tuple[Place, ...]
-    modules: tuple[ModuleLoss, ...]
+    values: tuple[BorderValue, ...]
     floor_db: float
-    lossy: bool
-    compared: int
-    different: int
     unknown: int
     outputs_differ: bool
-    inherited: int
-    frames: int
 
     @property
-    def first(self) -> Place | None:
-        """The first place whose error reaches an output; None where none does."""
-        return next((each for each in self.places if each.reaches), None)
+    def first(self) -> BorderValue | None:
+        """The first value below the floor, of a graph whose outputs differ."""
+        below = (each for each in self.values if each.sqnr_db < self.floor_db)
+        return next(below, None) if self.outputs_differ else None
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Source:
-    """A graph that was run with its sketches, to hold many others against.
-
-    Each is run over the same frames, its nodes as they stand.
-    """
-
-    values: Values
-    frames: tuple[Frame, ...]
-    fed: Fed
-    provider: Provider = CPU
-
-    @classmethod
-    def of(
-        cls, model: ir.Model, frames: Iterable[Frame], provider: Provider = CPU
-    ) -> Self:
-        """Run a graph over frames.
-
-        Raises:
-            EvaluationError: there is no frame.
-            FramesError: a frame does not fit.
-            GraphError: onnxruntime cannot run the graph.
-        """
-        shown = tuple(frames)
-        if not shown:
-            raise EvaluationError("no frames to compare on")
-        values = Values(model, shown)
-        values.measure_shapes(shown, provider, values.unshaped())
-        return cls(values, shown, values.run(shown, provider), provider)
-
-    def first_difference(
-        self, candidate: ir.Model, floor_db: float | None = None
-    ) -> FirstDifference:
-        """Find where another graph begins to differ; it gets this one's state.
-
-        ``floor_db`` None is :data:`ROUNDING_DB`, or
-        :data:`me2e_compress.fidelity.floor.SQNR_FLOOR_DB` where a graph holds int8 or
-        mostly narrow floats.
-
-        Raises:
-            EvaluationError: the graphs share no value.
-            FramesError: the other graph takes other inputs.
-            GraphError: onnxruntime cannot run it.
-        """
-        a, b = self.values, Values(candidate, self.frames)
-        b.take_shapes(a)
-        b.run(self.frames, self.provider, self.fed)
-        lossy = _is_lossy(a.model) or _is_lossy(b.model)
-        floor = floor_db or (SQNR_FLOOR_DB if lossy else ROUNDING_DB)
-        held = hold(a, b, _amplitude(floor))
-        if not held:
-            raise EvaluationError("the graphs share no value, by name or by content")
-        truth = Truth(a.model, self.fed, self.provider)
-        found = found_in(
-            b.model, held, truth.arrays, self.fed, floor, lossy, self.provider
-        )
-        return dataclasses.replace(found, unknown=len(b.by_name) - len(held))
-
-
-def found_in(
-    model: ir.Model,
-    held: Mapping[ir.Value, Held],
-    arrays: Arrays,
-    fed: Fed,
-    floor: float,
-    lossy: bool,
-    provider: Provider,
+def find_first_difference(
+    source: ir.Model,
+    candidate: ir.Model,
+    frames: Sequence[Frame],
+    provider: Provider = CPU,
 ) -> FirstDifference:
-    """Suspect, try alone, and tell."""
-    tolerance = _amplitude(floor)
-    regions = Regions(model, held, tolerance)
-    wrong, tried = list[tuple[Region, float | None]](), 0
-    for tier in regions.suspects()[: 1 if lossy else 3]:
-        for start in range(0, min(len(tier), MOST - tried), AT_ONCE):
-            batch = tier[start : start + AT_ONCE]
-            own = own_gaps(model, batch, held, arrays, fed, provider)
-            tried += len(batch)
-            wrong += [
-                (region, each)
-                for region, each in zip(batch, own, strict=True)
-                if lossy or each is None or each > tolerance
-            ]
-        if wrong:
-            break
-    return FirstDifference(
-        merged(regions, wrong),
-        _losses(regions),
-        floor,
-        lossy,
-        len(held),
-        sum(each.gap > tolerance for each in held.values()),
-        0,
-        any(regions.differs(value) for value in regions.outputs),
-        tried - len(wrong),
-        len(fed),
-    )
+    """Find the first module of a graph that gives something else than its source does.
+
+    The last of the frames is compared; the state of both graphs is what the source gave
+    on those before. The floor is :data:`ROUNDING_DB`, or
+    :data:`me2e_compress.fidelity.floor.SQNR_FLOOR_DB` where a graph holds int8 or
+    mostly narrow floats.
+
+    Raises:
+        EvaluationError: there is no frame, or the graphs share no value.
+        FramesError: a frame does not fit one of the graphs.
+        GraphError: onnxruntime cannot run one.
+    """
+    if not frames:
+        raise EvaluationError("no frames to compare on")
+    borders = dict.fromkeys([*_border_values(candidate), *_border_values(source)])
+    known = [set(_values_by_name(each)) for each in (source, candidate)]
+    shared = [name for name in borders if name in known[0] & known[1]]
+    if not shared:
+        raise EvaluationError("the graphs share no value at the border of a module")
+    feeds = _feeds_of_last(source, frames, provider)
+    expected = _compute(source, shared, feeds, provider)
+    values = _compute(candidate, shared, feeds, provider)
+    lossy = _is_lossy(source) or _is_lossy(candidate)
+    floor_db = SQNR_FLOOR_DB if lossy else ROUNDING_DB
+    return _compared(candidate, expected, values, floor_db, len(borders) - len(shared))
 
 
-def _losses(regions: Regions) -> tuple[ModuleLoss, ...]:
-    """Sum up what every module was given and gave."""
-    held = regions.held
-    given, gave = dict[str, list[float]](), dict[str, list[float]]()
-    counts = dict[str, int]()
-    for node in regions.nodes:
-        module = module_of(node)
-        counts.setdefault(module, 0)
-        for value in node.outputs:
-            if value not in held:
-                continue
-            counts[module] += 1
-            others = {module_of(each) for each in regions.readers.get(value, ())}
-            if value.is_graph_output() or others - {module}:
-                gave.setdefault(module, []).append(held[value].gap)
-            for other in sorted(others - {module}):
-                given.setdefault(other, []).append(held[value].gap)
-    return tuple(
-        ModuleLoss(
-            module, count, _decibels(given.get(module)), _decibels(gave.get(module))
+def first_difference_of_engine(
+    model: ir.Model, run: EngineRun, provider: Provider = CPU
+) -> FirstDifference:
+    """Find where the tensors that an engine dumped begin to differ from its graph's.
+
+    Every dumped tensor of the first frame is compared, inner ones too.
+    """
+    feeds, _ = next(run.follow(run.session, run.names))
+    known, dumped = _values_by_name(model), run.dump[0]
+    names = [name for name in dumped if name in known]
+    expected = _compute(model, names, feeds, provider)
+    return _compared(model, expected, dumped, SQNR_FLOOR_DB, unknown=0)
+
+
+def _compared(
+    model: ir.Model,
+    expected: Mapping[str, Array],
+    values: Mapping[str, Array],
+    floor_db: float,
+    unknown: int,
+) -> FirstDifference:
+    """Compare arrays of the same name, in the order in which a graph computes them."""
+    outputs = {value.name for value in model.graph.outputs}
+    compared = tuple(
+        BorderValue(
+            module_of(node),
+            name,
+            f"{node.name or 'a node'} ({node.op_type})",
+            _sqnr(expected[name], values[name]),
         )
-        for module, count in counts.items()
-        if count
+        for name, node in _values_by_name(model).items()
+        if name in expected
     )
+    differ = any(each.sqnr_db < floor_db for each in compared if each.value in outputs)
+    return FirstDifference(compared, floor_db, unknown, differ)
 
 
-def _decibels(gaps: Sequence[float] | None) -> float | None:
-    return decibels(max(gaps)) if gaps else None
+def _border_values(model: ir.Model) -> Iterator[str]:
+    """Yield outputs, and what depends on inputs and is read by another module."""
+    constant = constant_values(model)
+    readers: dict[ir.Value, set[str]] = {}
+    for node in model.graph:
+        for value in reads_of(node):
+            readers.setdefault(value, set()).add(module_of(node))
+    for name, node in _values_by_name(model).items():
+        value = next(each for each in node.outputs if each.name == name)
+        others = readers.get(value, set()) - {module_of(node)}
+        if value not in constant and (others or value.is_graph_output()):
+            yield name
 
 
-def _amplitude(sqnr_db: float) -> float:
-    return float(10 ** (-sqnr_db / 20))
+def _values_by_name(model: ir.Model) -> dict[str, ir.Node]:
+    """Map every named value to its node, in order."""
+    made = ((each.name, node) for node in model.graph for each in node.outputs)
+    return {name: node for name, node in made if name}
+
+
+def _feeds_of_last(
+    model: ir.Model, frames: Sequence[Frame], provider: Provider
+) -> Mapping[str, Array]:
+    """Return what a graph is fed at the last frame, state included."""
+    session = Session(model, optimize=False, release=True, provider=provider)
+    state: Mapping[str, Array] = {}
+    for at, frame in enumerate(frames):
+        if frame.starts_scene or not at:
+            state = session.first_state(frame.arrays)
+        feeds = {**frame.arrays, **state}
+        if at < len(frames) - 1 and session.recurrent:
+            answers = detached(session.run(feeds, list(session.recurrent.values())))
+            state = {name: answers[out] for name, out in session.recurrent.items()}
+    return feeds
+
+
+def _compute(
+    model: ir.Model,
+    names: Iterable[str],
+    feeds: Mapping[str, Array],
+    provider: Provider,
+) -> dict[str, Array]:
+    """Run a graph, its nodes as they stand, for values anywhere in it."""
+    shown, wanted = model.clone(), list(names)
+    graph.infer_shapes(shown)
+    made = {value.name: value for node in shown.graph for value in node.outputs}
+    missing = [made[name] for name in wanted if not made[name].is_graph_output()]
+    shown.graph.outputs.extend(missing)
+    session = Session(shown, optimize=False, release=True, provider=provider)
+    return detached(session.run(feeds, wanted))
+
+
+def _sqnr(expected: Array, value: Array) -> float:
+    """Return the SQNR in dB; what is infinite or NaN in both is no difference."""
+    if expected.shape != value.shape:
+        return -np.inf
+    x, y = (np.asarray(each, np.float64) for each in (expected, value))
+    equal = (x == y) | (np.isnan(x) & np.isnan(y))
+    with np.errstate(invalid="ignore"):
+        noise = np.where(equal, 0.0, x - y)
+    if not np.isfinite(noise).all():
+        return -np.inf
+    signal = x[np.isfinite(x)]
+    return decibels(float(np.vdot(signal, signal)), float(np.vdot(noise, noise)))
 
 
 def _is_lossy(model: ir.Model) -> bool:

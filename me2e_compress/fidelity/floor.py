@@ -24,8 +24,8 @@ PLAN_FLOOR_M = 0.5
 """A car 1.9 m wide in the middle of a lane of 3.5 m still keeps 0.3 m to its lines."""
 
 ALIVE = 0.01
-"""Least movement, as a share of the uncompressed graph's, of an output that is not
-dead; int8 recipes that work keep 0.038 or more (benchmarks/bench_liveness.py)."""
+"""Least standard deviation over frames, as a share of the uncompressed graph's, of an
+output that is not dead."""
 
 MOST_EXCESS = 1e6
 """Excess of an output that should be zero and is not."""
@@ -60,8 +60,8 @@ class Floor:
         sqnr_db: least SQNR of outputs, dB; not of discrete ones, of the plan
             only where its displacement was not measured.
         plan_m: most mean displacement of the waypoints, metres.
-        alive: least share of an output's movement, between frames and when one input is
-            exchanged; 0 does not ask.
+        alive: least share of an output's standard deviation over frames; 0 does not
+            ask.
     """
 
     sqnr_db: float = SQNR_FLOOR_DB

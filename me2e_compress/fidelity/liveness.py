@@ -1,261 +1,192 @@
-"""Measure whether the outputs of a graph still answer its inputs as another's do.
+"""Whether the outputs of a graph still move as those of another do.
 
 A graph may keep nearly every decibel and have one output that is dead: a plan that
-rests while boxes and view are perfect. So each output is asked how far it moves from
-frame to frame, and how far when one input alone is exchanged for another frame's.
+rests while boxes and view are perfect. So the standard deviation of each output over
+the frames is held against that of the first graph.
 """
 
 import dataclasses
-from collections.abc import Iterable
-from functools import partial
-from typing import Self, TypeAlias
+import math
+from collections.abc import Iterator, Mapping
+from typing import Literal, TypeAlias
 
 import numpy as np
-import onnx_ir as ir
 
-from me2e_compress.errors import FramesError, GraphError
-from me2e_compress.fidelity.compare import compare
+from me2e_compress.display import Table, number, table
 from me2e_compress.fidelity.floor import ALIVE
-from me2e_compress.fidelity.output_liveness import (
-    Liveness,
-    Movement,
-    gap,
-    length,
-    share_of,
-    share_without_jumps,
-)
-from me2e_compress.fidelity.saturation import cause_of
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.session import Session, detached
+from me2e_compress.runtime.session import Session
 
-LEAST_SIDE = 16
-"""Least rows and columns of a camera's picture."""
+ROUNDING = 1e-4
+"""A deviation, over the length of the output, that may be rounding alone: two runtimes
+are 3e-5 to 6e-5 apart in float32 on UniAD-tiny (docs/uniad.md)."""
 
-NOTHING = np.zeros(())
-"""Stands for a state that is not fed."""
-
-Sides: TypeAlias = tuple[dict[str, Array], dict[str, Array]]
-"""Arrays by name, of the first graph and of the second."""
-
-
-def measure_liveness(
-    a: Session, b: Session, frames: Iterable[Frame], alive: float = ALIVE
-) -> Liveness:
-    """Run two graphs over frames and compare how their outputs answer.
-
-    Errors are those of :func:`me2e_compress.fidelity.compare.compare`.
-    """
-    tally = LivenessTally(a, b)
-    compare(a, b, frames, tally.add)
-    return tally.result(alive)
+Verdict: TypeAlias = Literal["alive", "constant", "frozen", "not judged"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Part:
-    """What is exchanged at once: an input, or one of its cameras."""
+class OutputLiveness:
+    """How far one output moves.
 
-    input: str
-    camera: int | None = None
+    Attributes:
+        moves: its standard deviation over the frames, as a share of the first graph's;
+            None where that rests itself.
+        reason: why it is not judged, or what the verdict rests on.
+    """
+
+    output: str
+    verdict: Verdict
+    moves: float | None
+    reason: str = ""
+
+    @property
+    def is_dead(self) -> bool:
+        """Whether it does not move as it should."""
+        return self.verdict in ("constant", "frozen")
 
     def __str__(self) -> str:
-        if self.camera is None:
-            return self.input
-        return f"camera {self.camera} of {self.input}"
-
-    def of(self, array: Array) -> Array:
-        """Return a view of this part of an input's array."""
-        if self.camera is None:
-            return array
-        view: Array = np.moveaxis(array, -4, 0)[self.camera]
-        return view
+        return f"{self.output} is {self.verdict}: {self.reason}"
 
 
-def parts_of(name: str, array: Array) -> list[Part]:
-    """List the cameras of an input, or the input as a whole.
+@dataclasses.dataclass(frozen=True)
+class Liveness:
+    """Which outputs of a graph still move.
 
-    The dimension before the last three counts cameras, as in [1, 6, 3, H, W] and
-    [6, 3, H, W], if it is above 1, three channels stand right behind it or last, and
-    rows and columns are 16 or more.
+    Attributes:
+        alive: share of the first graph's deviation below which an output is dead.
+        not_fed: recurrent inputs that the second graph has and is not fed back.
+        reason: why nothing was measured; empty otherwise.
     """
-    if array.ndim < 4 or array.shape[-4] < 2:
-        return [Part(name)]
-    *_, cameras, first, second, last = array.shape
-    sides = (second, last) if first == 3 else (first, second) if last == 3 else (0,)
-    if min(sides) < LEAST_SIDE:
-        return [Part(name)]
-    return [Part(name, camera) for camera in range(cameras)]
 
+    outputs: tuple[OutputLiveness, ...]
+    alive: float
+    not_fed: tuple[str, ...] = ()
+    reason: str = ""
 
-@dataclasses.dataclass(frozen=True)
-class _Moment:
-    """One frame, with what both graphs remembered and answered."""
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """A sentence for each dead output, and for each state that is not fed."""
+        dead = [str(each) for each in self.outputs if each.is_dead]
+        return (*dead, *(f"{name} is not fed back any more" for name in self.not_fed))
 
-    frame: Frame
-    scene: int
-    states: Sides
-    answers: Sides
+    def lines(self) -> Iterator[str]:
+        """Yield which output moves least, and what is not judged."""
+        if self.reason:
+            yield f"liveness: not measured ({self.reason})"
+            return
+        moving = [
+            (each.moves, each.output)
+            for each in self.outputs
+            if each.verdict == "alive" and each.moves is not None
+        ]
+        if moving and not self.faults:
+            share, output = min(moving)
+            yield f"every output is alive (least of all {output}: {share:.0%})"
+        rests = [
+            f"{each.output} ({each.reason})"
+            for each in self.outputs
+            if each.verdict == "not judged"
+        ]
+        if rests:
+            yield f"liveness not judged: {', '.join(rests)}"
 
-    def feeds(self, side: int) -> dict[str, Array]:
-        return {**self.frame.arrays, **self.states[side]}
-
-
-@dataclasses.dataclass(frozen=True)
-class _Donor:
-    """What takes the place of a part, in each graph; `near` is of the same scene."""
-
-    near: bool
-    distance: float
-    values: tuple[Array, ...]
-
-    @classmethod
-    def of(cls, part: Part, base: _Moment, other: _Moment) -> Self:
-        # each graph gets its own state, of the same frame
-        held, *given = (
-            part.of(each.feeds(side).get(part.input, NOTHING))
-            for each, side in ((base, 0), (other, 0), (other, 1))
+    def table(self) -> Table:
+        """Return a row for each output."""
+        rows = [
+            (each.output, each.verdict, number(each.moves, ".2f"))
+            for each in self.outputs
+        ]
+        note = (
+            "Standard deviation over the frames, as a share of the first graph's: dead"
+            f" below {self.alive:g}."
         )
-        distance = gap(held, given[0])
-        return cls(base.scene == other.scene, distance, tuple(given))
+        return table("Liveness", ("output", "it is", "moves"), rows, note, words=2)
+
+
+class Deviation:
+    """The standard deviation of one output over frames, all elements pooled."""
+
+    def __init__(self) -> None:
+        self.frames, self.resized, self.discrete = 0, False, False
+        self._mean = self._squares = np.zeros(())
+
+    def add(self, value: Array) -> None:
+        """Take another frame."""
+        wide = np.asarray(value, np.float64)
+        self.frames += 1
+        if self.frames == 1:
+            self.discrete = value.dtype.kind not in "fc"
+            self._mean, self._squares = wide.copy(), np.zeros_like(wide)
+        elif wide.shape != self._mean.shape:
+            self.resized = True
+        else:  # Welford's update of mean and sum of squares
+            gap = wide - self._mean
+            self._mean += gap / self.frames
+            self._squares += gap * (wide - self._mean)
+
+    @property
+    def deviation(self) -> float:
+        """Length of the deviation of all elements."""
+        return math.sqrt(float(self._squares.sum()) / max(self.frames, 1))
+
+    @property
+    def rests(self) -> bool:
+        """Whether it moves by rounding at most."""
+        length = math.hypot(float(np.linalg.norm(self._mean)), self.deviation)
+        return self.deviation <= ROUNDING * length
+
+
+class OutputTally:
+    """The deviation of one output in both graphs."""
+
+    def __init__(self, name: str) -> None:
+        self.name, self._first, self._second = name, Deviation(), Deviation()
+
+    def add(self, first: Array, second: Array) -> None:
+        """Take what both graphs answer to a frame."""
+        self._first.add(first)
+        self._second.add(second)
+
+    def result(self, alive: float) -> OutputLiveness:
+        """Give the verdict."""
+        first, second = self._first, self._second
+        if first.resized or second.resized:
+            return OutputLiveness(self.name, "not judged", None, "its shape changes")
+        if first.rests:
+            reason = "it rests in the first graph too"
+            return OutputLiveness(self.name, "not judged", None, reason)
+        moves = second.deviation / first.deviation
+        if first.discrete:
+            return OutputLiveness(self.name, "not judged", moves, "whole numbers")
+        if moves >= alive:
+            return OutputLiveness(self.name, "alive", moves)
+        reason = f"it moves {moves:.2%} as far as before"
+        return OutputLiveness(
+            self.name, "frozen" if moves else "constant", moves, reason
+        )
 
 
 class LivenessTally:
-    """Watches two graphs over frames, then exchanges one input after the other.
-
-    The frame whose inputs are exchanged is the first that continues a scene, since it
-    has a history; where there is none, the first. Each part is taken from the frame
-    where it differs most, of the same scene if it changes there: one more inference of
-    each graph for every part that ever changes. Where an output seems deaf to it, it is
-    taken from a second frame too: a graph that picks may have jumped but once.
-    """
+    """Watches how the outputs of two graphs move over frames."""
 
     def __init__(self, a: Session, b: Session) -> None:
-        self._sessions = a, b
         names = [name for name in a.outputs if name in b.outputs]
-        self._movements = {name: Movement() for name in names}
-        self._donors = dict[Part, list[_Donor]]()
-        self._last: _Moment | None = None
-        self._base: _Moment | None = None
-        self._scene = self._frames = 0
+        self._tallies = {name: OutputTally(name) for name in names}
+        held = [name for name in a.recurrent if name in b.inputs]
+        self._not_fed = tuple(name for name in held if name not in b.recurrent)
+        self._frames = 0
 
     def add(
-        self, left: dict[str, Array], right: dict[str, Array], frame: Frame
+        self, left: Mapping[str, Array], right: Mapping[str, Array], frame: Frame
     ) -> None:
-        """Take what both graphs answer to a frame, the state of each included."""
-        last, answers = self._last, (detached(left), detached(right))
-        self._scene += frame.starts_scene
+        """Take what both graphs answer to a frame."""
         self._frames += 1
-        states = self._state(0, frame), self._state(1, frame)
-        moment = self._last = _Moment(frame, self._scene, states, answers)
-        for name, movement in self._movements.items():
-            before = None if last is None else [side[name] for side in last.answers]
-            movement.add([side[name] for side in answers], before)
-        # a frame with a history is a better base than one without
-        base = self._base
-        if base is None or (base.frame.starts_scene and not frame.starts_scene):
-            base, moment = moment, last or moment
-            self._base, self._donors = base, self._parts(base)
-        for part, donors in self._donors.items():
-            found = _Donor.of(part, base, moment)
-            if found.distance > 0:
-                donors.append(found)
-                donors.sort(key=lambda each: (each.near, each.distance), reverse=True)
-                del donors[2:]
+        for name, tally in self._tallies.items():
+            tally.add(left[name], right[name])
 
-    def result(
-        self,
-        alive: float = ALIVE,
-        model: ir.Model | None = None,
-        *,
-        ablated: bool = False,
-    ) -> Liveness:
-        """Exchange every part and judge every output.
-
-        Args:
-            alive: share of the first graph's movement below which an output is dead.
-            model: the second graph, to look for what makes an output rest.
-            ablated: whether modules were removed from it: who is deaf is meant to be.
-        """
-        base, (first, second) = self._base, self._sessions
-        if base is None or self._frames < 2:
+    def result(self, alive: float = ALIVE) -> Liveness:
+        """Judge every output."""
+        if self._frames < 2:
             return Liveness((), alive, reason="one frame alone: nothing moves")
-        answers, unjudged = self._exchange(base, alive)
-        found = []
-        for name, movement in self._movements.items():
-            why = partial(cause_of, model, name, base.feeds(1), second.provider)
-            found.append(
-                movement.judged(name, answers[name], alive, why, ablated=ablated)
-            )
-        held = [name for name in first.recurrent if name in second.inputs]
-        not_fed = [name for name in held if name not in second.recurrent]
-        return Liveness(tuple(found), alive, base.frame.index, unjudged, tuple(not_fed))
-
-    def _parts(self, base: _Moment) -> dict[Part, list[_Donor]]:
-        """List what can be exchanged of a frame, so far with nothing."""
-        fed = base.feeds(0).items()
-        return {part: [] for name, array in fed for part in parts_of(name, array)}
-
-    def _state(self, side: int, frame: Frame) -> dict[str, Array]:
-        """Return what a graph remembers at a frame, as replays feed it."""
-        session = self._sessions[side]
-        if frame.starts_scene or self._last is None:
-            return session.first_state(frame.arrays)
-        held = self._last.answers[side]
-        return {name: held[answer] for name, answer in session.recurrent.items()}
-
-    def _exchange(
-        self, base: _Moment, alive: float
-    ) -> tuple[dict[str, dict[str, float | None]], dict[str, str]]:
-        """Return how outputs answer each part, and why some parts tell nothing."""
-        answers: dict[str, dict[str, float | None]] = {n: {} for n in self._movements}
-        unjudged = dict[str, str]()
-        for part, donors in self._donors.items():
-            told = str(part)
-            if not donors:
-                unjudged[told] = "the same in all frames"
-            for donor in donors:
-                try:
-                    found = self._shares(base, part, donor)
-                except (GraphError, FramesError) as error:
-                    unjudged[told] = str(error)
-                    break
-                for name, share in found.items():
-                    known = (answers[name].get(told), share)
-                    both = [each for each in known if each is not None]
-                    answers[name][told] = max(both, default=None)
-                least = [
-                    share for e in answers.values() if (share := e[told]) is not None
-                ]
-                if min(least, default=alive) >= alive:
-                    break
-        return answers, unjudged
-
-    def _shares(
-        self, base: _Moment, part: Part, donor: _Donor
-    ) -> dict[str, float | None]:
-        """Return how every output answers a part of another frame."""
-        changed = [self._exchanged(side, base, part, donor) for side in (0, 1)]
-        found = dict[str, float | None]()
-        for name in self._movements:
-            sides = [
-                (side[name], now[name])
-                for side, now in zip(base.answers, changed, strict=True)
-            ]
-            moved = [gap(*pair) for pair in sides]
-            share = found[name] = share_of(moved, length(sides[0][0]))
-            if share is not None:
-                found[name] = max(share, share_without_jumps(*sides))
-        return found
-
-    def _exchanged(
-        self, side: int, base: _Moment, part: Part, donor: _Donor
-    ) -> dict[str, Array]:
-        """Run a graph on a frame with one part exchanged."""
-        session, feeds = self._sessions[side], base.feeds(side)
-        if part.input not in session.inputs:
-            return base.answers[side]
-        if part.camera is None:
-            feeds[part.input] = donor.values[side]
-        else:
-            feeds[part.input] = feeds[part.input].copy()
-            part.of(feeds[part.input])[...] = donor.values[side]
-        return detached(session.run(feeds, list(self._movements)))
+        outputs = (tally.result(alive) for tally in self._tallies.values())
+        return Liveness(tuple(outputs), alive, self._not_fed)

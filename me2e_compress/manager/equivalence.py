@@ -11,7 +11,7 @@ from typing import TypeAlias
 import onnx_ir as ir
 
 from me2e_compress.errors import FramesError, GraphError, Me2eError
-from me2e_compress.fidelity.first_difference import Source
+from me2e_compress.fidelity.first_difference import find_first_difference
 from me2e_compress.graph.nodes import DRAWS, bodies_of, reads_of
 from me2e_compress.manager import runtime_levels
 from me2e_compress.manager.output_errors import (
@@ -189,13 +189,12 @@ def _without_optimizations(
 
 
 def where(before: ir.Model, after: ir.Model, inputs: VerificationInputs) -> str:
-    """Say after which node of a changed graph its values differ, if that is found."""
+    """Name the first module of a changed graph whose values differ, if one is found."""
     try:
-        source = Source.of(before, inputs.frames, inputs.provider)
-        first = source.first_difference(after).first
+        found = find_first_difference(before, after, inputs.frames, inputs.provider)
     except Me2eError:
         return ""
-    return "" if first is None else f"; values differ from {first.named} on"
+    return "" if found.first is None else f"; first difference: {found.first}"
 
 
 def skipped(passes: tuple[str, ...], why: str) -> Verification:

@@ -59,19 +59,6 @@ def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.M
     return copy
 
 
-def with_shapes(model: ir.Model, tensors: Sequence[str]) -> ir.Model:
-    """Return a copy of a graph whose last outputs are the shapes of these tensors."""
-    copy = model.clone()
-    known = _values(copy)
-    for at, name in enumerate(tensors):
-        node = ir.node("Shape", [known[name]], name=f"{READINGS}/shape_{at}")
-        node.outputs[0].name = node.name
-        node.outputs[0].dtype = ir.DataType.INT64
-        copy.graph.append(node)
-        copy.graph.outputs.append(node.outputs[0])
-    return copy
-
-
 def _values(model: ir.Model) -> dict[str, ir.Value]:
     made = (value for node in model.graph for value in node.outputs)
     return {str(value.name): value for value in (*model.graph.inputs, *made)}

@@ -13,11 +13,8 @@ from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.fidelity.compare import Fidelity, common_adapter
 from me2e_compress.fidelity.compare import compare as measure
 from me2e_compress.fidelity.floor import ALIVE
-from me2e_compress.fidelity.liveness import LivenessTally
+from me2e_compress.fidelity.liveness import Liveness, LivenessTally
 from me2e_compress.fidelity.matched_sets import SetFidelity, SetOutputs, SetTally
-from me2e_compress.fidelity.output_liveness import Liveness
-from me2e_compress.graph import provenance
-from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
@@ -118,11 +115,6 @@ class CompareResult(Result):
         }
 
 
-def _is_ablated(model: ir.Model) -> bool:
-    made = (node.metadata_props.get(provenance.PASSES, "") for node in model.graph)
-    return any(AblateModules.name in passes for passes in made)
-
-
 def _agents(found: SetFidelity) -> Table:
     rows = [(name, f"{decibels:.1f}") for name, decibels in found.sqnr_db.items()]
     agents = counted(found.agents, "agent")
@@ -161,11 +153,10 @@ def compare(
     Each graph is an ONNX file or the name of a model that ships. Outputs that the
     metadata ``me2e.sets`` of the first names are matched agent by agent. `as_it_stands`
     runs the first graph without onnxruntime's optimizations and the second with all of
-    them: comparing a graph with itself shows what they change. An output is dead that
-    moves less than a share `alive` of the first graph's, between frames or when one
-    input is exchanged; 0 does not ask, which saves an inference of each graph for every
-    input. The adapter's TOML says which output is the plan and which are fed back, in
-    both graphs; None leaves it to their metadata.
+    them: comparing a graph with itself shows what they change. An output is dead whose
+    standard deviation over the frames is less than a share `alive` of the first
+    graph's; 0 does not ask. The adapter's TOML says which output is the plan and which
+    are fed back, in both graphs; None leaves it to their metadata.
 
     Raises:
         GraphError: A model does not exist or run, or nothing picks one of a plan's
@@ -232,7 +223,5 @@ def compare(
         runtime = kernels.result(models[-1], fidelity)
         found = dataclasses.replace(found, runtime=runtime)
     if lively is not None:
-        model = models[-1]
-        told = lively.result(alive, model, ablated=_is_ablated(model))
-        found = dataclasses.replace(found, liveness=told)
+        found = dataclasses.replace(found, liveness=lively.result(alive))
     return found

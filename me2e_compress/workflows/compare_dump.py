@@ -14,8 +14,10 @@ from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.fidelity.engine_loss import OutputLoss, losses
 from me2e_compress.fidelity.engine_run import EngineRun
-from me2e_compress.fidelity.engine_values import first_difference_of_engine
-from me2e_compress.fidelity.first_difference import FirstDifference
+from me2e_compress.fidelity.first_difference import (
+    FirstDifference,
+    first_difference_of_engine,
+)
 from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
@@ -24,7 +26,7 @@ from me2e_compress.runtime.session import Session
 from me2e_compress.targets.quantized import describe_quantized
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.compress_result import beside
-from me2e_compress.workflows.first_difference import told_of, with_modules
+from me2e_compress.workflows.first_difference import headline_of, with_modules
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, counted, number, table
@@ -74,7 +76,7 @@ class DumpResult(Result):
 
     def lines(self) -> tuple[str, ...]:
         """Return the verdict, what differs inside, and what is worth knowing."""
-        inside = () if self.inner is None else (f"inside: {told_of(self.inner)}",)
+        inside = () if self.inner is None else (f"inside: {headline_of(self.inner)}",)
         return (self.headline, *inside, *self.notes)
 
     def alerts(self) -> tuple[str, ...]:
@@ -171,7 +173,7 @@ def compare_dump(
         raise EvaluationError(f"{answered.path}: {error}") from error
     if set(answered.names) - set(session.outputs):
         named = with_modules(loaded)
-        inner = first_difference_of_engine(named, run, provider=provider)
+        inner = first_difference_of_engine(named, run, provider)
     return DumpResult(
         path, answered.path, source, why, total, _state(run), outputs,
         (*notes, *_rounded(run)), inner,

@@ -148,10 +148,9 @@ class _Measurement:
         )
 
     def _answers(self, found: MeasuredLoss, reference: Reference) -> MeasuredLoss:
-        """Compare the result with the graph before, and how both answer their inputs.
+        """Compare the result with the graph before, and how far the outputs move.
 
-        What lossy passes other than a quantizer cut, they are meant to cut. A graph for
-        onnxruntime is run by its int8 kernels, too.
+        A graph for onnxruntime is run by its int8 kernels, too.
         """
         session, model = self._session(self.report.model), self.report.model
         alive = self.floor.alive
@@ -164,13 +163,10 @@ class _Measurement:
                     tally.add(a, b, frame)
 
         fidelity = reference.compare(session, watch=watch)
-        ablated = not all(each.applied.quantizes for each in self.report.lossy)
         return dataclasses.replace(
             found,
             fidelity=fidelity,
-            liveness=None
-            if lively is None
-            else lively.result(alive, model, ablated=ablated),
+            liveness=None if lively is None else lively.result(alive),
             runtime=None if kernels is None else kernels.result(model, fidelity),
         )
 

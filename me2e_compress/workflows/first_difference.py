@@ -1,8 +1,7 @@
-"""Find the first module and node after which a graph differs from its source."""
+"""Find the first module after which a graph differs from its source."""
 
 import dataclasses
 import itertools
-import math
 from pathlib import Path
 
 import onnx_ir as ir
@@ -11,18 +10,21 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.fidelity.first_difference import FirstDifference, Source
-from me2e_compress.fidelity.places import Place
+from me2e_compress.fidelity.first_difference import (
+    BorderValue,
+    FirstDifference,
+    find_first_difference,
+)
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import ModuleMap, assign, map_of
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.workflows.checks import check_count, model_path
+from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, counted, number, table
 
 FRAMES = 2
-"""Frames that are looked at: the second one reads the state of the first."""
+"""The second frame is compared: it reads the state of the first."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -35,88 +37,49 @@ class FirstDifferenceResult(Result):
 
     @property
     def headline(self) -> str:
-        """The first wrong module and node."""
-        return told_of(self.found)
+        """The first module that differs."""
+        return headline_of(self.found)
 
     def tables(self) -> tuple[Table, ...]:
-        """Return the places, and what every module was given and gave."""
-        found = self.found
+        """Return the worst value that each module hands on."""
+        worst: dict[str, BorderValue] = {}
+        for each in self.found.values:
+            known = worst.setdefault(each.module, each)
+            if each.sqnr_db < known.sqnr_db:
+                worst[each.module] = each
         rows = [
-            (
-                each.module or "-",
-                each.value,
-                each.named,
-                number(each.sqnr_db, ".1f"),
-                number(each.own_db, ".1f"),
-            )
-            for each in found.places
+            (each.module or "-", each.value, each.node, number(each.sqnr_db, ".1f"))
+            for each in worst.values()
         ]
-        columns = ("module", "value", "nodes", "SQNR dB", "alone dB")
+        columns = ("module", "worst value", "node", "SQNR dB")
         note = (
-            "One of the nodes makes the value another than in the first graph. Alone:"
-            " the same nodes, run on the first graph's values."
+            f"Of {counted(len(self.found.values), 'value')} that modules hand on."
+            f" {self.found.unknown} of either graph have no namesake in the other."
         )
-        places = (table("Where they differ", columns, rows, note, words=3),)
-        modules = [
-            (
-                each.module or "-",
-                f"{each.compared}",
-                number(each.before_db, ".1f"),
-                number(each.after_db, ".1f"),
-            )
-            for each in found.modules
-        ]
-        return (
-            *(places if rows else ()),
-            table(
-                f"Modules over {counted(found.frames, 'frame')}",
-                ("module", "values", "before, dB", "after, dB"),
-                modules,
-                "The lowest SQNR of what a module was given and gave, estimated by 16"
-                f" projections of every value. {found.unknown} values of the second"
-                " graph are none of the first's, and not judged.",
-            ),
-        )
+        return (table("Modules", columns, rows, note, words=3),)
 
     def records(self) -> list[dict[str, object]]:
-        """Return one row per place."""
-        return [dataclasses.asdict(each) for each in self.found.places]
+        """Return one row per value."""
+        return [dataclasses.asdict(each) for each in self.found.values]
 
     def to_json(self) -> object:
-        """Return all that was found."""
+        """Return all that was compared."""
         return dataclasses.asdict(self.found)
 
 
-def told_of(found: FirstDifference) -> str:
-    """Name the first wrong module and node, or say that there is none."""
+def headline_of(found: FirstDifference) -> str:
+    """Name the first module that differs, or say that there is none."""
     if found.first is not None:
-        return _told(found.first, found)
-    if not found.different:
+        return f"first below {found.floor_db:g} dB: {found.first}"
+    below = sum(each.sqnr_db < found.floor_db for each in found.values)
+    if not below:
         return (
-            f"no difference: {counted(found.compared, 'value')} at"
+            f"no difference: {counted(len(found.values), 'value')} at"
             f" {found.floor_db:g} dB or more"
         )
-    of = f"{found.different} of {counted(found.compared, 'value')}"
-    if found.outputs_differ:
-        end = "every place that was tried is right on equal inputs: rounding grew"
-    else:
-        end = "none of that reaches an output"
-    return f"{of} are below {found.floor_db:g} dB, but {end}"
-
-
-def _told(first: Place, found: FirstDifference) -> str:
-    begin = f"first below {found.floor_db:g} dB" if found.lossy else "first difference"
-    module = f"module {first.module}, " if first.module else ""
-    # of equal inputs the nodes are wrong, or only what they read was
-    own = first.own_db
-    alone = f"{own:.1f} dB" if own is not None else "not measured"
-    if own is not None and own >= found.floor_db:
-        alone = "right" if own == math.inf else f"{own:.1f} dB: the loss adds up"
-    more = len([each for each in found.places if each.reaches]) - 1
-    others = f"; {counted(more, 'other place')} beside it" if more else ""
     return (
-        f"{begin}: {module}{first.named}: {first.value} is at {first.sqnr_db:.1f} dB;"
-        f" alone, on the first graph's values: {alone}{others}"
+        f"{below} of {counted(len(found.values), 'value')} are below"
+        f" {found.floor_db:g} dB, but no output is"
     )
 
 
@@ -126,26 +89,23 @@ def first_difference(
     frames: str | Path,
     listener: Listener = SILENT,
     *,
-    floor_db: float | None = None,
-    most_frames: int = FRAMES,
     provider: Provider = CPU,
     adapter: str | Path | None = None,
     module_map: str | Path | None = None,
 ) -> FirstDifferenceResult:
-    """Find the first module and node after which the second graph differs.
+    """Find the first module after which the second graph differs.
 
-    Both graphs run once, their nodes as they stand, with a sketch of every value; the
-    places that are suspected run once more, alone, on the first graph's values.
-    `floor_db` None is 100 dB, rounding, and 20 dB where a graph holds int8 or
-    mostly narrow floats. The adapter's TOML says which outputs are fed back.
+    Both graphs run on one frame, their nodes as they stand, and what their modules hand
+    on is compared by name. A value differs below 80 dB, or below 20 dB where a graph
+    holds int8 or mostly narrow floats. The adapter's TOML says which outputs are fed
+    back.
 
     Raises:
-        EvaluationError: The graphs share no value, or compute none.
+        EvaluationError: The graphs share no value.
         FramesError: A frame does not fit one of the graphs.
         GraphError: A model does not exist or run.
         ProviderError: The provider is not available.
     """
-    check_count("most_frames", most_frames, 1)
     paths = model_path(reference), model_path(candidate)
     recording = CalibrationSet(Path(frames))
     models = dict[Path, ir.Model]()
@@ -158,13 +118,8 @@ def first_difference(
             provider=provider,
         )  # fmt: skip
         models[path] = with_modules(loaded)
-    # the source runs once, then the other graph
-    shown = tuple(itertools.islice(recording, most_frames))
-    listener.on_progress("sketches", 0, 2, str(paths[0]))
-    source = Source.of(models[paths[0]], shown, provider)
-    listener.on_progress("sketches", 1, 2, str(paths[1]))
-    found = source.first_difference(models[paths[1]], floor_db)
-    listener.on_progress("sketches", 2, 2, "")
+    shown = tuple(itertools.islice(recording, FRAMES))
+    found = find_first_difference(models[paths[0]], models[paths[1]], shown, provider)
     return FirstDifferenceResult(*paths, found)
 
 

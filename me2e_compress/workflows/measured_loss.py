@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 
 from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.floor import Floor, Rounding, Shortfall, shown
-from me2e_compress.fidelity.output_liveness import Liveness
+from me2e_compress.fidelity.liveness import Liveness
 from me2e_compress.workflows.result import Table, counted, table
 from me2e_compress.workflows.runtime_loss import RuntimeLoss
 
@@ -32,7 +32,7 @@ class MeasuredLoss:
         guilty: the lossy passes, which cause the shortfalls between them.
         advice: the command that measures int8 module by module; empty where nothing is
             below the floor, or nothing is int8.
-        liveness: which outputs still answer their inputs; None if not asked.
+        liveness: which outputs still move; None if not asked.
         runtime: what onnxruntime's int8 answers otherwise; None if it is not for it.
         seconds: CPU time of measuring.
     """

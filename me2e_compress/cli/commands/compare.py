@@ -43,7 +43,7 @@ def compare(
         bool,
         typer.Option(
             "--first-difference",
-            help="name the first module and node after which the second differs",
+            help="name the first module after which the second differs",
         ),
     ] = False,
     adapter: given.Adapter = None,
@@ -53,7 +53,7 @@ def compare(
 ) -> None:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres.
 
-    Exit code 1 if an output of the second does not answer its inputs any more.
+    Exit code 1 if an output of the second hardly moves any more.
     """
     runs_on = provider_named(provider, plugins or ())
     if where and (as_it_stands or outputs is not None):
