@@ -2,8 +2,7 @@
 
 ``python -m benchmarks.bench_energy`` simulates measurements of models of several frame
 times and powers by counters that move every 100 ms and look at 25 ms of these, and
-prints how often the 95 % interval holds the true joules, and how wide it is. The step
-is learnt as the meter learns it.
+prints how often the 95 % interval holds the true joules, and how wide it is.
 """
 
 import argparse
@@ -54,10 +53,9 @@ def held(
     *,
     simulations: int,
     seed: int,
-    detuned: bool = True,
 ) -> Held:
     """Simulate measurements of one load and see what their intervals hold."""
-    rows = list(_rows(load, counter, schedule, simulations, seed, detuned))
+    rows = list(_rows(load, counter, schedule, simulations, seed))
     low, middle, high, taken, mean = np.array(rows).T
     return Held(
         simulations,
@@ -74,7 +72,6 @@ def _rows(
     schedule: EnergySchedule,
     simulations: int,
     seed: int,
-    detuned: bool,
 ) -> Iterator[tuple[float, ...]]:
     random = np.random.default_rng(seed)
     numbers = schedule.windows * schedule.frames(load.frame_s) * 3
@@ -85,13 +82,10 @@ def _rows(
             *(load, counter, random),
             measurements=count,
             schedule=schedule,
-            detuned=detuned,
         )
-        rows = zip(
-            *(found.windows, found.steps_s, found.taken_j, found.mean_j), strict=True
-        )
-        for windows, step_s, taken, mean in rows:
-            by = estimate(windows, step_s, load.idle_w)
+        rows = zip(found.windows, found.taken_j, found.mean_j, strict=True)
+        for windows, taken, mean in rows:
+            by = estimate(windows, counter.step_s)
             yield by.low, by.j_per_frame, by.high, taken, mean
 
 
@@ -109,7 +103,6 @@ def main() -> None:
     parser.add_argument("--simulations", type=int, default=2_000, help="a condition")
     parser.add_argument("--windows", type=int, default=EnergySchedule().windows)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--plain", action="store_true", help="frames are not held up")
     given = parser.parse_args()
     schedule = EnergySchedule(windows=given.windows)
     print(
@@ -126,7 +119,6 @@ def main() -> None:
             *(load, COUNTER, schedule),
             simulations=given.simulations,
             seed=given.seed,
-            detuned=not given.plain,
         )
         found.append(each)
         print(

@@ -27,8 +27,9 @@ import pynvml
 
 from benchmarks.run_one import peak_mb
 from me2e_compress.errors import EnergyError, Me2eError
+from me2e_compress.registry import name_in
 from me2e_compress.runtime.energy import EnergyResult
-from me2e_compress.runtime.energy.energy_counter import open_counter
+from me2e_compress.runtime.energy.energy_counter import ENERGY_COUNTERS, open_counter
 from me2e_compress.runtime.energy.meter import EnergyMeter
 from me2e_compress.runtime.energy.reader import Absent, Reader
 from me2e_compress.runtime.energy.schedule import EnergySchedule
@@ -129,6 +130,9 @@ def energy(run: Run, provider: Provider) -> EnergyResult:
         names = ["rapl"]
     reasons = list[str]()
     for name in names:
+        if name_in(name) not in ENERGY_COUNTERS.names():
+            reasons.append(f"{name}: examples/energy_counters is not installed")
+            continue
         counter = open_counter(name)
         if isinstance(counter, Reader):
             try:

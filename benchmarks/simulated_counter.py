@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from me2e_compress.runtime.energy.counter_step import learnt_step
-from me2e_compress.runtime.energy.estimate import Window, detuning
+from me2e_compress.runtime.energy.estimate import Window
 from me2e_compress.runtime.energy.schedule import EnergySchedule
 
 Floats = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
@@ -34,8 +33,6 @@ class Load:
         burst: of it, its full power over the usual.
         drift: share by which power rises while the chip warms up.
         drift_s: time constant of that.
-        idle_w: power of the idle device; between two frames it is somewhere from here
-            to the mean of a frame, in each measurement another.
     """
 
     frame_s: float
@@ -48,7 +45,6 @@ class Load:
     burst: float = 1.5
     drift: float = 0.03
     drift_s: float = 60.0
-    idle_w: float = 80.0
 
     def lasting(self, frame_s: float) -> "Load":
         """Return the same power with frames of so many seconds."""
@@ -86,13 +82,11 @@ class Simulated:
 
     Attributes:
         windows: of every measurement.
-        steps_s: of the counter, as each measurement learnt it.
         taken_j: joules a frame that its frames took.
         mean_j: joules a frame that such frames take on average, at that warmth.
     """
 
     windows: list[list[Window]]
-    steps_s: list[float]
     taken_j: Floats
     mean_j: Floats
 
@@ -104,7 +98,6 @@ def simulate(
     *,
     measurements: int,
     schedule: EnergySchedule,
-    detuned: bool = True,
 ) -> Simulated:
     """Simulate measurements of one model beside another that takes as long.
 
@@ -114,15 +107,11 @@ def simulate(
         random: draws everything.
         measurements: how many.
         schedule: of their windows.
-        detuned: hold frames up that keep step with the counter, as the meter does.
     """
     windows, frames = schedule.windows, schedule.frames(load.frame_s)
-    steps = [_learnt(counter, random, schedule.idle_s) for _ in range(measurements)]
-    pauses = [detuning(load.frame_s, frames, each) * detuned for each in steps]
-    pause = np.repeat(pauses, windows)
     lead = int(np.ceil(LEAD_S / load.frame_s))
     shape = (measurements * windows, lead + frames + lead)
-    span = frames * (load.frame_s + pause) + schedule.lead_in_s
+    span = frames * load.frame_s + schedule.lead_in_s
     begun = 2 * span * np.tile(np.arange(windows), measurements)
     warmth = -np.expm1(-(schedule.warm_up_s + begun) / load.drift_s)
     warm = 1 + load.drift * warmth[:, None]
@@ -131,49 +120,27 @@ def simulate(
     full = 1 + load.spread * random.standard_normal(shape)
     if load.burst_every:
         full *= np.where(random.random(shape) < 1 / load.burst_every, load.burst, 1.0)
-    seconds = [
-        length * load.busy,
-        length * (1 - load.busy),
-        np.broadcast_to(pause[:, None], shape),
-    ]
-    at_most = load.mean_j() / load.frame_s
-    pause_w = np.repeat(random.uniform(load.idle_w, at_most, measurements), windows)
-    power = [load.busy_w * full * warm, load.rest_w * warm, pause_w[:, None]]
+    seconds = [length * load.busy, length * (1 - load.busy)]
+    power = [load.busy_w * full * warm, load.rest_w * warm]
     parts_s = np.stack(seconds, -1)
     watts = np.stack([np.broadcast_to(each, shape) for each in power], -1)
     joules = parts_s * watts
 
     inside = slice(lead, lead + frames)
-    taken = joules[:, inside, :2].sum((1, 2)) / frames
+    taken = joules[:, inside].sum((1, 2)) / frames
     mean = load.mean_j() * warm[:, 0]
     times, energy = _from_zero(parts_s), _from_zero(joules)
-    begin, end = times[:, 3 * lead], times[:, 3 * (lead + frames)]
+    begin, end = times[:, 2 * lead], times[:, 2 * (lead + frames)]
     moved = _moved(counter, random, times, energy, begin, end)
     found = [
-        Window(start, start + each, frames, counted, paused * frames)
-        for start, each, counted, paused in zip(
-            *(begun, end - begin, moved, pause), strict=True
-        )
+        Window(start, start + each, frames, counted)
+        for start, each, counted in zip(begun, end - begin, moved, strict=True)
     ]
     return Simulated(
         [found[at : at + windows] for at in range(0, len(found), windows)],
-        steps,
         taken.reshape(-1, windows).mean(1),
         mean.reshape(-1, windows).mean(1),
     )
-
-
-def _learnt(counter: Counter, random: np.random.Generator, for_s: float) -> float:
-    """Learn the counter's step as the meter does: sleeps end late, in each another."""
-    now, late = random.uniform(0, counter.step_s), random.uniform(0, 2e-3)
-
-    def sleep(seconds: float) -> None:
-        nonlocal now
-        now += seconds + late
-
-    found = learnt_step(lambda: now // counter.step_s, lambda: now, sleep, for_s)
-    assert found is not None
-    return found
 
 
 def _moved(

@@ -18,7 +18,6 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import StudyError
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.quantization.plan import plan_of
-from me2e_compress.runtime.energy.modelled import DEFAULT_PROCESS
 from me2e_compress.runtime.energy.models import measure_energy
 from me2e_compress.runtime.interleaved import record_traces
 from me2e_compress.runtime.providers import CPU
@@ -111,7 +110,7 @@ def _facts_of(
     before = known.get(name)
     if prepared.model is None:
         return ModelFacts(name, failure=prepared.failure)
-    if before and before.modelled_j and before.sha256 == prepared.sha256:
+    if before and before.sha256 == prepared.sha256:
         return (
             before
             if before.latency_us == latency_us
@@ -119,8 +118,7 @@ def _facts_of(
         )
     # otherwise count the graph anew
     module_map = prepared.variant.module_map
-    found = inspect(prepared.model, module_map, None, DEFAULT_PROCESS)
-    modelled = found.modelled_energy
+    found = inspect(prepared.model, module_map)
     return ModelFacts(
         name,
         prepared.sha256,
@@ -130,7 +128,6 @@ def _facts_of(
         found.macs,
         int8_counts(prepared.model),
         latency_us,
-        modelled_j=None if modelled is None else modelled.modelled_j_per_frame,
     )
 
 

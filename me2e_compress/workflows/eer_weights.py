@@ -1,7 +1,6 @@
 """Weights and scales of EER_AV in a file, for later calls to score alike."""
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,9 +11,6 @@ from me2e_compress.metrics.eer import MEASURES, EerResult, EerScale, Normalizati
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_json
 
-Kind = Literal["measured", "modelled"]
-"""Joules counted by a counter, or modelled from MACs and bytes."""
-
 _STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
 _Four = Annotated[dict[str, float], Field(min_length=4, max_length=4)]
 
@@ -22,20 +18,20 @@ _Four = Annotated[dict[str, float], Field(min_length=4, max_length=4)]
 @with_config(_STRICT)
 @dataclasses.dataclass(frozen=True)
 class SavedWeights:
-    """A scale by the names of the measures, and the kind of joules it is for."""
+    """A scale by the names of the measures; its joules are measured."""
 
-    energy: Kind
+    energy: Literal["measured"]
     normalization: Normalization
     weights: _Four
     offset: _Four
     span: _Four
 
     @classmethod
-    def of(cls, scale: EerScale, energy: Kind) -> "SavedWeights":
+    def of(cls, scale: EerScale) -> "SavedWeights":
         """Build the saved form of a scale."""
         columns = (scale.weights, scale.offset, scale.span)
         named = [dict(zip(MEASURES, each, strict=True)) for each in columns]
-        return cls(energy, scale.normalization, *named)
+        return cls("measured", scale.normalization, *named)
 
     @classmethod
     def load(cls, path: Path) -> "SavedWeights":
@@ -60,13 +56,12 @@ class SavedWeights:
         return EerScale(self.normalization, weights, offset, span)
 
 
-def save_weights(path: Path, found: Mapping[Kind, EerResult]) -> None:
-    """Write the scale of measured joules, or of modelled ones where there are none."""
-    kind, result = next(iter(found.items()))
+def save_weights(path: Path, result: EerResult) -> None:
+    """Write the scale that a result was made by."""
     if result.scale is None:
         reason = next(iter(result.scores.values())).measure.reason
         raise EvaluationError(f"{path}: there are no weights to save: {reason}")
-    saved = SavedWeights.of(result.scale, kind)
+    saved = SavedWeights.of(result.scale)
     with drafts.written(path, EvaluationError):
         write_json(path, dataclasses.asdict(saved), indent=1)
 

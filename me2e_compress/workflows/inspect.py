@@ -1,4 +1,4 @@
-"""Inspect a graph: interface; nodes, parameters, MACs, energy and time by module."""
+"""Inspect a graph: interface; nodes, parameters, MACs and time by module."""
 
 import dataclasses
 from collections import Counter
@@ -18,12 +18,6 @@ from me2e_compress.graph.summary import why_uncounted
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
-from me2e_compress.runtime.energy.modelled import (
-    DEFAULT_PROCESS,
-    ModelledEnergy,
-    costs_of,
-    modelled_energy,
-)
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
 from me2e_compress.workflows.inspect_result import InspectResult
@@ -42,7 +36,6 @@ def inspect(
     model: str | Path,
     module_map: str | Path | None = None,
     dims: Mapping[str, int] | None = None,
-    process: str | None = None,
     trace: str | Path | None = None,
     frames: str | Path | None = None,
     listener: Listener = SILENT,
@@ -50,13 +43,11 @@ def inspect(
 ) -> InspectResult:
     """Read a graph, and weigh its modules.
 
-    `dims` are sizes that open dimensions of the inputs are given first. `process`,
-    ``45nm`` or ``7nm``, is the silicon process whose figures model the energy of a
-    frame. The time by module comes from a trace that ``profile`` wrote, or is measured
-    on recorded frames. The adapter's TOML says which outputs are fed back.
+    `dims` are sizes that open dimensions of the inputs are given first. The time by
+    module comes from a trace that ``profile`` wrote, or is measured on recorded frames.
+    The adapter's TOML says which outputs are fed back.
 
     Raises:
-        EnergyError: The process is unknown.
         GraphError: The model does not exist.
         PreconditionError: No input has such a dimension.
         ModuleMapError: The map does not exist.
@@ -64,8 +55,6 @@ def inspect(
         RecipeError: Both a trace and frames are given.
         FramesError: A frame does not fit.
     """
-    if process is not None:
-        costs_of(process)
     if trace is not None and frames is not None:
         raise RecipeError("--trace and --frames: the time is read, or measured")
     # the time by module is read from a trace, or measured here
@@ -76,7 +65,7 @@ def inspect(
     loaded = graph.load(path)
     adapted(loaded, adapter, module_map)
     modules = load_map(module_map, loaded)
-    return inspected(path, loaded, modules, dims, process, taken)
+    return inspected(path, loaded, modules, dims, taken)
 
 
 def inspected(
@@ -84,7 +73,6 @@ def inspected(
     loaded: ir.Model,
     modules: ModuleMap,
     dims: Mapping[str, int] | None = None,
-    process: str | None = None,
     taken: LatencyTrace | None = None,
 ) -> InspectResult:
     """Weigh the modules of a graph; the arguments are those of :func:`inspect`."""
@@ -94,7 +82,7 @@ def inspected(
     placed = assign(loaded, modules)
     inputs, outputs = graph.interface(loaded)
     items = itemise(loaded, modules, placed.module_of)
-    # MACs, activations and energy need shapes, and folded shape arithmetic
+    # MACs and activations need shapes, and folded shape arithmetic
     folded = _folded(loaded, modules)
     costs = {item.module: item for item in _costs(folded, modules)}
     items = tuple(_with_cost(item, costs.get(item.module)) for item in items)
@@ -122,9 +110,6 @@ def inspected(
         lowered(loaded),
         "; ".join(filter(None, (lacking_shapes(loaded), wrong))),
         fed_back,
-        None
-        if process is None
-        else modelled_energy(folded, process, provenance.module_of),
         weights=named_weights(loaded.metadata_props),
         latency_of="" if taken is None else taken.headline,
     )
@@ -145,18 +130,6 @@ def _timed(
 
     options = ProfileOptions(by_module=True, module_map=module_map, adapter=adapter)
     return profile(path, frames, options=options, listener=listener).trace
-
-
-def model_energy(
-    model: str | Path,
-    process: str = DEFAULT_PROCESS,
-    module_map: str | Path | None = None,
-) -> ModelledEnergy:
-    """Model the energy of a frame of a file, by the figures of ``45nm`` or ``7nm``."""
-    costs_of(process)
-    loaded = graph.load(model_path(model))
-    folded = _folded(loaded, load_map(module_map, loaded))
-    return modelled_energy(folded, process, provenance.module_of)
 
 
 def _fed_back(model: ir.Model) -> tuple[dict[str, str], str]:

@@ -4,7 +4,6 @@ import dataclasses
 
 from me2e_compress.graph import Port
 from me2e_compress.graph.modules import Item
-from me2e_compress.runtime.energy.modelled import ModelledEnergy
 from me2e_compress.workflows.result import Result, Table, giga, megabytes, number, table
 
 _SHOWN = 8
@@ -26,7 +25,6 @@ class InspectResult(Result):
         lowered: what was changed for onnxruntime; empty if nothing.
         hint: what the graph lacks; empty if nothing.
         recurrent: outputs that are fed back, by input.
-        modelled_energy: energy of its MACs and bytes; None if not asked for.
         weights: the checkpoint that its metadata names; or empty.
         latency_of: what the shares of time are of; empty if not measured.
     """
@@ -47,7 +45,6 @@ class InspectResult(Result):
     lowered: str = ""
     hint: str = ""
     recurrent: dict[str, str] = dataclasses.field(default_factory=dict)
-    modelled_energy: ModelledEnergy | None = None
     weights: str = ""
     latency_of: str = ""
 
@@ -64,7 +61,7 @@ class InspectResult(Result):
         return tuple(filter(None, (self.hint, self.headline, self.weights)))
 
     def tables(self) -> tuple[Table, ...]:
-        """Return the interface, the modules, and modelled energy if asked for."""
+        """Return the interface and the modules."""
         ports = [
             (kind, port.name, port.type, port.shape)
             for kind, side in (("in", self.inputs), ("out", self.outputs))
@@ -93,11 +90,9 @@ class InspectResult(Result):
         counts = ("nodes", "parameters", "MB", "GMACs", "activations MB")
         # the column of time is only there if it was measured
         columns = ("module", *counts, *time)
-        modelled = self.modelled_energy
         return (
             table("Interface", ("", "name", "type", "shape"), ports, back, words=4),
             table(f"Modules (map {self.map})", columns, rows, note),
-            *(() if modelled is None else modelled.tables()),
         )
 
     def _share(self, item: Item) -> tuple[str, ...]:

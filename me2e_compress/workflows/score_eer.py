@@ -11,9 +11,8 @@ from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
 from me2e_compress.metrics.route_summary import RouteSummary
-from me2e_compress.registry import documents
 from me2e_compress.runtime.energy import EnergyResult
-from me2e_compress.workflows.eer_weights import Kind, SavedWeights, save_weights
+from me2e_compress.workflows.eer_weights import SavedWeights, save_weights
 from me2e_compress.workflows.result import (
     Table,
     counted,
@@ -23,10 +22,6 @@ from me2e_compress.workflows.result import (
     table,
 )
 
-HEADS: Mapping[Kind, str] = {
-    "measured": "EER_AV",
-    "modelled": "EER_AV, modelled energy",
-}
 UNITS = ("%", "%", "ratio", "J")
 
 UNPAIRED = "a drive in each"
@@ -42,76 +37,66 @@ class EerOptions:
     Attributes:
         energy: measured joules of one inference, by folder: a number, or a file that
             ``profile --energy`` wrote. A folder's last part is enough as its name.
-        modelled: joules of one inference that follow from MACs and bytes, by folder: a
-            number, or a file of what ``inspect --modelled-energy 7nm --json`` prints.
-            They make a score of their own, never one with measured joules.
         weights: file of weights and scales that an earlier call saved.
         save_weights: where to write those of this call.
     """
 
     energy: Joules = dataclasses.field(default_factory=dict)
-    modelled: Joules = dataclasses.field(default_factory=dict)
     weights: str | Path | None = None
     save_weights: str | Path | None = None
 
     @property
     def asked(self) -> bool:
         """Whether there is anything to do."""
-        return bool(self.energy or self.modelled or self.weights or self.save_weights)
+        return bool(self.energy or self.weights or self.save_weights)
 
 
 @dataclasses.dataclass(frozen=True)
 class EerScores:
-    """EER_AV by kind of joules, with each kind's rankings by normalization."""
+    """EER_AV of folders, and their order under every normalization."""
 
-    found: Mapping[Kind, EerResult]
-    rankings: Mapping[Kind, Mapping[str, tuple[str, ...]]]
+    found: EerResult
+    rankings: Mapping[str, tuple[str, ...]]
 
     def tables(self) -> tuple[Table, ...]:
         """Return the scores and their weights."""
-        return (self._scores(), *(self._weights(kind) for kind in self._weighed()))
+        scale = self.found.scale
+        return (self._scores(), *(() if scale is None else (self._weights(scale),)))
 
     def lines(self) -> tuple[str, ...]:
         """Return whether the order depends on the normalization."""
-        return tuple(self._order(kind) for kind in self._weighed())
+        if self.found.scale is None:
+            return ()
+        own = self.found.ranking
+        others = {n: order for n, order in self.rankings.items() if order != own}
+        said = f"EER_AV, best first: {', '.join(own)}"
+        if not others:
+            return (f"{said}; the same under every normalization that has weights",)
+        turned = "; ".join(f"{n}: {', '.join(order)}" for n, order in others.items())
+        return (f"{said}; but {turned}",)
 
     def to_json(self) -> dict[str, Any]:
-        """Return scores, scales, routes left out and orders, by kind of joules."""
+        """Return scores, scale, routes left out and orders."""
+        found = self.found
         return {
-            kind: {
-                "scores": {n: each.to_json() for n, each in found.scores.items()},
-                "scale": found.scale
-                and dataclasses.asdict(SavedWeights.of(found.scale, kind)),
-                "left_out": dict(found.left_out),
-                "rankings": {k: list(v) for k, v in self.rankings[kind].items()},
-            }
-            for kind, found in self.found.items()
+            "scores": {n: each.to_json() for n, each in found.scores.items()},
+            "scale": found.scale and dataclasses.asdict(SavedWeights.of(found.scale)),
+            "left_out": dict(found.left_out),
+            "rankings": {k: list(v) for k, v in self.rankings.items()},
         }
-
-    def _weighed(self) -> list[Kind]:
-        return [kind for kind, each in self.found.items() if each.scale is not None]
 
     def _scores(self) -> Table:
-        names = next(iter(self.found.values())).scores
-        columns, rows = ["results"], [[name] for name in names]
-        for kind, result in self.found.items():
-            columns += [HEADS[kind], "95 %", "95 %, other types", "n"]
-            for row, name in zip(rows, names, strict=True):
-                row += estimate_cells(result.scores[name], ".2f")
+        scores = self.found.scores
+        rows = [[n, *estimate_cells(each, ".2f")] for n, each in scores.items()]
         why = {
-            f"{HEADS[kind]} of {name}": each.measure.reason
-            for kind, result in self.found.items()
-            for name, each in result.scores.items()
+            f"EER_AV of {name}": each.measure.reason
+            for name, each in scores.items()
             if each.value is None
         }
-        note = not_measured(why)
-        return table("Driving and energy, points", columns, rows, note)
+        columns = ("results", "EER_AV", "95 %", "95 %, other types", "n")
+        return table("Driving and energy, points", columns, rows, not_measured(why))
 
-    def _weights(self, kind: Kind) -> Table:
-        found = self.found[kind]
-        scale = found.scale
-        if scale is None:
-            return table("Weights", (), ())
+    def _weights(self, scale: EerScale) -> Table:
         # a measure is scaled so that its offset is 0 and offset plus span is 1
         rows = [
             (measure, f"{weight:.3f}", significant(low), significant(low + span), unit)
@@ -119,24 +104,10 @@ class EerScores:
                 MEASURES, scale.weights, scale.offset, scale.span, UNITS, strict=True
             )
         ]
-        left = [f"{n} for want of {name}" for name, n in found.left_out.items()]
+        left = [f"{n} for want of {name}" for name, n in self.found.left_out.items()]
         note = f"Routes left out of all: {', '.join(left)}." if left else ""
         columns = ("measure", "weight", "0 is", "1 is", "unit")
-        return table(
-            f"Weights by CRITIC, {scale.normalization}, {kind} energy",
-            columns,
-            rows,
-            note,
-        )
-
-    def _order(self, kind: Kind) -> str:
-        own = self.found[kind].ranking
-        others = {n: order for n, order in self.rankings[kind].items() if order != own}
-        said = f"EER_AV with {kind} energy, best first: {', '.join(own)}"
-        if not others:
-            return f"{said}; the same under every normalization that has weights"
-        turned = "; ".join(f"{n}: {', '.join(order)}" for n, order in others.items())
-        return f"{said}; but {turned}"
+        return table(f"Weights by CRITIC, {scale.normalization}", columns, rows, note)
 
 
 def score_eer(
@@ -151,35 +122,18 @@ def score_eer(
     """
     if not options.asked:
         return None
-    given: dict[Kind, Joules] = {
-        "measured": options.energy,
-        "modelled": options.modelled,
-    }
-    asked: dict[Kind, Joules] = {kind: each for kind, each in given.items() if each}
-    if not asked:
-        asked["measured"] = {}
-    # saved weights are for one kind of joules
-    scales = dict[Kind, EerScale]()
+    scale = None
     if options.weights is not None:
-        saved = SavedWeights.load(Path(options.weights))
-        if saved.energy not in asked:
-            raise EvaluationError(
-                f"{options.weights}: the weights are for {saved.energy} energy, the"
-                f" joules given are {', '.join(asked)}"
-            )
-        scales = {saved.energy: saved.scale()}
+        scale = SavedWeights.load(Path(options.weights)).scale()
     paired, others = paired_drives(folders)
-    types, found = _types(paired), dict[Kind, EerResult]()
-    orders = dict[Kind, dict[str, tuple[str, ...]]]()
-    # measured and modelled joules make scores of their own
-    for kind, joules in asked.items():
-        variants = _variants(paired, kind, joules)
-        result = eer(variants, scales.get(kind), types=types)
-        left_out = {UNPAIRED: others, **result.left_out} if others else result.left_out
-        found[kind] = dataclasses.replace(result, left_out=left_out)
-        orders[kind] = {str(n): order for n, order in rankings(variants).items()}
+    variants = _variants(paired, options.energy)
+    found = eer(variants, scale, types=_types(paired))
+    if others:
+        left_out = {UNPAIRED: others, **found.left_out}
+        found = dataclasses.replace(found, left_out=left_out)
     if options.save_weights is not None:
         save_weights(Path(options.save_weights), found)
+    orders = {str(n): order for n, order in rankings(variants).items()}
     return EerScores(found, orders)
 
 
@@ -229,11 +183,10 @@ def joules_named(words: Sequence[str]) -> dict[str, str | float]:
 
 
 def _variants(
-    folders: Mapping[str, Sequence[Episode]], kind: Kind, joules: Joules
+    folders: Mapping[str, Sequence[Episode]], joules: Joules
 ) -> dict[str, RouteMeasures]:
     named = {
-        _folder(name, folders): _joules(name, kind, each)
-        for name, each in joules.items()
+        _folder(name, folders): _joules(name, each) for name, each in joules.items()
     }
     return {
         name: route_measures(list(map(RouteSummary.of, episodes)), named.get(name))
@@ -251,30 +204,12 @@ def _folder(name: str, folders: Mapping[str, Sequence[Episode]]) -> str:
     return fitting[0]
 
 
-def _joules(name: str, kind: Kind, given: str | Path | float) -> float | None:
+def _joules(name: str, given: str | Path | float) -> float | None:
     if isinstance(given, (str, Path)):
-        if kind == "modelled":
-            return _modelled(Path(given))
         return EnergyResult.load(Path(given)).j_per_frame
     if not 0.0 <= given < float("inf"):
         raise EvaluationError(f"energy of {name}: {given} is not a number of joules")
     return given
-
-
-def _modelled(path: Path) -> float | None:
-    """Read the joules of the document that ``inspect --json`` prints."""
-    try:
-        document = documents.from_json(documents.content(path))
-        joules = document["modelled_energy"]["modelled_j_per_frame"]
-    except OSError as error:
-        raise EvaluationError(f"{path}: {error.strerror}") from error
-    except (documents.MalformedError, KeyError, TypeError) as error:
-        raise EvaluationError(
-            f"{path}: not what inspect --modelled-energy --json prints: {error}"
-        ) from error
-    if joules is not None and not (isinstance(joules, float) and joules >= 0.0):
-        raise EvaluationError(f"{path}: modelled_j_per_frame: {joules} is not a number")
-    return joules
 
 
 def _types(folders: Mapping[str, Sequence[Episode]]) -> list[str]:

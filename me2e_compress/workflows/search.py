@@ -14,12 +14,7 @@ from me2e_compress.fidelity.sensitivity import search as find
 from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import DEFAULT_TARGET
-from me2e_compress.workflows.budgets import (
-    Joules,
-    check_budgets,
-    joules_here,
-    joules_of,
-)
+from me2e_compress.workflows.budgets import check_budgets, joules_of, need_counter
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.int8_trials import TrialFiles, TrialOptions
 from me2e_compress.workflows.listener import SILENT, Listener
@@ -33,8 +28,7 @@ class SearchOptions(TrialOptions):
     Attributes:
         max_mb: most MB of weights.
         max_ms: most milliseconds per frame, on this CPU, so for its target alone.
-        max_joules: most joules per frame: measured where a counter answers, else
-            modelled.
+        max_joules: most joules per frame, as a counter measures them.
     """
 
     max_mb: float | None = None
@@ -129,7 +123,7 @@ def search(
     Raises:
         GraphError: The model does not exist, or the output would harm an input.
         RecipeError: There is no such scheme, rule set or target.
-        EnergyError: A counter that answers is not usable.
+        EnergyError: No counter answers, or one is not usable.
         FramesError: Frames or saved ranges do not fit.
         PreconditionError: The graph is quantized already, or nothing can become int8.
         EvaluationError: Nothing fits; the message says what the least was.
@@ -142,6 +136,8 @@ def search(
 def _search(
     files: TrialFiles, options: SearchOptions, listener: Listener
 ) -> SearchResult:
+    if options.max_joules is not None:
+        need_counter()
     # calibrate once, then search variants of that one graph
     trials, modules = files.trials(options, listener)
     budgets = _budgets(options, trials)
@@ -162,9 +158,8 @@ def _budgets(options: SearchOptions, trials: Trials) -> list[Budget]:
         seconds = partial(_seconds, trials, options.threads)
         found.append(Budget(options.max_ms / 1e3, "s", seconds))
     if options.max_joules is not None:
-        kind = joules_here()
-        joules = partial(_joules, trials, options.threads, kind)
-        found.append(Budget(options.max_joules, kind, joules))
+        joules = partial(_joules, trials, options.threads)
+        found.append(Budget(options.max_joules, "J", joules))
     return found
 
 
@@ -172,20 +167,14 @@ def _weight_bytes(made: ir.Model) -> float:
     return float(graph.size(made).weight_bytes)
 
 
-def _joules(trials: Trials, threads: int, kind: Joules, made: ir.Model) -> float:
-    # energy is measured or modelled for a file
+def _joules(trials: Trials, threads: int, made: ir.Model) -> float:
+    # energy is measured of a file
     reference = trials.reference
     with TemporaryDirectory() as folder:
         file = Path(folder) / "int8.onnx"
         graph.save(made, file)
-        found = joules_of(
-            kind,
-            {"int8": file},
-            reference.frames,
-            threads=threads,
-            provider=reference.session.provider,
-        )
-    return found["int8"]
+        provider = reference.session.provider
+        return joules_of(file, reference.frames, threads=threads, provider=provider)
 
 
 def _seconds(trials: Trials, threads: int, made: ir.Model) -> float:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pynvml
 import pytest
 
 from me2e_compress.metrics.episode import Ending
@@ -18,6 +19,7 @@ from tests.command import Cli
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
 from tests.frames import record
 from tests.nets import save_text
+from tests.runtime.energy.opened import Driver
 from tests.simulator.world.driving import route_of
 from tests.workflows.test_check_model import ADAPTER, tcp_like
 
@@ -147,11 +149,11 @@ def test_joules_are_shown_and_written(cli: Cli, dense: Path) -> None:
 
 
 def test_no_counter_is_no_figure_and_one_that_stands_still_is_an_error(
-    cli: Cli, dense: Path
+    cli: Cli, dense: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    line = JOULES.replace("recorded:orin.json", 'rapl{root="nowhere"}')
-    shown = cli.document(line)
-    reason = "no energy counter answers (rapl: no nowhere)"
+    Driver(monkeypatch, init=-pynvml.NVML_ERROR_LIBRARY_NOT_FOUND)
+    shown = cli.document(JOULES.replace("recorded:orin.json", "nvml"))
+    reason = "no energy counter answers (nvml: NVML Shared Library Not Found)"
     assert (shown["energy"]["joules"], shown["energy"]["reason"]) == (None, reason)
     assert f"energy: not measured: {reason}" in shown["verdict"]
     write_power(dense, watts=0.0)

@@ -83,17 +83,6 @@ def test_a_plugin_s_macs_are_unknown_and_a_sum_is_a_lower_bound(
     assert "at least 2.000, 1 node not counted" in cli.done(IN).out
 
 
-def test_modelled_energy_has_a_key_of_its_own_and_is_not_called_measured(
-    cli: Cli, dense: Path
-) -> None:
-    shown = cli.document("inspect dense.onnx --modelled-energy 7nm")["modelled_energy"]
-    assert shown["macs"] == {"float32": 4 * 16 * 32}
-    assert shown["modelled_j_per_frame"] > 0
-    words = cli.done("inspect dense.onnx --modelled-energy 45nm").words
-    assert "Modelled energy (45nm), not measured" in words
-    assert "Horowitz, ISSCC 2014" in words
-
-
 @pytest.fixture
 def trace(files: Path) -> LatencyTrace:
     """One of in.onnx, which is saved as t.json."""

@@ -107,7 +107,6 @@ OTHERS = {
     "frames vad-huge -o out": "no stack 'vad-huge' in the zoo",
     "plan latin.json": r"latin\.json: not a plan",
     "plan dense.onnx --against none.onnx": "none.onnx: no such file; models",
-    "inspect dense.onnx --modelled-energy 1nm": "no process '1nm'; there are 45nm, 7nm",
     "inspect dense.onnx --trace t.json --frames frames": "--trace and --frames",
     "inspect open.onnx --set-dim n": "write NAME=SIZE, e.g. batch=1",
     "inspect open.onnx --set-dim n=x": "write NAME=SIZE, e.g. batch=1",
@@ -133,7 +132,7 @@ OTHERS = {
     "demo -o out --routes 0": "0 routes were asked for",
     "demo -o out --recipe half": "no recipe half",
     f"{TIMED} --figure tail.gif": r"tail\.gif: a figure ends in \.png",
-    f"{TIMED} --energy sun": "no energy counter 'sun'; there are auto, nvml",
+    f"{TIMED} --energy sun": "no energy counter 'sun'; there are nvml, recorded",
     f"{TIMED} --energy recorded:no.csv": r"no\.csv: No such file",
     f"{TIMED} --energy-out j.json": "there is no --energy to write",
 }

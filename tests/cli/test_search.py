@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ from tests.command import Cli, write_frames
 from tests.evaluators.highway.drivers import PARKED, straight_on
 from tests.metrics.drives import drive as by_hand
 
-MODELLED = "modelled J"
 F = "dense.onnx frames --map map.toml -o r.toml"
 
 
@@ -72,12 +72,17 @@ def test_programs_get_json_and_the_recipe(
 def test_search_keeps_size_time_and_energy_at_once(
     cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("me2e_compress.workflows.search.joules_here", lambda: MODELLED)
+    battery = SimpleNamespace(j_per_frame=0.5)
+    budgets = "me2e_compress.workflows.budgets"
+    monkeypatch.setattr(f"{budgets}.open_counter", lambda: None)
+    monkeypatch.setattr(
+        f"{budgets}.measure_energy", lambda models, *_, **__: {"model": battery}
+    )
 
     found = cli.document(f"search {F} --max-ms 10000 --max-mb 1 --max-joules 1")
 
     units = [each["unit"] for each in found["budgets"]]
-    assert units == ["bytes of weights", "s", MODELLED]
+    assert units == ["bytes of weights", "s", "J"]
     assert len(found["tried"][-1]["measured_costs"]) == 3
 
 

@@ -18,6 +18,16 @@ from tests.installed import install
 __all__ = ["cli", "command"]
 
 
+@pytest.mark.parametrize(
+    "line", ["inspect highway --modelled-energy 7nm", "score results --modelled a=1"]
+)
+def test_modelled_energy_is_a_usage_error(line: str, cli: Cli) -> None:
+    refused = cli(line)
+
+    assert refused.code == 2
+    assert "is gone since 0.3.0: use" in refused.err
+
+
 @pytest.mark.parametrize("line", ["plan highway", "compress highway -o m.onnx"])
 @pytest.mark.parametrize("flag", ["--weight-only-gemv", "--weight-only-gemv=1"])
 def test_an_option_that_is_gone_is_a_usage_error(

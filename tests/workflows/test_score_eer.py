@@ -45,27 +45,11 @@ def test_every_folder_has_a_score_by_its_own_joules() -> None:
     found = score_eer(FOLDERS, EerOptions({"fast": 2.0, "runs/slow": 3.0}))
 
     assert found is not None
-    scale = found.found["measured"].scale
+    scale = found.found.scale
     assert scale is not None
     # 9 and 5 decisions of 2 J, 20 and 14 of 3 J
     assert (scale.offset[3], scale.offset[3] + scale.span[3]) == (10.0, 60.0)
-    assert set(found.found) == {"measured"}
-    assert len(found.found["measured"].ranking) == 2
-
-
-def test_modelled_joules_make_a_column_of_their_own() -> None:
-    found = score_eer(
-        FOLDERS, EerOptions({"fast": 2.0}, modelled={"fast": 0.5, "slow": 0.1})
-    )
-
-    assert found is not None
-    (scores, *_) = found.tables()
-    assert scores.columns[1] == "EER_AV"
-    assert scores.columns[5] == "EER_AV, modelled energy"
-    (_, slow) = scores.rows
-    assert slow[1].text == "-"
-    assert scores.note.endswith("EER_AV of runs/slow (energy: not measured).")
-    assert slow[5].text != "-"
+    assert len(found.found.ranking) == 2
 
 
 def test_joules_come_from_a_file(tmp_path: Path) -> None:
@@ -80,35 +64,6 @@ def test_joules_come_from_a_file(tmp_path: Path) -> None:
     assert found.to_json() == given.to_json()
 
 
-def test_modelled_joules_come_from_what_inspect_prints(tmp_path: Path) -> None:
-    file = tmp_path / "inspected.json"
-    file.write_text('{"modelled_energy": {"modelled_j_per_frame": 0.5}}')
-
-    found = score_eer(FOLDERS, EerOptions(modelled={"fast": file, "slow": 1.0}))
-    given = score_eer(FOLDERS, EerOptions(modelled={"fast": 0.5, "slow": 1.0}))
-
-    assert found is not None
-    assert given is not None
-    assert found.to_json() == given.to_json()
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "{}",
-        '{"modelled_energy": null}',
-        '{"modelled_energy": {"modelled_j_per_frame": "1"}}',
-        "[",
-    ],
-)
-def test_a_document_without_modelled_joules_is_named(tmp_path: Path, text: str) -> None:
-    (tmp_path / "inspected.json").write_text(text)
-    options = EerOptions(modelled={"fast": tmp_path / "inspected.json"})
-
-    with pytest.raises(EvaluationError, match=r"inspected\.json: "):
-        score_eer(FOLDERS, options)
-
-
 def test_weights_are_saved_and_used_again(tmp_path: Path) -> None:
     joules, file = {"fast": 2.0, "slow": 3.0}, tmp_path / "weights.json"
     first = score_eer(FOLDERS, EerOptions(joules, save_weights=file))
@@ -117,18 +72,8 @@ def test_weights_are_saved_and_used_again(tmp_path: Path) -> None:
 
     assert first is not None
     assert again is not None
-    there, here = (
-        each.found["measured"].scores["runs/slow"] for each in (first, again)
-    )
+    there, here = (each.found.scores["runs/slow"] for each in (first, again))
     assert here.value == pytest.approx(there.value)
-
-
-def test_weights_for_other_joules_are_refused(tmp_path: Path) -> None:
-    joules, file = {"fast": 2.0, "slow": 3.0}, tmp_path / "weights.json"
-    score_eer(FOLDERS, EerOptions(modelled=joules, save_weights=file))
-
-    with pytest.raises(EvaluationError, match="are for modelled energy, the jou"):
-        score_eer(FOLDERS, EerOptions(joules, weights=file))
 
 
 @pytest.mark.parametrize(
@@ -136,7 +81,7 @@ def test_weights_for_other_joules_are_refused(tmp_path: Path) -> None:
     [
         ("span", {"energy": 0.0}, "a span or a weight is not positive"),
         ("weights", {"joy": 1.0}, "weights: Dictionary should have at most 4"),
-        ("energy", "guessed", "energy: Input should be 'measured' or 'modelled'"),
+        ("energy", "modelled", "energy: Input should be 'measured'"),
     ],
 )
 def test_spoiled_weights_are_one_line(
@@ -164,8 +109,8 @@ def test_what_one_real_run_lacks_is_left_out_of_all() -> None:
     found = score_eer(real, EerOptions({"fast": 2.0, "slow": 3.0}))
 
     assert found is not None
-    assert found.found["measured"].left_out == {"a drive in each": 1}
-    assert found.found["measured"].scores["runs/slow"].n == 2
+    assert found.found.left_out == {"a drive in each": 1}
+    assert found.found.scores["runs/slow"].n == 2
 
 
 def test_no_joules_no_score() -> None:
@@ -178,7 +123,6 @@ def test_no_joules_no_score() -> None:
         (EerOptions({"other": 2.0}), "energy of other: 0 folders of that name"),
         (EerOptions({"fast": -1.0}), "energy of fast: -1.0 is not a number of joules"),
         (EerOptions({"fast": float("nan")}), "nan is not a number of joules"),
-        (EerOptions(modelled={"fast": "a.json"}), "a.json: No such file"),
         (EerOptions(weights="no.json"), "no.json: No such file"),
     ],
 )
@@ -231,5 +175,5 @@ def test_the_command_prints_what_the_page_says(tmp_path: Path) -> None:
 
     document = json.loads(result.stdout)
     assert faults("score", document) == []
-    scores = document["eer"]["measured"]["scores"]
+    scores = document["eer"]["scores"]
     assert {Path(name).name for name in scores} == {"fast", "slow"}

@@ -15,10 +15,6 @@ def inspect(
     model: given.Model,
     module_map: given.ModuleMap = None,
     set_dim: given.SetDim = None,
-    modelled_energy: Annotated[
-        str | None,
-        typer.Option(help="joules by published figures of 7nm or 45nm"),
-    ] = None,
     trace: Annotated[
         Path | None, typer.Option(help="latencies by module, of profile --by-module")
     ] = None,
@@ -32,6 +28,6 @@ def inspect(
     """
     dims = sizes(set_dim or ())
     with listening() as listener:
-        read = module_map, dims, modelled_energy, trace, frames, listener, adapter
+        read = module_map, dims, trace, frames, listener, adapter
         found = workflow.inspect(model, *read)
     show(found)

@@ -31,7 +31,7 @@ def profile(
     ] = None,
     energy: Annotated[
         str | None,
-        typer.Option(help="joules too: auto, nvml, ina3221, rapl, recorded:FILE"),
+        typer.Option(help="joules too: auto, nvml, recorded:FILE"),
     ] = None,
     energy_out: Annotated[
         Path | None, typer.Option(help="joules as JSON; beside the trace if not named")

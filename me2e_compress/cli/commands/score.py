@@ -30,10 +30,6 @@ Joules = Annotated[
     list[str] | None,
     typer.Option(help="NAME=JOULES or NAME=FILE: of an inference; gives EER_AV"),
 ]
-Modelled = Annotated[
-    list[str] | None,
-    typer.Option(help="NAME=JOULES or FILE, by MACs and bytes; an EER_AV of its own"),
-]
 Weights = Annotated[
     Path | None,
     typer.Option(help="file of weights: of EER_AV, as --save-weights wrote them"),
@@ -50,14 +46,13 @@ def score(
     rules: AbilityRules = None,
     penalties: Penalties = None,
     joules: Joules = None,
-    modelled: Modelled = None,
     weights: Weights = None,
     save_weights: SaveWeights = None,
     budget_ms: given.Budget = BUDGET_MS,
 ) -> None:
     """Print driving score, success rate, efficiency, comfort and abilities.
 
-    With --joules or --modelled also EER_AV, which compares all folders. The other
+    With --joules also EER_AV, which compares all folders. The other
     options but --budget-ms and --json are about results of real runs in CARLA.
     """
     # options of real runs are passed on only if one was given
@@ -73,12 +68,7 @@ def score(
             *results,
             listener=listener,
             real=options if asked else None,
-            eer=EerOptions(
-                joules_named(joules or ()),
-                joules_named(modelled or ()),
-                weights,
-                save_weights,
-            ),
+            eer=EerOptions(joules_named(joules or ()), weights, save_weights),
             budget_ms=budget_ms,
         )
     show(found)

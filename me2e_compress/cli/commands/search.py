@@ -11,7 +11,7 @@ from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows import search as workflow
 from me2e_compress.workflows.checks import sizes
 
-MAX_JOULES = "most joules a frame: measured by a counter, else modelled"
+MAX_JOULES = "most joules a frame, measured by a counter"
 MaxMb = Annotated[float | None, typer.Option(help="most MB of weights")]
 MaxMs = Annotated[
     float | None, typer.Option(help="most milliseconds a frame, on this CPU")

@@ -1,4 +1,4 @@
-"""Energy of a model, either measured by a device counter or modelled."""
+"""Energy of a model, measured by a counter of the device."""
 
 from me2e_compress.runtime.energy.energy_result import EnergyResult
 

@@ -41,7 +41,7 @@ class EnergyResult(Displayed):
         high: likewise.
         windows: number of windows.
         window_s: mean seconds of a window.
-        counter: ``nvml-total``, ``rapl``, ``ina3221`` or another.
+        counter: ``nvml-total`` or another.
         counter_step_s: seconds between its updates.
         idle_w: watts of the idle device; with the model loaded, mean of before and
             after.
@@ -54,7 +54,6 @@ class EnergyResult(Displayed):
         model_sha256: digest of the model that ran; None if unknown.
         window_j_per_frame: joules per frame of each window.
         power_j_per_frame: by integrated power; beside the counter.
-        warnings: reasons to doubt the figure.
     """
 
     joules: NotNegative | None = None
@@ -77,7 +76,6 @@ class EnergyResult(Displayed):
     model_sha256: str | None = None
     window_j_per_frame: tuple[Finite, ...] = ()
     power_j_per_frame: NotNegative | None = None
-    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check that there is either a figure with its interval, or a reason."""
@@ -115,7 +113,7 @@ class EnergyResult(Displayed):
         throttled = (f"energy: the device slowed itself down: {slowed}",)
         # A counter that disagrees with integrated power is suspect.
         apart = self.power_apart
-        found = self.warnings + (throttled if slowed else ())
+        found = throttled if slowed else ()
         if apart is None or abs(apart) <= FURTHEST_APART:
             return found
         line = (
@@ -186,17 +184,15 @@ def summarise(
     *,
     states: Sequence[DeviceState] = (),
     power_j_per_frame: float | None = None,
-    warnings: tuple[str, ...] = (),
 ) -> EnergyResult:
     """Return the energy result of one model.
 
     ``idle_w`` is None where the idle device was not measured; ``states`` are those
     before and after each window.
     """
-    found = estimate(windows, by.step_s, idle_w)
-    # Pauses between frames are not part of a frame's time.
+    found = estimate(windows, by.step_s)
     frames = sum(each.frames for each in windows)
-    frame_s = sum(each.taken_s - each.paused_s for each in windows) / frames
+    frame_s = sum(each.taken_s for each in windows) / frames
     # Not every device reports temperatures or clocks.
     warmth = [e.temperature_c for e in states if e.temperature_c is not None]
     throttled = dict.fromkeys(reason for each in states for reason in each.throttled)
@@ -221,7 +217,6 @@ def summarise(
         scope=by.scope,
         window_j_per_frame=tuple(each.joules / each.frames for each in windows),
         power_j_per_frame=power_j_per_frame,
-        warnings=warnings,
     )
 
 

@@ -11,13 +11,12 @@ from statistics import fmean, median
 import numpy as np
 
 from me2e_compress.errors import EnergyError
-from me2e_compress.runtime.energy.counter_step import learnt_step
 from me2e_compress.runtime.energy.energy_result import (
     CountedBy,
     EnergyResult,
     summarise,
 )
-from me2e_compress.runtime.energy.estimate import BEATS, Window, beat, detuning
+from me2e_compress.runtime.energy.estimate import Window
 from me2e_compress.runtime.energy.power import (
     FEWEST_SAMPLES,
     SAMPLED_S,
@@ -32,9 +31,6 @@ Work = Callable[[], object]
 Every = Callable[[float, Callable[[], None]], AbstractContextManager[None]]
 """Calls a function every so many seconds while the context is open."""
 
-_SHORTEST_PAUSE_S = 1e-3
-"""Shorter pauses are not reliable; they are accumulated."""
-
 
 @dataclass(frozen=True)
 class _Span:
@@ -44,7 +40,6 @@ class _Span:
     end_s: float
     frames: int
     joules: float | None
-    paused_s: float = 0.0
     states: tuple[DeviceState, ...] = ()
 
 
@@ -84,42 +79,28 @@ class EnergyMeter:
             else contextlib.nullcontext()
         ):
             # Idle and warm up before the windows.
-            first, step_s = self._idle_and_step()
-            idle = [first]
+            idle = [self._idle()]
             frame_s = self._warm_up(work)
             # Alternate the models, so that drift falls on all alike.
             for done, name in enumerate(turns):
                 self._on_window(done, len(turns), name)
-                spans[name].append(self._work(work[name], frame_s[name], step_s))
+                spans[name].append(self._work(work[name], frame_s[name]))
             self._on_window(len(turns), len(turns), turns[-1])
             self._sleep(self._schedule.lead_in_s)
-            idle.append(self._idle(self._sleep))
+            idle.append(self._idle())
             self._sleep(2 * SAMPLED_S)  # the last sample of power lies behind it
         # Idle power is the mean of before and after.
         idle_w = fmean(self._window(each).watts for each in idle)
-        return {
-            name: self._result(spans[name], step_s, idle_w, frame_s[name])
-            for name in work
-        }
+        return {name: self._result(spans[name], idle_w) for name in work}
 
-    def _result(
-        self, spans: Sequence[_Span], step_s: float, idle_w: float, frame_s: float
-    ) -> EnergyResult:
-        reader, frames = self._reader, spans[0].frames
-        pause = detuning(frame_s, frames, step_s)
-        # Warn if even the pauses leave frames in step.
-        left = beat(frame_s + pause, frames, step_s)
-        warnings = (
-            f"energy: frames of {frame_s * 1e3:.1f} ms keep step with the counter"
-            f" ({step_s * 1e3:.0f} ms), which sees only a part of each",
-        )
+    def _result(self, spans: Sequence[_Span], idle_w: float) -> EnergyResult:
+        reader = self._reader
         return summarise(
             [self._window(each) for each in spans],
-            CountedBy(reader.counter, reader.device, reader.scope, step_s),
+            CountedBy(reader.counter, reader.device, reader.scope, reader.step_s),
             idle_w,
             states=[state for each in spans for state in each.states],
             power_j_per_frame=self._by_power(spans),
-            warnings=warnings if left > BEATS else (),
         )
 
     def _by_power(self, spans: Sequence[_Span]) -> float | None:
@@ -135,25 +116,11 @@ class EnergyMeter:
         joules = span.joules
         if joules is None:
             joules = self._power.joules(span.begin_s, span.end_s)
-        return Window(span.begin_s, span.end_s, span.frames, joules, span.paused_s)
+        return Window(span.begin_s, span.end_s, span.frames, joules)
 
-    def _idle_and_step(self) -> tuple[_Span, float]:
-        """Measure the idle device, and meanwhile the counter's step if none is told."""
-        reader, steps = self._reader, list[float]()
-
-        def watch(for_s: float) -> None:
-            found = learnt_step(reader.joules, self._clock, self._sleep, for_s)
-            if found is None:
-                raise EnergyError(self._says(f"stands still at {reader.joules():g} J"))
-            steps.append(found)
-
-        told = reader.step_s or (None if reader.counts else SAMPLED_S)
-        span = self._idle(watch if told is None else self._sleep)
-        return span, told or steps[0]
-
-    def _idle(self, wait: Callable[[float], None]) -> _Span:
+    def _idle(self) -> _Span:
         begin, before = self._read()
-        wait(self._schedule.idle_s)
+        self._sleep(self._schedule.idle_s)
         end, after = self._read()
         return _Span(begin, end, 0, self._moved(before, after, end - begin))
 
@@ -173,33 +140,20 @@ class EnergyMeter:
             times.append(self._clock())
         return [after - before for before, after in pairwise(times)]
 
-    def _work(self, run: Work, frame_s: float, step_s: float) -> _Span:
+    def _work(self, run: Work, frame_s: float) -> _Span:
         """Run one window at a random phase of the counter."""
         frames = self._schedule.frames(frame_s)
-        pause = detuning(frame_s, frames, step_s)
         # The lead-in follows the wait: caches must hold this model.
-        self._sleep(float(self._random.uniform(0, step_s)))
+        self._sleep(float(self._random.uniform(0, self._reader.step_s)))
         first = self._reader.state()
         self._lead_in(run)
         begin, before = self._read()
-        paused = self._frames(run, frames, pause)
+        for _ in range(frames):
+            run()
         end, after = self._read()
         joules = self._moved(before, after, end - begin)
         states = (first, self._reader.state())
-        return _Span(begin, end, frames, joules, paused, states)
-
-    def _frames(self, run: Work, frames: int, pause: float) -> float:
-        """Run frames with pauses between; return the seconds spent in pauses."""
-        owed, paused = 0.0, 0.0
-        for _ in range(frames):
-            run()
-            owed += pause
-            if owed >= _SHORTEST_PAUSE_S:
-                begun = self._clock()
-                self._sleep(owed)
-                taken = self._clock() - begun
-                owed, paused = owed - taken, paused + taken
-        return paused
+        return _Span(begin, end, frames, joules, states)
 
     def _read(self) -> tuple[float, float]:
         """Return the time and the joules; 0 joules where power is integrated."""

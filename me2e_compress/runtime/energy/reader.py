@@ -3,7 +3,6 @@
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -22,7 +21,7 @@ class Reader(abc.ABC):
         counter: name of the counter, for the result.
         device: name of the device.
         scope: what is counted: a board, packages, rails.
-        step_s: seconds between updates, if the device tells; else None.
+        step_s: seconds between updates; 0.1, as GPUs have it, where nothing says so.
         counts: whether it counts energy; otherwise its power is integrated.
         tells_power: whether it reads power.
     """
@@ -30,7 +29,7 @@ class Reader(abc.ABC):
     counter: str
     device: str
     scope: str
-    step_s: float | None = None
+    step_s: float = 0.1
     counts: bool = True
     tells_power: bool = False
 
@@ -64,11 +63,3 @@ class Absent:
     """A counter that is missing or may not be read, with the reason."""
 
     reason: str
-
-
-def text_in(path: Path) -> str:
-    """Return the text of a file of the system; empty if it cannot be read."""
-    try:
-        return path.read_text().strip()
-    except OSError:
-        return ""

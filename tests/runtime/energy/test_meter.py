@@ -1,17 +1,11 @@
 """The meter finds what a device takes, in turn, and refuses a counter that fails."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from itertools import groupby
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from me2e_compress.errors import EnergyError
-from me2e_compress.runtime.energy.counter_step import learnt_step
 from me2e_compress.runtime.energy.energy_result import EnergyResult
 from me2e_compress.runtime.energy.meter import EnergyMeter
 from me2e_compress.runtime.energy.schedule import EnergySchedule
@@ -49,7 +43,7 @@ def test_joules_windows_and_the_device_are_told() -> None:
     # as the schedule says
     assert (found.windows, found.frames) == (6, 6 * 67)
     assert found.window_s == pytest.approx(2.01, abs=0.02)
-    assert found.counter_step_s == pytest.approx(0.1, rel=2e-3)
+    assert found.counter_step_s == 0.1
     said = found.counter, found.device, found.scope
     assert said == ("simulated", "a device", "board")
     first, last = found.temperature or (1, 0)
@@ -117,15 +111,6 @@ def test_power_that_is_read_too_seldom_spoils_no_counter() -> None:
     assert found.power_j_per_frame is None
 
 
-def test_frames_that_keep_step_with_the_counter_are_held_up() -> None:
-    world = World()
-    found = measured(world, frame_s=0.1)
-
-    assert found.window_s == pytest.approx(2.1, abs=1e-3)
-    assert found.j_per_frame == pytest.approx(30.0, rel=0.02)
-    assert found.warnings == ()
-
-
 @pytest.mark.parametrize("frame_s", [0.013, 0.05, 0.1])
 def test_a_counter_that_looks_part_of_the_time_is_held(frame_s: float) -> None:
     parts = (0.7 * frame_s, 300, 0.3 * frame_s, 100)
@@ -139,49 +124,6 @@ def test_a_counter_that_looks_part_of_the_time_is_held(frame_s: float) -> None:
     assert held >= 21  # of 25 at 95 %, 1 time in 200 fewer
 
 
-@given(st.floats(0.02, 0.5), st.floats(0.0, 1.0), st.integers(0, 2**32 - 1))
-def test_the_step_is_learnt_to_a_poll_over_the_idle_window(
-    step_s: float, phase: float, seed: int
-) -> None:
-    random, now = np.random.default_rng(seed), phase * step_s
-
-    def sleep(seconds: float) -> None:
-        nonlocal now
-        now += seconds + float(random.exponential(2e-4))  # sleeps end late
-
-    found = learnt_step(lambda: now // step_s, lambda: now, sleep, 10.0)
-
-    assert found == pytest.approx(step_s, rel=1e-3)
-    assert now - phase * step_s < 13.0
-
-
-def late(sleep: Callable[[float], None], seconds: float) -> None:
-    sleep(seconds + 1.1e-3)
-
-
-@pytest.mark.parametrize("frame_s", [0.033, 0.05, 0.1, 0.2])
-def test_a_learnt_step_is_good_enough_to_hold_frames_up(frame_s: float) -> None:
-    parts = (0.7 * frame_s, 300, 0.3 * frame_s, 100)
-    widths = []
-    for seed in range(5):
-        world, schedule = World(sensed=0.25), EnergySchedule(seed=seed)
-        exactly, world.now = world.sleep, 0.03 + 0.001 * seed
-        # a sleep ends late, so that polls and steps are no multiples of each other
-        world.sleep = partial(late, exactly)  # type: ignore[method-assign]
-        found = meter(world, schedule).measure({"m": world.model("m", *parts)})["m"]
-        widths.append(((found.high or 9e9) - (found.low or 0)) / (240 * frame_s))
-
-    assert max(widths) < 0.02  # 0.1 to 0.4 where five steps tell it
-
-
-def test_a_counter_that_stops_while_its_step_is_learnt_is_an_error() -> None:
-    world = World()
-    world.joules = lambda: min(world.now // 0.1, 9.0)  # type: ignore[method-assign]
-
-    with pytest.raises(EnergyError, match="stands still at 9 J"):
-        measured(world)
-
-
 def test_a_counter_that_stands_still_is_an_error() -> None:
     world = World()
     world.joules = lambda: 7.0  # type: ignore[method-assign]
@@ -190,10 +132,8 @@ def test_a_counter_that_stands_still_is_an_error() -> None:
         measured(world)
 
 
-@pytest.mark.parametrize("step_s", [None, 0.1])
-def test_a_counter_that_goes_back_is_an_error(step_s: float | None) -> None:
+def test_a_counter_that_goes_back_is_an_error() -> None:
     world = World()
-    world.step_s = step_s
     world.joules = lambda: 900.0 - world.now  # type: ignore[method-assign]
 
     with pytest.raises(EnergyError, match="simulated of a device went back from"):

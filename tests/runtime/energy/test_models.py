@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import pynvml
 import pytest
 
 from me2e_compress.errors import EnergyError
@@ -13,6 +14,7 @@ from me2e_compress.runtime.energy.schedule import EnergySchedule
 from me2e_compress.runtime.frames import Array, Frame
 from tests.installed import install
 from tests.runtime.energy.clockwork import Clock
+from tests.runtime.energy.opened import Driver
 
 MODEL = """<ir_version: 8, opset_import: ["" : 17]>
 counter (float[2] x, float[2] total) => (float[2] total_out)
@@ -56,14 +58,16 @@ def test_any_packages_counter_measures_models_in_turn(model: Path) -> None:
     assert Clock.closed == closed + 1
 
 
-def test_without_a_counter_nothing_runs(tmp_path: Path) -> None:
+def test_without_a_counter_nothing_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "m.onnx").write_bytes(b"no model")
-    text = f'rapl{{root="{tmp_path / "nowhere"}"}}'
+    Driver(monkeypatch, init=-pynvml.NVML_ERROR_LIBRARY_NOT_FOUND)
 
-    found = measure_energy({"m": tmp_path / "m.onnx"}, FRAMES, text)["m"]
+    found = measure_energy({"m": tmp_path / "m.onnx"}, FRAMES, "nvml")["m"]
 
     assert found.j_per_frame is None
-    assert "rapl: no " in found.reason
+    assert "nvml: NVML Shared Library Not Found" in found.reason
 
 
 def test_a_recording_is_of_one_model(model: Path, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ class World(Reader):
         readings: of the counter.
     """
 
-    counter, device, scope = "simulated", "a device", "board"
+    counter, device, scope, step_s = "simulated", "a device", "board", STEP_S
 
     def __init__(
         self, idle_w: float = 50.0, tells_power: bool = False, sensed: float = 1.0

@@ -7,7 +7,8 @@ from typing import ClassVar
 
 from me2e_compress.errors import EnergyError
 from me2e_compress.runtime.energy.energy_counter import EnergyCounter
-from me2e_compress.runtime.energy.reader import Absent, Reader, text_in
+from me2e_compress.runtime.energy.reader import Absent, Reader
+from me2e_counters import text_in
 
 INPUTS = ("VDD_IN", "POM_5V_IN")
 """Rails that feed the module (Xavier NX, Orin NX and Nano, TX2; Nano). All others
@@ -89,7 +90,7 @@ class Ina3221Reader(Reader):
         )
         rails = " + ".join(each.label for each in channels)
         self.scope = f"{rails} ({averaging})" if averaging else rails
-        self.step_s = _seconds(text_in(sensors[0] / "update_interval"))
+        self.step_s = _seconds(text_in(sensors[0] / "update_interval")) or self.step_s
 
     def watts(self) -> float:
         """Return the summed power of the chosen rails."""
