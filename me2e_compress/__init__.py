@@ -54,7 +54,6 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.profile_result import ProfileResult
     from me2e_compress.workflows.ranges import RangesResult, ranges
     from me2e_compress.workflows.score import ScoreResult, score
-    from me2e_compress.workflows.score_bench2drive import Bench2DriveOptions
     from me2e_compress.workflows.score_eer import EerOptions
     from me2e_compress.workflows.search import SearchOptions, SearchResult, search
     from me2e_compress.workflows.sensitivity import (
@@ -66,7 +65,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "PASSES",
-    "Bench2DriveOptions",
     "BuildOptions",
     "CalibrateOptions",
     "CalibrateResult",
@@ -175,7 +173,6 @@ _ROOMS = {
     "workflows.profile_result": ("ProfileResult",),
     "workflows.ranges": ("RangesResult", "ranges"),
     "workflows.score": ("ScoreResult", "score"),
-    "workflows.score_bench2drive": ("Bench2DriveOptions",),
     "workflows.score_eer": ("EerOptions",),
     "workflows.search": ("SearchOptions", "SearchResult", "search"),
     "workflows.sensitivity": (

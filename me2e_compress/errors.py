@@ -50,6 +50,9 @@ FORMER = {
     "energy counter rapl": f"rapl {_NOW} examples/energy_counters",
     "energy counter ina3221": f"ina3221 {_NOW} examples/energy_counters",
     "--modelled-energy": f"--modelled-energy {_NOW} the MACs and MB of `inspect`",
+    "--junctions": "--junctions is gone since 0.3.0: such routes are not judged",
+    "--abilities": "--abilities is gone since 0.3.0: the rules are those of 0.0.4",
+    "--penalties": "--penalties is gone since 0.3.0: they are Bench2Drive's",
     "--modelled": f"--modelled {_NOW} --joules, measured",
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""

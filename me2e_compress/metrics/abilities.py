@@ -1,19 +1,13 @@
 """Bench2Drive's five abilities: which routes count as successes, and the rates.
 
 A route counts under every ability that it tests; routes without a record are not
-counted. For Traffic_Signs a route also *passes the junction* (J) if the ego came more
-than 8 m into it and ran no stop sign or red light. In Bench2Drive's words: if its
-completion exceeds (c + 8) / n, where n is the number of points of its dense route and c
-the index of the first one on a junction. With S for a success, over N routes
-(tools/ability_benchmark.py):
-
-* 0.0.3 adds the two: sum(S + J) / 2 N;
-* 0.0.4 takes either: sum(S or J) / N, as we do.
+counted. For Traffic_Signs a route also counts that failed, but *passed the junction*:
+the ego came more than 8 m into it and ran no stop sign or red light
+(tools/ability_benchmark.py, branch 0.0.4).
 """
 
 from collections.abc import Mapping, Sequence
 from statistics import fmean
-from typing import Literal, get_args
 
 from me2e_compress.metrics.bench2drive import success
 from me2e_compress.metrics.episode import Episode
@@ -30,9 +24,6 @@ ABILITIES = (
 )
 TRAFFIC_SIGNS = "Traffic_Signs"
 MEAN = "mean"
-
-Rules = Literal["0.0.3", "0.0.4"]
-RULES: tuple[Rules, ...] = get_args(Rules)
 
 JUNCTION_MARGIN_M = 8.0
 """How far past the start of a junction the ego must come to have obeyed its signs."""
@@ -62,53 +53,33 @@ def successes(episodes: Sequence[Episode]) -> dict[str, tuple[bool, ...]]:
     }
 
 
-def ability_rates(
-    episodes: Sequence[Episode], rules: Rules, junctions: Mapping[str, float]
-) -> dict[str, Estimate]:
-    """Return the rate of each ability in percent, and their arithmetic mean.
+def ability_rates(episodes: Sequence[Episode]) -> dict[str, Estimate]:
+    """Return the rate of each ability of a real run in percent, and their mean.
 
-    ``junctions`` holds (c + 8) / n by route. If a value that matters is missing, the
-    rate of Traffic_Signs is None, and so is the mean.
+    A real run does not say where junctions are. Where that decides, the rate of
+    Traffic_Signs is None, and so is the mean.
     """
     rates = {
         ability: _rate([one for one in episodes if ability in one.abilities])
         for ability in ABILITIES
     }
-    signs = [one for one in episodes if TRAFFIC_SIGNS in one.abilities]
-    rates[TRAFFIC_SIGNS] = _signs(signs, rules, junctions)
-    return {**rates, MEAN: _mean(rates, len(episodes))}
-
-
-def passes_the_junction(
-    episode: Episode, junctions: Mapping[str, float]
-) -> bool | None:
-    """Return J of a route; None if it depends on an unknown junction."""
-    if _ran_a_sign(episode) or episode.completion_percent <= 0.0:
-        return False
-    place = junctions.get(episode.route)
-    return None if place is None else episode.completion_percent / 100.0 > place
-
-
-def _signs(
-    episodes: Sequence[Episode], rules: Rules, junctions: Mapping[str, float]
-) -> Estimate:
-    """Rate Traffic_Signs; 0.0.4 needs the junctions of failed routes only."""
-    either = rules == "0.0.4"
-    asked = [one for one in episodes if not (either and success(one))]
-    # no rate if a junction that matters is unknown
-    passed = {one.route: passes_the_junction(one, junctions) for one in asked}
-    unknown = [route for route, each in passed.items() if each is None]
+    unknown = [
+        one.route
+        for one in episodes
+        if TRAFFIC_SIGNS in one.abilities and _hangs_on_the_junction(one)
+    ]
     if unknown:
         others = f" and {len(unknown) - 1} others" if len(unknown) > 1 else ""
         reason = f"where the junction is on {unknown[0]}{others} is not known"
-        return Estimate.missing("%", reason, len(episodes))
-    # successes and passed junctions, by the rules of the version
-    good = sum(success(one) for one in episodes) + sum(map(bool, passed.values()))
-    if either or not episodes:
-        return _share(good, len(episodes))
-    # half a success has no binomial interval
-    rate = 100.0 * good / (2 * len(episodes))
-    return Estimate(Measure(rate, "%"), None, None, len(episodes))
+        n = sum(TRAFFIC_SIGNS in one.abilities for one in episodes)
+        rates[TRAFFIC_SIGNS] = Estimate.missing("%", reason, n)
+    return {**rates, MEAN: _mean(rates, len(episodes))}
+
+
+def _hangs_on_the_junction(episode: Episode) -> bool:
+    """Return whether a failed route counts if the ego passed its junction."""
+    failed = not success(episode) and not _ran_a_sign(episode)
+    return failed and episode.completion_percent > 0.0
 
 
 def _ran_a_sign(episode: Episode) -> bool:
@@ -117,12 +88,10 @@ def _ran_a_sign(episode: Episode) -> bool:
 
 
 def _rate(episodes: Sequence[Episode]) -> Estimate:
-    return _share(sum(success(one) for one in episodes), len(episodes))
-
-
-def _share(good: int, n: int) -> Estimate:
+    n = len(episodes)
     if n == 0:
         return Estimate.missing("%", "no such route was driven")
+    good = sum(success(one) for one in episodes)
     low, high = binomial_interval(good, n)
     return Estimate(Measure(100.0 * good / n, "%"), low, high, n)
 

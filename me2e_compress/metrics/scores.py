@@ -205,7 +205,7 @@ def _abilities(
     Real runs do not tell where junctions are, which Traffic_Signs needs.
     """
     if any(episode.given is not None for episode in episodes):
-        rates = ability_rates(episodes, "0.0.4", {})
+        rates = ability_rates(episodes)
         return rates.pop(MEAN), rates
     outcomes = successes(episodes)
     each = {

@@ -18,7 +18,6 @@ from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, not_measured, number, table
 from me2e_compress.workflows.score_bench2drive import (
     STANDING,
-    Bench2DriveOptions,
     RealRun,
     score_real_run,
     some_of,
@@ -107,7 +106,7 @@ class ScoreResult(Result):
         real = self.real[name]
         return (
             *real.tables(name),
-            scores_table(f"{name}, abilities by the rules {real.rules}", scores),
+            scores_table(name, scores),
             *late,
         )
 
@@ -115,14 +114,15 @@ class ScoreResult(Result):
 def score(
     *results: str | Path,
     listener: Listener = SILENT,
-    real: Bench2DriveOptions | None = None,
+    real_metrics: str | Path | None = None,
     eer: EerOptions | None = None,
     budget_ms: float = BUDGET_MS,
 ) -> ScoreResult:
     """Score the episodes in folders that ``evaluate`` or real Bench2Drive runs left.
 
     The listener is told of damaged files, which are left out; `eer` holds the folders'
-    joules, for EER_AV of all of them together.
+    joules, for EER_AV of all of them together; `real_metrics` a folder of recordings of
+    real runs (``metric_info.json``) that do not lie below their results.
 
     Raises:
         EvaluationError: A folder holds no results, EER_AV cannot compare the folders,
@@ -142,19 +142,19 @@ def score(
             continue
         if not path.exists():
             raise EvaluationError(f"{path}: no such folder")
-        if real is None and not holds_records(path):
+        if real_metrics is None and not holds_records(path):
             raise EvaluationError(
                 f"{path}: not a results folder: it holds neither {MANIFEST} nor "
                 "records of a leaderboard"
             )
-        run = score_real_run(path, real or Bench2DriveOptions())
+        apart = None if real_metrics is None else Path(real_metrics)
+        run = score_real_run(path, apart)
         scores[str(path)], runs[str(path)] = run.scores, run
         driven[str(path)] = run.collected.episodes
-    # options of real runs would be ignored without a word
-    if real is not None and not runs:
+    # it would be ignored without a word
+    if real_metrics is not None and not runs:
         raise EvaluationError(
-            f"{', '.join(scores)}: no results of a real run, which --metrics, "
-            "--junctions, --abilities and --penalties are about"
+            f"{', '.join(scores)}: no results of a real run, which --metrics is about"
         )
     # folders whose decisions cost nothing have no deadlines
     late = {

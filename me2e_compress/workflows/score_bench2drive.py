@@ -2,64 +2,27 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.real_results import (
     Bench2DriveResults,
     CollectedResults,
 )
-from me2e_compress.evaluators.bench2drive.records import number_of
 from me2e_compress.metrics import scores as metrics
-from me2e_compress.metrics.abilities import MEAN, RULES, Rules, ability_rates
 from me2e_compress.metrics.comfort import stood_most
-from me2e_compress.metrics.episode import LARGEST
 from me2e_compress.metrics.leaderboard_scores import (
-    VERSIONS,
     LeaderboardScores,
     Quotients,
-    Version,
     leaderboard_scores,
 )
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.registry import documents
 from me2e_compress.workflows.result import Table, number, table
 
 STANDING = "the ego stood most of the time, which is comfortable: see comfort in motion"
 _NAMED = 5
 _TOLERANCE = 1e-6
-
-
-@dataclasses.dataclass(frozen=True)
-class Bench2DriveOptions:
-    """How results of real runs are read and scored.
-
-    Attributes:
-        metrics: a folder with the recordings (``metric_info.json``), where they do not
-            lie below that of the results.
-        junctions: JSON file of the share of each route, by its number, at which its
-            first junction is passed: (c + 8) / n, as Traffic_Signs asks for it.
-        rules: rules of the abilities: ``0.0.3`` or ``0.0.4``; None takes those that
-            came with the routes.
-        penalties: penalties of infractions: ``b2d``, ``1.0``, ``2.0`` or ``2.1``.
-    """
-
-    metrics: str | Path | None = None
-    junctions: str | Path | None = None
-    rules: Rules | None = None
-    penalties: Version = "b2d"
-
-    def __post_init__(self) -> None:
-        if self.rules is not None and self.rules not in RULES:
-            raise EvaluationError(
-                f"no rules {self.rules!r} of abilities; there are {', '.join(RULES)}"
-            )
-        if self.penalties not in VERSIONS:
-            raise EvaluationError(
-                f"no penalties {self.penalties!r}; there are {', '.join(VERSIONS)}"
-            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +38,6 @@ class RealRun:
     collected: CollectedResults
     scores: Scores
     leaderboard: LeaderboardScores
-    rules: Rules
     stood: tuple[str, ...]
 
     def tables(self, name: str) -> tuple[Table, ...]:
@@ -122,7 +84,6 @@ class RealRun:
             "leaderboard": {
                 "route_set": found.route_set,
                 "set_size": self.leaderboard.set_size,
-                "rules": self.rules,
                 **self.leaderboard.to_json(),
             },
             "records": {
@@ -184,9 +145,6 @@ class RealRun:
             ("route completion", of.given_completion, nothing, "%"),
             ("infraction penalty", of.given_penalty, of.penalty, "ratio"),
         ]
-        if of.score != of.score_without_low_speed:
-            without = of.score_without_low_speed
-            lines.insert(1, ("  without low speed", nothing, without, "%"))
         # each figure is shown over the whole set, and over what was driven
         rows = [
             (label, over, _shown(given, over), _shown(computed, over), str(n), unit)
@@ -195,52 +153,25 @@ class RealRun:
             if unit == "%" or over == "driven"  # a missing route has no penalty
         ]
         columns = ("score", "over", "given", "computed", "n", "unit")
-        title = f"given by the simulator, and computed with penalties {of.penalties}"
+        title = "given by the simulator, and computed with Bench2Drive's penalties"
         return table(title, columns, rows, words=2)
 
 
-def score_real_run(path: Path, options: Bench2DriveOptions) -> RealRun:
-    """Read and score the results of a real run."""
-    metric_folder = None if options.metrics is None else Path(options.metrics)
-    # collect the records, and find the rules that came with the routes
+def score_real_run(path: Path, metric_folder: Path | None = None) -> RealRun:
+    """Read and score the results of a real run.
+
+    `metric_folder` holds recordings (``metric_info.json``) that do not lie below that
+    of the results.
+    """
     collected = Bench2DriveResults(path, metric_folder).collect()
     episodes = collected.episodes
     set_size = metrics.FULL_SET * collected.repetitions
-    rules = options.rules or collected.route_set or RULES[0]
-    junctions = _junctions(options.junctions, [each.route for each in episodes])
-    # Bench2Drive's rates of abilities replace our own
-    rates = ability_rates(episodes, rules, junctions)
-    scores = dataclasses.replace(
-        metrics.score(episodes, set_size),
-        abilities=rates.pop(MEAN),
-        each_ability=rates,
-    )
     return RealRun(
         collected,
-        scores,
-        leaderboard_scores(episodes, options.penalties, set_size),
-        rules,
+        metrics.score(episodes, set_size),
+        leaderboard_scores(episodes, set_size),
         stood_most(episodes),
     )
-
-
-def _junctions(path: str | Path | None, routes: Sequence[str]) -> dict[str, float]:
-    """Read the places of junctions by route; the file names the route or its number."""
-    if path is None:
-        return {}
-    try:
-        found = documents.from_json(documents.content(Path(path)))
-    except OSError as error:
-        raise EvaluationError(f"{path}: cannot be read: {error.strerror}") from error
-    except documents.MalformedError as error:
-        raise EvaluationError(f"{path}: not JSON: {error}") from error
-    if not isinstance(found, Mapping):
-        raise EvaluationError(f"{path}: not an object of shares by route")
-    for route, share in found.items():
-        if type(share) not in (int, float) or not 0.0 < share <= LARGEST:
-            raise EvaluationError(f"{path}: {route}: {share!r:.60} is not a share")
-    places = {route: found.get(route, found.get(number_of(route))) for route in routes}
-    return {route: float(each) for route, each in places.items() if each is not None}
 
 
 def _shown(quotients: Quotients, over: str) -> str:

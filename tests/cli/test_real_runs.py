@@ -57,21 +57,6 @@ def test_a_real_run_is_scored(cli: Cli) -> None:
     assert "driven │ 74.0000 │ 74.0000 │ 2 │ %" in shown.words
 
 
-def test_options_decide_what_is_computed(cli: Cli, run: Path) -> None:
-    write(run.parent / "j.json", {"2050": 0.5})
-
-    line = "score run --abilities 0.0.4 --penalties 2.1 --junctions j.json"
-    found = scored(cli, line)
-
-    assert found["abilities"]["each"]["Traffic_Signs"]["value"] == 100.0
-    computed = found["leaderboard"]["computed"]
-    # 50 % of the traffic's speed costs 0.2, the collision 0.7
-    driven = computed["driving_score"]["driven"]
-    assert driven == pytest.approx((100 / 1.2 + 80 / 1.7) / 2, abs=1e-6)
-    without = computed["driving_score_without_low_speed"]["driven"]
-    assert without == pytest.approx((100 + 80 / 1.7) / 2, abs=1e-6)
-
-
 def test_what_is_wrong_with_a_real_run_is_said(cli: Cli, run: Path) -> None:
     odd = run.parent / "odd"
     write(odd / "m.json", merged(GOOD, said={"eval num": 5}))
@@ -91,25 +76,15 @@ def test_what_is_wrong_with_a_real_run_is_said(cli: Cli, run: Path) -> None:
 
 
 @pytest.mark.usefixtures("run")
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--abilities 0.0.5", "no rules '0.0.5' of abilities; there are 0.0.3, 0.0.4"),
-        ("--penalties 3", "no penalties '3'; there are b2d, 1.0, 2.0, 2.1"),
-        ("--metrics nowhere", "nowhere: no such folder"),
-        ("--junctions nowhere", "nowhere: cannot be read: No such file"),
-    ],
-)
-def test_wrong_words_about_a_real_run_are_one_line(
-    cli: Cli, words: str, message: str
-) -> None:
-    assert message in cli.refused(f"score run {words}")
+def test_a_folder_of_recordings_that_is_none_is_one_line(cli: Cli) -> None:
+    said = cli.refused("score run --metrics nowhere")
+
+    assert "nowhere: no such folder" in said
 
 
-@pytest.mark.parametrize(
-    "places", [[], {"2050": "far"}, {"2050": float("nan")}, {"2050": 10**400}]
-)
-def test_a_bad_file_of_junctions(cli: Cli, run: Path, places: object) -> None:
-    write(run.parent / "j.json", places)
+@pytest.mark.parametrize("flag", ["--abilities", "--penalties", "--junctions"])
+def test_older_rules_are_usage_errors(cli: Cli, flag: str) -> None:
+    refused = cli(f"score run {flag} 1.0")
 
-    assert "j.json: " in cli.refused("score run --junctions j.json")
+    assert refused.code == 2
+    assert f"{flag} is gone since 0.3.0" in refused.err

@@ -149,7 +149,7 @@ DRIVE = {
 SCORE = {
     "score nodir": "nodir: no such folder$",
     "score frames": "not a results folder",
-    "score results --penalties 2.0": "no results of a real run, which --metr",
+    "score results --metrics frames": "no results of a real run, which --metr",
     "routes -o out.json --scenarios Flying": "no scenario 'Flying'; there are",
 }
 LINES = {

@@ -105,7 +105,7 @@ def test_a_graph_in_int8_that_works_is_alive(scenes: tuple[int, ...]) -> None:
     ],
 )
 def test_what_is_dead_is_named(changed: dict[str, str], said: str) -> None:
-    found = measured(driver(**changed))
+    found = measured(driver(fed=True, **changed))
 
     assert found.faults[0].startswith(f"plan is {said}")
 
