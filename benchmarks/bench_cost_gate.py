@@ -8,8 +8,7 @@ float and in int8 for onnxruntime, in turn, on one thread, in CPU seconds. Alone
 that the input is quantized and the answer dequantized. The model of the rule ``cost``
 says the sign beforehand, from shapes; "always int8" is what it has to beat. Then, by
 module: the MACs that int8 takes over, what it saves and what its borders cost, as
-predicted for the whole graph on this CPU and, by published rates, on Orin; and layers
-whose time on Orin is published. Under two CPU minutes; exporting needs torch.
+predicted for the whole graph. Under two CPU minutes; exporting needs torch.
 """
 
 import argparse
@@ -32,28 +31,12 @@ from me2e_compress.targets.biases import biased_end
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.onnxruntime.costs import costs_of
 from me2e_compress.targets.onnxruntime.kernels import end_of, has_kernel
-from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 from me2e_compress.zoo.export import export
 from me2e_compress.zoo.shipped import shipped
 
 NEAR = 0.05
 """A difference of that part of the float time is a tie."""
-
-PUBLISHED = (
-    (
-        "SparseDriveV2, weights_fc with its region",
-        "3.26 ms, 6.10 ms",
-        Layer("MatMul", (3072, 256), (256, 16000)),
-    ),
-    (
-        "SparseDriveV2, convolutions of the backbone (one of ResNet-34's)",
-        "4.65 ms, 4.03 ms",
-        Layer("Conv", (3, 256, 16, 64), (256, 256, 3, 3), "pads=[1,1,1,1]", relu=True),
-    ),
-)
-"""TensorRT 8.6 on Orin X: deploy/artifacts/reports/m6_myelin_int8.md of
-github.com/Wanglaoban3/SparseDriveV2-Quantization-Onnx-Deploy."""
 
 
 def main() -> None:
@@ -72,7 +55,6 @@ def main() -> None:
     signs(rows)
     for name, ready in prepared.items():
         modules(name, ready)
-    plausibility()
 
 
 def graphs(out: Path) -> Iterator[tuple[str, PreparedGraph]]:
@@ -165,16 +147,11 @@ def signs(rows: list[tuple[str, Layer]]) -> None:
 
 def modules(name: str, ready: PreparedGraph) -> None:
     """Print by module what int8 takes over, and what that should save."""
-    print(f"| {name} | CPU: layers, float, GMACs, saved ms, borders ms | Orin |")
-    print("|---|---|---|")
-    found = {
-        "onnxruntime": by_module(ready, OnnxRuntime()),
-        "orin": by_module(ready, TensorRT(machine="orin")),
-    }
-    for module in ready.modules.names():
-        cells = [each[module] for each in found.values()]
-        if any(cells):
-            print(f"| {module} | {' | '.join(cells)} |")
+    print(f"| {name} | layers, float, GMACs, saved ms, borders ms |")
+    print("|---|---|")
+    for module, cell in by_module(ready, OnnxRuntime()).items():
+        if cell:
+            print(f"| {module} | {cell} |")
     print()
 
 
@@ -203,18 +180,6 @@ def by_module(ready: PreparedGraph, target: Target) -> dict[str, str]:
             f" {saved * 1e3:.2f}, {(saved - costs.net_s(kept)) * 1e3:.2f}"
         )
     return cells
-
-
-def plausibility() -> None:
-    """Print what is published of int8 on Orin beside what the model says of it."""
-    print("| on Orin | published: float16, int8 | predicted to save, one layer |")
-    print("|---|---|---|")
-    for name, published, layer in PUBLISHED:
-        model = layer.graph()
-        nodes = [node for node in model.graph if node.op_type == layer.op]
-        costs = TensorRT(machine="orin").costs(model, nodes)
-        net = 0.0 if costs is None else costs.net_s(frozenset(nodes))
-        print(f"| {name} | {published} | {net * 1e3:+.2f} ms |")
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ FORMER = {
     "--shard": f"--shard {_NOW} one run, which goes on where it was killed",
     "--merge": f"--merge {_NOW} one run, which goes on where it was killed",
     "rule set tensorrt": f"tensorrt {_NOW} safe",
+    "tensorrt machine": "machine is gone since 0.3.0: measure on the board",
     "study scheme": f"[[scheme]] {_NOW} [[variant]]",
     "stack first_frame": f"first_frame {_NOW} a TOML of its own for the first frames",
     "stack first": f"first {_NOW} [recurrent] of the adapter",

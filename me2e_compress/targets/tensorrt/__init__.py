@@ -8,7 +8,7 @@ of a tensor share one pair, all float readers read the tensor itself.
 """
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -19,7 +19,6 @@ from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import input_at, rewrite, static_shape
 from me2e_compress.operators import find, int8_inputs
-from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import (
     Decision,
     QuantPlan,
@@ -28,7 +27,6 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.targets.base import LintRule, Target
 from me2e_compress.targets.biases import bias_by_channel, least_scales, with_room
-from me2e_compress.targets.tensorrt.costs import MACHINES, costs_of
 from me2e_compress.targets.tensorrt.lint import rules
 from me2e_compress.targets.tensorrt.lint.support_matrix import version_of
 from me2e_compress.targets.weights import (
@@ -47,22 +45,15 @@ class TensorRT(Target):
     """NVIDIA's engine builder, by its ONNX parser and explicit quantization.
 
     Attributes:
-        machine: ``orin``: layers that are predicted to be slower there in int8 than in
-            float16 stay float (rule ``cost``); empty predicts nothing.
         version: of TensorRT, such as ``10.13``, whose tables :meth:`lint` asks; empty
             warns of what 10.1 did not take.
     """
 
     name: ClassVar[str] = "tensorrt"
     half_since: ClassVar[int | None] = 19
-    machine: str = ""
     version: str = ""
 
     def __post_init__(self) -> None:
-        if self.machine and self.machine not in MACHINES:
-            raise ValueError(
-                f"no machine {self.machine}; there are {', '.join(MACHINES)}"
-            )
         if self.version:
             version_of(self.version)
 
@@ -105,12 +96,6 @@ class TensorRT(Target):
         if shape is None or input_at(node, scale) is not None:
             return "its features are int8 already, or of open size"
         return None
-
-    def costs(self, model: ir.Model, layers: Collection[ir.Node]) -> Costs | None:
-        """Predict the savings and costs of int8 for some layers on the machine."""
-        if not self.machine:
-            return None
-        return costs_of(model, layers, MACHINES[self.machine])
 
     def lint_rules(self) -> tuple[LintRule, ...]:
         """Return the rules of its parser and of explicit quantization."""
