@@ -35,7 +35,7 @@ def placed(rules: str) -> ir.Model:
     return TensorRT().place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
 
 
-@pytest.mark.parametrize("rules", ["paper", "tensorrt"])
+@pytest.mark.parametrize("rules", ["paper", "safe"])
 def test_what_we_place_has_no_findings(rules: str) -> None:
     assert RUNTIME.lint(placed(rules)) == ()
 
