@@ -84,15 +84,12 @@ def parse(text: str) -> tuple[Pass, ...]:
 
 def adding_no_weights(passes: Iterable[Pass]) -> tuple[Pass, ...]:
     """Set the options that let passes add weights for fewer nodes or less work to 0."""
-
-    def without(each: Pass) -> Pass:
-        prices = [name for name in _PRICES if name in each.option_names()]
-        return each.with_options(dict.fromkeys(prices, 0))
-
-    return tuple(map(without, passes))
-
-
-_PRICES = ("bytes_per_node", "growth")
+    return tuple(
+        each.with_options({"bytes_per_node": 0})
+        if "bytes_per_node" in each.option_names()
+        else each
+        for each in passes
+    )
 
 
 def to_text(passes: Iterable[Pass]) -> str:

@@ -13,9 +13,8 @@ from me2e_compress.graph.activations import value_bytes
 from me2e_compress.graph.nodes import VIEWS
 from me2e_compress.graph.rewrite import graphs_of, remove_dead, value_names
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.hoist_linear.node_writer import NodeWriter
-from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
-from me2e_compress.passes.hoist_linear.row_moves import broadcasts
+from me2e_compress.passes.hoist_linear.rebuilding import NodeWriter, Rewriter
+from me2e_compress.passes.hoist_linear.repeated_axes import broadcasts
 from me2e_compress.passes.work import (
     MOVED_BYTES_PER_NODE,
     SMALL_PRODUCTS_PER_NODE,

@@ -1,6 +1,5 @@
-"""What folding stores: bytes of the file against work of every frame."""
+"""What folding stores: bytes of the file against nodes of every frame."""
 
-import itertools
 from typing import Any
 
 import numpy as np
@@ -9,49 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.graph.summary import weight_bytes
-from me2e_compress.passes import PassResult
-from me2e_compress.passes.fold_constants import SMALL_FILE, FoldConstants
+from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.fold_constants.choice import ENTRY_BYTES
-from me2e_compress.passes.fold_constants.min_cut import FlowNetwork
 from tests.passes.small import NO_MODULES, apply, ops, read
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
-
-Edges = list[tuple[int, int, int]]
-
-
-@st.composite
-def edges(draw: st.DrawFn) -> Edges:
-    """Edges between six vertices; 0 is the source and 5 the sink."""
-    pairs = draw(st.lists(st.sampled_from(list(itertools.permutations(range(6), 2)))))
-    return [(tail, head, draw(st.integers(0, 9))) for tail, head in pairs]
-
-
-def cost(given_edges: Edges, side: set[int]) -> int:
-    return sum(
-        price for tail, head, price in given_edges if tail in side and head not in side
-    )
-
-
-@given(edges())
-def test_no_cut_is_cheaper_and_no_equal_one_larger(given_edges: Edges) -> None:
-    network = FlowNetwork()
-    for _ in range(6):
-        network.vertex()
-    for tail, head, price in given_edges:
-        network.edge(tail, head, price)
-
-    found = network.cut(0, 5)
-
-    sides = [
-        {0, *inner}
-        for count in range(5)
-        for inner in itertools.combinations(range(1, 5), count)
-    ]
-    best = min((cost(given_edges, side), -len(side)) for side in sides)
-    assert 0 in found
-    assert 5 not in found
-    assert (cost(given_edges, found), -len(found)) == best
 
 
 def attention(tokens: int) -> ir.Model:
@@ -85,35 +46,32 @@ def attention(tokens: int) -> ir.Model:
     )
 
 
-def folded(tokens: int, growth: float = 1e9) -> tuple[ir.Model, PassResult]:
+@given(st.integers(0, 40_000), st.integers(2, 800))
+def test_weights_grow_by_at_most_the_limit_for_each_node_that_goes(
+    limit: int, tokens: int
+) -> None:
     model = attention(tokens)
-    return model, apply(FoldConstants(growth=growth), model)
+    before, nodes = _file_bytes(model), len(model.graph)
 
+    apply(FoldConstants(limit), model)
 
-def test_an_attention_that_takes_longer_than_its_bytes_are_worth_is_folded() -> None:
-    """2,000 x 2,000 x 32, twice, is 256 MMACs a frame; its result is 256 kB."""
-    model, _ = folded(2000)
-
-    assert ops(model) == ["Add", "Mul", "MatMul"]
-
-
-def test_what_is_worth_its_bytes_stays_computed_beyond_the_budget() -> None:
-    model, _ = folded(2000, growth=0.01)
-
-    assert "Softmax" in ops(model)
+    assert _file_bytes(model) - before <= limit * (nodes - len(model.graph))
     assert ops(model).count("Slice") == 0  # what shrinks the weights is done
 
 
-@given(st.floats(0, 40), st.integers(2, 3000))
-def test_weights_never_grow_beyond_their_budget(growth: float, tokens: int) -> None:
-    model = attention(tokens)
-    before = weight_bytes(model)
+def test_an_attention_of_constants_is_folded_within_the_limit_alone() -> None:
+    """Its result is 256 kB for 13 nodes."""
+    small, large = attention(2000), attention(2000)
 
-    apply(FoldConstants(growth=growth), model)
+    apply(FoldConstants(), small)
+    apply(FoldConstants(bytes_per_node=20_000), large)
 
-    allowed = max(growth * before, SMALL_FILE) if growth else 0
-    entries = ENTRY_BYTES * len(model.graph.initializers)
-    assert weight_bytes(model) - before <= allowed + entries
+    assert "Softmax" in ops(small)
+    assert ops(large) == ["Add", "Mul", "MatMul"]
+
+
+def _file_bytes(model: ir.Model) -> int:
+    return weight_bytes(model) + ENTRY_BYTES * len(model.graph.initializers)
 
 
 def test_a_table_that_is_only_repeated_stays_computed() -> None:
@@ -170,16 +128,16 @@ def test_a_repeated_table_is_not_stored() -> None:
     model = read(TABLE, **TABLE_WEIGHTS)
     result = apply(FoldConstants(), model)
     assert ops(model) == ["Expand", "Add", "Mul"]
-    assert "cheaper than their bytes" in result.notes[0]
+    assert "smaller than their values" in result.notes[0]
 
 
-def test_a_repeated_table_is_stored_when_nodes_are_dear() -> None:
+def test_a_repeated_table_is_stored_under_a_high_limit() -> None:
     model = read(TABLE, **TABLE_WEIGHTS)
-    apply(FoldConstants(bytes_per_node=200_000, growth=1e9), model)
+    apply(FoldConstants(bytes_per_node=200_000), model)
     assert ops(model) == ["Mul"]
 
 
-def test_the_cut_goes_before_the_table() -> None:
+def test_what_is_in_front_of_the_table_is_stored() -> None:
     text = """
     <ir_version: 9, opset_import: ["" : 17]>
     g (float[1000,64] x) => (float[1000,64] y) {

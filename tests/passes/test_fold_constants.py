@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from me2e_compress import graph
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.fold_constants.choice import ENTRY_BYTES
-from me2e_compress.passes.work import work
 from tests.passes.small import apply, compute, ops, read
 from tests.profiles import scaled
 
@@ -240,7 +239,7 @@ def programs(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
 
 @settings(max_examples=scaled(60))
 @given(programs(), st.sampled_from([0, 40, 512, 10**6]))
-def test_random_programs_keep_their_meaning_and_their_price(
+def test_random_programs_keep_their_meaning_and_the_limit(
     program: tuple[str, dict[str, Any]], bytes_per_node: int
 ) -> None:
     text, weights = program
@@ -249,10 +248,8 @@ def test_random_programs_keep_their_meaning_and_their_price(
     feeds = {"x": np.random.default_rng(0).normal(size=(2, 3)).astype(np.float32)}
     for want, got in zip(compute(before, feeds), compute(after, feeds), strict=True):
         np.testing.assert_array_equal(got, want)
-    graph.infer_shapes(before)  # what is folded knows its sizes
     growth = _file_bytes(after) - _file_bytes(before)
-    worth = sum(map(work, before.graph)) - sum(map(work, after.graph))
-    assert growth <= bytes_per_node * worth
+    assert growth <= bytes_per_node * (len(before.graph) - len(after.graph))
 
 
 def _file_bytes(model: ir.Model) -> int:

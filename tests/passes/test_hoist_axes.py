@@ -34,7 +34,7 @@ def test_rows_that_were_flattened_behind_their_repetition(op_type: str) -> None:
 
     model = hoist(text, **shapes, **used)
 
-    assert of(op_type, model).outputs[0].shape == (1, 5, 4, width)
+    assert of(op_type, model).outputs[0].shape == (1, 20, width)
 
 
 def test_rows_that_got_an_axis_between_two_repetitions() -> None:
@@ -49,7 +49,7 @@ def test_rows_that_got_an_axis_between_two_repetitions() -> None:
         three=integers(3),
     )  # fmt: skip
 
-    assert of("ReduceSum", model).outputs[0].shape == (1, 1, 1)
+    assert of("ReduceSum", model).outputs[0].shape == (1, 1, 1, 1)
 
 
 def test_an_axis_of_a_softmax_may_not_be_negative_before_opset_11() -> None:
@@ -61,7 +61,7 @@ def test_an_axis_of_a_softmax_may_not_be_negative_before_opset_11() -> None:
 
     model = hoist(text, many=integers(20, 5, 4, 32), flat=integers(400, 32))
 
-    assert of("Softmax", model).attributes.get_int("axis") == 3
+    assert of("Softmax", model).attributes.get_int("axis") == 2
 
 
 @pytest.mark.parametrize("version", [11, 12, 13, 17])
@@ -108,9 +108,3 @@ def test_a_gemm_of_repeated_rows_keeps_its_attributes(attributes: str) -> None:
     )  # fmt: skip
 
     assert products(model) == 5 * 4 * 32 * 32
-
-
-def test_a_transposed_constant_of_one_number_is_no_scaled_head() -> None:
-    body = "t = Transpose<perm = [0, 2, 1]>(k)  y = MatMul(x, t)"
-
-    hoist(graph_of("(float[2,5,1] x) => (float[2,5,1] y)", body), k=normal(1, 1, 1))

@@ -1,4 +1,4 @@
-"""Any chain of moves and sums in front of a product: less work, the same numbers."""
+"""Any chain of moves, layers and sums before a product: less work, the same numbers."""
 
 import math
 from typing import Any
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import strategies as st
 
 from me2e_compress.graph import infer_shapes, static_shape
-from me2e_compress.passes.hoist_linear import HoistLinear, least_work
+from me2e_compress.passes.hoist_linear import HoistLinear, sums
 from tests.passes.hoisted import (
     RANDOM,
     difference,
@@ -30,6 +30,8 @@ MOVES = (
     "unsqueeze",
     "slice",
     "add",
+    "layer",
+    "peak",
 )
 
 
@@ -39,9 +41,10 @@ def chains(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
     width = draw(st.integers(1, 6))
     shape = [draw(st.integers(1, 3)), draw(st.integers(1, 4)), width]
     start = list(shape)
-    weights: dict[str, Any] = {"w": normal(width, draw(st.integers(1, 5)))}
+    weights: dict[str, Any] = {}
     steps: list[str] = []
-    for index, move in enumerate(draw(st.lists(st.sampled_from(MOVES), max_size=6))):
+    moves = draw(st.lists(st.sampled_from(MOVES), max_size=6))
+    for index, move in enumerate(moves):
         name = f"c{index}"
         repeats = draw(st.integers(1, 9))
         if move == "expand":
@@ -72,11 +75,22 @@ def chains(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
             shape = [max(1, shape[0] - 1), *shape[1:]]
             weights |= {name: integers(shape[0]), "zero": integers(0)}
             call = f"Slice(v{index}, zero, {name}, zero)"
+        elif move == "layer":
+            wide = draw(st.integers(1, 6))
+            weights |= {name: normal(width, wide), f"b{index}": normal(wide)}
+            steps.append(f"m{index} = MatMul(v{index}, {name})")
+            call, width = f"Add(b{index}, m{index})", wide
+            shape = [*shape[:-1], width]
+        elif move == "peak":
+            peak = f"p{index} = ReduceMax<axes = [0], keepdims = 1>(v{index})"
+            steps.append(peak)
+            call = f"Add(p{index}, v{index})"
         else:
             weights[name] = normal(*draw(st.sampled_from([[width], [1, width], shape])))
             call = f"{draw(st.sampled_from(['Add', 'Sub']))}(v{index}, {name})"
         steps.append(f"v{index + 1} = {call}")
-    body = f"v0 = Neg(x) {' '.join(steps)} y = MatMul(v{len(steps)}, w)"
+    weights["w"] = normal(width, draw(st.integers(1, 5)))
+    body = f"v0 = Neg(x) {' '.join(steps)} y = MatMul(v{len(moves)}, w)"
     result = ",".join("ABCDEFGHIJK"[: len(shape)])
     text = graph_of(f"(float{start} x) => (float[{result}] y)", body)
     return text.replace("float[1 ", "float[1"), weights
@@ -114,7 +128,7 @@ def test_any_chain_in_front_of_a_product(drawn: tuple[str, dict[str, Any]]) -> N
     infer_shapes(model)
     before = work(model)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(least_work, "MACS_PER_NODE", 1)
+        patch.setattr(sums, "MACS_PER_NODE", 1)
         changes = HoistLinear(bytes_per_node=10**9).run(model, NO_MODULES).changes
     hypothesis.event(f"changes: {min(changes, 1)}")
     infer_shapes(model, strict=True)

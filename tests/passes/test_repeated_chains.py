@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from me2e_compress.graph import infer_shapes, static_shape
 from me2e_compress.passes import work
-from me2e_compress.passes.hoist_linear import HoistLinear, sunk_repeats
+from me2e_compress.passes.hoist_linear import HoistLinear, repeats
 from tests.passes.hoisted import RANDOM, graph_of, integers
 from tests.passes.small import NO_MODULES, compute, read
 from tests.profiles import scaled
@@ -108,7 +108,7 @@ def test_any_chain_of_repetitions_views_and_operators(
     feeds = {"x": RANDOM.normal(size=static_shape(model.graph.inputs[0]) or ())}
     (want,) = compute(model, feeds)
     with pytest.MonkeyPatch.context() as patch:
-        for module in (work, sunk_repeats):
+        for module in (work, repeats):
             patch.setattr(module, "MOVED_BYTES_PER_NODE", 1)
         changes = HoistLinear().run(model, NO_MODULES).changes
         infer_shapes(model, strict=True)

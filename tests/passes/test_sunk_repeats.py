@@ -100,7 +100,7 @@ def test_a_repeated_constant_beside_repeated_rows_is_stored_once() -> None:
 
     model = hoist(text, **rows, w=normal(32, 32))
 
-    assert products(model) == 100 * 32**2
+    assert products(model) == 101 * 32**2
     assert rows_of(model, "Concat") == {1}
     rows["ego"][7, 0, 3] += 1.0
     other = hoist(text, **rows, w=normal(32, 32))

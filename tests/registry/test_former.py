@@ -70,12 +70,23 @@ def test_a_method_that_is_gone_is_one_line(cli: Cli) -> None:
     assert line == ("me2e-compress: moving-average is gone since 0.3.0: use max-min")
 
 
-def test_an_option_of_a_pass_that_is_gone() -> None:
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (
+            "quantize-int8{weight_only_gemv=true}",
+            "weight_only_gemv is gone since 0.3.0: use without=[gemv]",
+        ),
+        (
+            "fold-constants{growth=0}",
+            "growth is gone since 0.3.0: use bytes_per_node",
+        ),
+    ],
+)
+def test_an_option_of_a_pass_that_is_gone(text: str, line: str) -> None:
     with pytest.raises(RecipeError) as refused:
-        recipe.parse("quantize-int8{weight_only_gemv=true}")
-    assert str(refused.value) == (
-        "weight_only_gemv is gone since 0.3.0: use without=[gemv]"
-    )
+        recipe.parse(text)
+    assert str(refused.value) == line
 
 
 @dataclass(frozen=True)

@@ -21,19 +21,16 @@ from me2e_compress.graph.rewrite import (
     replace_value,
     value_names,
 )
-from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fold_constants import evaluation
-from me2e_compress.passes.fold_constants.choice import FoldChoice, choose_within
+from me2e_compress.passes.fold_constants.choice import FoldChoice, choose
 from me2e_compress.passes.fold_constants.inference import branch_fits
 from me2e_compress.passes.fold_constants.knowledge import Sweep
-from me2e_compress.passes.work import BYTES_PER_NODE
 
 __all__ = ["FoldConstants"]
 
-
-SMALL_FILE = 1 << 16
-"""Growth in bytes that is no matter, whatever the share."""
+LIMIT_BYTES = 4096
+"""Bytes that a removed node may cost: at 2 us a node, 2 MB for 1 ms."""
 
 
 @dataclasses.dataclass
@@ -45,7 +42,6 @@ class _Tally:
     stored: int = 0
     kept: int = 0
     growth_bytes: int = 0
-    budget: float = 0.0
     refused: Counter[str] = dataclasses.field(default_factory=Counter)
 
     @property
@@ -62,30 +58,23 @@ class FoldConstants(Pass):
     Result:  Reshape and MatMul read initializers
 
     Attributes:
-        bytes_per_node: how many bytes of new weights the removal of a node may cost,
-            scaled by the node's work (:mod:`me2e_compress.passes.work`). A fold that
-            shrinks the weights is always done, one that grows them only up to this
-            price, so that a position table repeated for every token stays computed and
-            an attention between constants does not.
-        growth: by which share of their bytes all weights together may grow, or by
-            64 KB where that is more; 0 is by nothing, for more nodes. The price of a
-            node is lowered until it is met.
-        through_compute: fold through products, convolutions and softmax too, at the
-            same price; False keeps every named layer, e.g. to ablate it later.
+        bytes_per_node: how many bytes the removal of a node may add to the weights. A
+            fold that shrinks them is always done, so that a position table repeated
+            for every token stays computed and a transposed weight does not.
+        through_compute: fold through products, convolutions and softmax too; False
+            keeps every named layer, e.g. to ablate it later.
     """
 
     name: ClassVar[str] = "fold-constants"
     exact: ClassVar[bool] = True
-    bytes_per_node: int = BYTES_PER_NODE
-    growth: float = 0.01
+    bytes_per_node: int = LIMIT_BYTES
     through_compute: bool = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Infer shapes, then fold every graph of the model, outermost first."""
         # Normalize first: Constant nodes and bounds of Range
         lifted = lift_constants(model)
-        share = self.growth * weight_bytes(model)
-        tally = _Tally(lifted, budget=max(share, SMALL_FILE) if self.growth else 0)
+        tally = _Tally(lifted)
         declared = [value.shape for value in model.graph.outputs]
         opset = graphs.opset_of(model)
         for body in graphs_of(model.graph):
@@ -115,8 +104,7 @@ class FoldConstants(Pass):
                 through_compute=self.through_compute,
                 trust_shapes=trust,
             ).run(body)
-            left = max(tally.budget - tally.growth_bytes, 0)
-            choice = choose_within(known, self.bytes_per_node, left)
+            choice = choose(known, self.bytes_per_node)
             # Evaluate the choice; start over if it taught new shapes or failed
             asked = [value for value in choice.values if value not in known.arrays]
             found, failed = evaluation.evaluate(asked, known, opset)
@@ -154,7 +142,7 @@ def _notes(tally: _Tally) -> tuple[str, ...]:
         )
     if tally.kept:
         kept = counted(tally.kept, "node")
-        notes.append(f"{kept} left to compute constants: cheaper than their bytes")
+        notes.append(f"{kept} left to compute constants: smaller than their values")
     if tally.refused:
         what = ", ".join(f"{count} {op}" for op, count in sorted(tally.refused.items()))
         notes.append(f"onnxruntime cannot evaluate {what}: left as they are")

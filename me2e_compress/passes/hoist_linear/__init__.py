@@ -1,21 +1,18 @@
 """Multiply fewer rows: move products before nodes that repeat or add up rows."""
 
 import dataclasses
-from collections import Counter
 from typing import ClassVar
 
 import onnx_ir as ir
 
 from me2e_compress.display import counted
-from me2e_compress.graph import opset_of
+from me2e_compress.graph import macs, nodes_of, opset_of
 from me2e_compress.graph.rewrite import graphs_of, remove_dead, value_names
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.hoist_linear.batch_operands import split_operand
-from me2e_compress.passes.hoist_linear.least_work import Prices
-from me2e_compress.passes.hoist_linear.linear_layers import layer_at
+from me2e_compress.passes.hoist_linear.layers import layer_at
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
-from me2e_compress.passes.hoist_linear.repeated_rows import do_before_repeats
-from me2e_compress.passes.hoist_linear.sunk_repeats import sink_repeats
+from me2e_compress.passes.hoist_linear.repeats import before_repeat
+from me2e_compress.passes.hoist_linear.sums import multiply_earlier
 from me2e_compress.passes.work import BYTES_PER_NODE
 
 __all__ = ["HoistLinear"]
@@ -31,21 +28,18 @@ ROUNDS = 8
 class _Tally:
     products: int = 0
     others: int = 0
-    operands: int = 0
     unread: int = 0
     left: int = 0
-    macs: int = 0
-    refused: Counter[str] = dataclasses.field(default_factory=Counter)
 
     @property
     def changes(self) -> int:
-        return self.products + self.others + self.operands + self.unread
+        return self.products + self.others + self.unread
 
-    def notes(self) -> tuple[str, ...]:
+    def notes(self, macs: int) -> tuple[str, ...]:
         found = []
-        if products := self.products + self.operands:
-            less = f"{self.macs / 1e6:,.1f} MMACs fewer"
-            found.append(f"moved {counted(products, 'product')}: {less}")
+        if self.products:
+            less = f"{macs / 1e6:,.1f} MMACs fewer"
+            found.append(f"moved {counted(self.products, 'product')}: {less}")
         if self.others:
             found.append(
                 f"moved {counted(self.others, 'other node')} before repeated rows"
@@ -57,9 +51,6 @@ class _Tally:
             )
         if self.unread:
             found.append(f"removed what nothing reads: {self.unread}")
-        for reason, count in sorted(self.refused.items()):
-            whole = counted(count, "product")
-            found.append(f"left {whole} with keys or values as they are: {reason}")
         return tuple(found)
 
 
@@ -71,17 +62,14 @@ class HoistLinear(Pass):
 
     Result:  MatMul(x) -> Tile;  x W + p (P W) + c W;  x -> Relu -> MatMul -> Expand
 
-    A product moves in front of nodes that only rearrange or repeat rows and keep the
-    last axis (Tile, Expand, Gather, Concat, Slice, Reshape and Transpose). It is
-    distributed over a sum, or over concatenated columns, of which a part is small or
-    repeated. Two consecutive linear layers become one. Each rewrite is done only where
-    it needs fewer multiply-accumulates and is cheaper in total: nodes, memory traffic
-    and new weights (:mod:`me2e_compress.passes.work`). Other row-wise operators (a
-    bias, LayerNorm, Relu) also move in front of repetitions, as do Transpose and Concat
-    (of constants that repeat, too), also where views have split or merged the axes
-    behind those that repeat. Keys and values that the batch shares but for their
-    positions are multiplied term by term. Sizes must be known. Outputs are equal up to
-    rounding.
+    Three fusions (:mod:`me2e_compress.passes.hoist_linear.sums` writes the algebra
+    out). A layer, a row-wise operator (LayerNorm, Relu), a Transpose or a Concat is
+    computed before the rows that it reads are repeated (Tile, Expand, a Concat of one
+    value), also where views have split or merged their axes. Two consecutive layers
+    become one. A layer is distributed over a sum of which a term is constant, or has
+    fewer rows, or is a layer of few columns. Each is done where it needs fewer
+    multiply-accumulates and is less work in total (:mod:`me2e_compress.passes.work`).
+    Sizes must be known. Outputs are equal up to rounding.
 
     Attributes:
         bytes_per_node: how many bytes of new weights the work of one node may cost.
@@ -97,44 +85,33 @@ class HoistLinear(Pass):
         if opset < OLDEST_OPSET:
             return PassResult(model, 0)
         tally.unread = remove_dead(model.graph)  # it would hold on to what it reads
-        names = value_names(model.graph)
+        names, before = value_names(model.graph), _macs(model)
         rewriters = [
             Rewriter(each, names, self.name) for each in graphs_of(model.graph)
         ]
         for _ in range(ROUNDS):
-            before = tally.changes
-            tally.left = 0  # those of the last round are left
-            tally.refused.clear()
+            changes, tally.left = tally.changes, 0  # those of the last round are left
             for rewriter in rewriters:
                 self._round(rewriter, opset, tally)
-            if tally.changes == before:
+            if tally.changes == changes:
                 break
             remove_dead(model.graph)
-        return PassResult(model, tally.changes, tally.notes())
+        return PassResult(model, tally.changes, tally.notes(before - _macs(model)))
 
     def _round(self, rewriter: Rewriter, opset: int, tally: _Tally) -> None:
-        body = rewriter.graph
-        prices = Prices(self.bytes_per_node)
-        for node in list(body):
-            if node.graph is not body:
+        for node in list(rewriter.graph):
+            if node.graph is not rewriter.graph:
                 continue
-            before = tally.changes
-            # Try products first, then row-wise nodes, then attention operands
             layer = layer_at(node)
-            found = None if layer is None else prices.saving(layer)
-            if layer is not None and found is not None:
-                if rewriter.replace(layer, found.way):
-                    tally.products += 1
-                    tally.macs += found.macs
-            elif do_before_repeats(node, rewriter, opset):
-                tally.others += 1
-            elif (sunk := sink_repeats(node, rewriter, opset)) is not None:
-                tally.others += sunk
-                tally.left += not sunk
-            elif isinstance(fewer := split_operand(node, rewriter), int):
-                tally.operands += 1
-                tally.macs += fewer
-            elif fewer is not None:
-                tally.refused[fewer] += 1
-            if tally.changes > before:
-                prices.forget()
+            moved = before_repeat(node, rewriter, opset)
+            if moved:
+                tally.products += layer is not None
+                tally.others += layer is None
+                continue
+            tally.left += moved is False
+            if layer is not None:
+                tally.products += multiply_earlier(layer, rewriter, self.bytes_per_node)
+
+
+def _macs(model: ir.Model) -> int:
+    return sum(macs(node) or 0 for node in nodes_of(model))

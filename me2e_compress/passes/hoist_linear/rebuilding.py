@@ -1,33 +1,19 @@
-"""Write another way to compute a linear layer into the graph."""
+"""Write new nodes into a graph, and drop what nothing reads any more."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
-from me2e_compress.graph.nodes import VIEWS
 from me2e_compress.graph.rewrite import (
     Array,
-    Numbers,
     add_constant,
     fresh_name,
     inherit,
     is_read,
-    overflow,
     remove_node,
     replace_value,
-)
-from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer
-from me2e_compress.passes.hoist_linear.matrices import Matrix, plus, times, vector_of
-from me2e_compress.passes.hoist_linear.ways import (
-    Composed,
-    Direct,
-    Distributed,
-    Precomputed,
-    Term,
-    Way,
 )
 
 
@@ -38,19 +24,6 @@ class Rewriter:
         self.graph, self.names, self.by = graph, names, by
         self.shapes: dict[tuple[int, ...], ir.Value] = {}
         self.stored: list[ir.Value] = []
-
-    def replace(self, layer: LinearLayer, way: Way) -> bool:
-        """Compute a layer another way; False if a weight would overflow."""
-        writer = _Writer(self, layer)
-        name = layer.weight.name or "weight"
-        stored = layer.weight if layer.is_plain else None
-        try:
-            new = writer.build(way, Matrix(layer.matrix(), stored, name), layer.bias())
-        except OverflowError:
-            self.undo(writer.made)
-            return False
-        self.swap(layer.result, new)
-        return True
 
     def swap(self, old: ir.Value, new: ir.Value) -> None:
         """Replace a value, keep its name, and drop what nothing reads any more."""
@@ -92,19 +65,6 @@ class Rewriter:
             if not is_read(value) and value.is_initializer():
                 del self.graph.initializers[value.name or ""]
 
-    def move(
-        self, node: ir.Node, inputs: list[ir.Value]
-    ) -> tuple[str, list[ir.Value | None], list[ir.Attr], tuple[int, ...]]:
-        """Return operator, inputs, attributes and shape of a node on other rows."""
-        width = (static_shape(inputs[0]) or (0,))[-1]
-        shape = (*(static_shape(node.outputs[0]) or ())[:-1], width)
-        if node.op_type in VIEWS or node.op_type == "Expand":
-            kind = "Expand" if node.op_type == "Expand" else "Reshape"
-            target = self.target(shape, f"{node.outputs[0].name}_shape")
-            return kind, [inputs[0], target], [], shape
-        given = [*inputs, *node.inputs[len(inputs) :]]
-        return node.op_type, given, list(node.attributes.values()), shape
-
     def write(
         self,
         op_type: str,
@@ -127,108 +87,57 @@ class Rewriter:
         return value
 
 
-class _Writer:
-    def __init__(self, rewriter: Rewriter, layer: LinearLayer) -> None:
-        self.rewriter, self.layer = rewriter, layer
-        self.made: list[ir.Value] = []
+class NodeWriter:
+    """Writes nodes of known shapes in front of the node that they replace.
 
-    def build(self, way: Way, matrix: Matrix, bias: Numbers | None) -> ir.Value:
-        return self._write_way(way, matrix, plus(bias, vector_of(way, matrix)))
+    Args:
+        rewriter: of the graph.
+        sources: the replaced node first, then those that go with it.
+        label: what shapes are named after.
+    """
 
-    def _write_way(self, way: Way, matrix: Matrix, vector: Numbers | None) -> ir.Value:
-        # Products and constants end the recursion
-        if isinstance(way, Direct):
-            return self._multiply(way.value, matrix, vector)
-        if isinstance(way, Precomputed):
-            return self._constant(times(way.value, matrix, vector), matrix.name)
-        if isinstance(way, Composed):
-            return self._write_way(way.way, matrix.behind(way), vector)
-        if isinstance(way, Distributed):
-            return self._distribute(way, matrix, vector)
-        # A move: write each distinct part once
-        if len(way.parts) == 1:
-            parts = [self._write_way(way.parts[0], matrix, vector)]
-        else:
-            once = {id(part): part for part in way.parts}  # some stand there twice
-            made = {key: self.build(part, matrix, vector) for key, part in once.items()}
-            parts = [made[id(part)] for part in way.parts]
-        return self._write(*self.rewriter.move(way.node, parts), also=way.node)
+    def __init__(
+        self, rewriter: Rewriter, sources: Sequence[ir.Node], label: str | None
+    ) -> None:
+        self.rewriter, self.sources = rewriter, tuple(sources)
+        self.label = label
+        self.values: list[ir.Value] = []
 
-    def _distribute(
-        self, way: Distributed, matrix: Matrix, vector: Numbers | None
-    ) -> ir.Value:
-        """Write the terms, the fewest rows first, which take the vector."""
-        terms, minus = list(way.terms), way.node.op_type == "Sub"
-        # Constant terms join the vector
-        if not minus:
-            terms.sort(key=lambda term: math.prod(term.shape[:-1]))
-            terms, vector = _without_vectors(terms, matrix, vector)
-        total: ir.Value | None = None
-        # Only the first term takes the vector
-        for term in terms:
-            one = self._write_way(term.way, matrix.part(term), vector)
-            vector = None
-            if total is None:
-                total = one
-                continue
-            shapes = (static_shape(total) or (), static_shape(one) or ())
-            shape, kind = np.broadcast_shapes(*shapes), "Sub" if minus else "Add"
-            total = self._write(kind, [total, one], [], shape, also=way.node)
-        assert total is not None
-        return total
+    def transpose(self, value: ir.Value, order: Sequence[int]) -> ir.Value:
+        """Reorder axes; nothing is written where the order stays."""
+        if list(order) == sorted(order):
+            return value
+        old = static_shape(value) or ()
+        shape = tuple(old[axis] for axis in order)
+        perm = ir.AttrInt64s("perm", list(order))
+        return self._moved(value, self.write("Transpose", [value], shape, [perm]))
 
-    def _multiply(
-        self, value: ir.Value, matrix: Matrix, vector: Numbers | None
-    ) -> ir.Value:
-        if matrix.value is None:
-            matrix.value = self._constant(matrix.numbers, matrix.name)
-        shape = (*(static_shape(value) or ())[:-1], matrix.numbers.shape[1])
-        result = self._write("MatMul", [value, matrix.value], [], shape)
-        if vector is None:
-            return result
-        bias = self._constant(vector, f"{matrix.name}_bias")
-        return self._write("Add", [result, bias], [], shape)
+    def shape(self, value: ir.Value, shape: tuple[int, ...]) -> ir.Value:
+        """Reshape; nothing is written where the shape stays."""
+        if static_shape(value) == shape:
+            return value
+        target = self.rewriter.target(shape, f"{self.label}_shape")
+        return self._moved(value, self.write("Reshape", [value, target], shape))
 
-    def _constant(self, numbers: Numbers, name: str) -> ir.Value:
-        dtype = self.layer.result.dtype
-        assert dtype is not None
-        with np.errstate(over="ignore"):
-            array = numbers.astype(dtype.numpy())
-        if overflow(numbers, array):
-            raise OverflowError(name)
-        return self.rewriter.store(array, name)
+    def _moved(self, value: ir.Value, result: ir.Value) -> ir.Value:
+        result.type = value.type or result.type
+        return result
 
-    def _write(
+    def write(
         self,
         op_type: str,
-        inputs: list[ir.Value] | list[ir.Value | None],
-        attributes: list[ir.Attr],
+        inputs: Sequence[ir.Value | None],
         shape: tuple[int, ...],
-        *,
-        also: ir.Node | None = None,
+        attributes: Sequence[ir.Attr] = (),
     ) -> ir.Value:
-        layer = self.layer
-        sources = layer.nodes if also is None else (*layer.nodes, also)
+        """Write a node of one output."""
         value = self.rewriter.write(
-            op_type, inputs, attributes, shape, sources=sources, like=layer.result
+            op_type,
+            inputs,
+            attributes,
+            shape,
+            sources=self.sources,
+            like=self.sources[0].outputs[0],
         )
-        self.made.append(value)
+        self.values.append(value)
         return value
-
-
-def _without_vectors(
-    terms: list[Term], matrix: Matrix, vector: Numbers | None
-) -> tuple[list[Term], Numbers | None]:
-    """Merge constant terms of one row into the vector, if others have full shape."""
-    kept = [
-        term
-        for term in terms
-        if not isinstance(term.way, Precomputed) or math.prod(term.shape[:-1]) != 1
-    ]
-    full = np.broadcast_shapes(*(term.shape[:-1] for term in terms))
-    if not kept or np.broadcast_shapes(*(term.shape[:-1] for term in kept)) != full:
-        return terms, vector
-    for term in terms:
-        if term not in kept and isinstance(term.way, Precomputed):
-            vector = times(term.way.value, matrix.part(term), vector).reshape(-1)
-    return kept, vector

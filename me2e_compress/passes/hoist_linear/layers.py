@@ -82,7 +82,7 @@ class LinearLayer:
 
 def layer_at(product: ir.Node) -> LinearLayer | None:
     """Return the layer of a product, with its bias where nothing else reads it."""
-    if not _is_product(product):
+    if not is_product(product):
         return None
     reader = sole_reader(product.outputs[0])
     if reader is not None and reader.op_type == "Add" and _adds_bias(reader, product):
@@ -95,16 +95,17 @@ def layer_behind(value: ir.Value) -> LinearLayer | None:
     node = maker(value, "MatMul", "Gemm", "Add")
     if node is None or node.op_type != "Add":
         return (
-            LinearLayer(node, None) if node is not None and _is_product(node) else None
+            LinearLayer(node, None) if node is not None and is_product(node) else None
         )
     for operand in node.inputs:
         product = maker(operand, "MatMul", "Gemm")
-        if product is not None and _is_product(product) and _adds_bias(node, product):
+        if product is not None and is_product(product) and _adds_bias(node, product):
             return LinearLayer(product, node)
     return None
 
 
-def _is_product(node: ir.Node) -> bool:
+def is_product(node: ir.Node) -> bool:
+    """Return whether a node multiplies rows by a constant matrix."""
     if node.op_type not in ("MatMul", "Gemm") or node.domain not in ("", "ai.onnx"):
         return False
     if node.attributes.get_int("transA", 0):

@@ -1,9 +1,15 @@
 """Compute nodes once for all that a repetition repeats, and repeat their result.
 
-Given:   Reshape(Tile(x)) -> Div(c) -> Add(points);  Reshape(Tile(x)) -> Softmax
+Given:   Reshape(Tile(x)) -> MatMul(W) -> Add(points);  Reshape(Tile(x)) -> Softmax
 
-Result:  Reshape(x) -> Div(c) -> Add(points), which repeats by itself;
+Result:  Reshape(x) -> MatMul(W) -> Add(points), which repeats by itself;
          Reshape(x) -> Softmax -> Expand
+
+A row-wise operator f maps every row alone: with R, which repeats rows,
+
+    f(R(x))        =  R(f(x))                 a layer x W, a Softmax, a Relu
+    f(R(x), y)     =  f(x, y)                 an Add repeats the smaller operand itself
+    f(R(x), R(y))  =  R(f(x, y))              a Concat, too
 
 Spatial cross attention repeats its queries for every camera (Li et al., BEVFormer,
 2022, section 3.3): sampling offsets and weights are the same for all of them.
@@ -15,18 +21,24 @@ import math
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, is_standard, static_shape
+from me2e_compress.graph import array_of, is_standard, macs, static_shape
 from me2e_compress.graph.nodes import permutation_of
 from me2e_compress.graph.rewrite import Array, holds_numbers, sole_reader
+from me2e_compress.passes.hoist_linear.layers import is_product
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.repeated_axes import RepeatedAxes, repeated_axes
-from me2e_compress.passes.hoist_linear.repeated_rows import (
+from me2e_compress.passes.hoist_linear.row_wise import (
     BINARY,
     UNARY,
     along_last,
     is_row_wise,
 )
-from me2e_compress.passes.work import MOVED_BYTES_PER_NODE, item_bytes, work
+from me2e_compress.passes.work import (
+    MACS_PER_NODE,
+    MOVED_BYTES_PER_NODE,
+    item_bytes,
+    work,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,14 +60,18 @@ class _Operand:
 
 @dataclasses.dataclass(frozen=True)
 class _Plan:
-    """A node on other operands: the shape of its result, and that of all repeats."""
+    """A node on other operands: the shape of its result, and that of all repeats.
+
+    ``flat`` is the shape of what a Gemm makes, which knows two axes only.
+    """
 
     operands: tuple[_Operand, ...]
     small: tuple[int, ...]
     large: tuple[int, ...]
+    flat: tuple[int, ...] | None = None
 
 
-def sink_repeats(node: ir.Node, rewriter: Rewriter, opset: int) -> bool | None:
+def before_repeat(node: ir.Node, rewriter: Rewriter, opset: int) -> bool | None:
     """Compute a node before the repetition of what it reads.
 
     Returns False where that does not pay, and None where nothing it reads repeats.
@@ -78,7 +94,7 @@ def _plan(node: ir.Node, opset: int) -> _Plan | None:
     value = node.inputs[0] if node.inputs else None
     if node.op_type == "Transpose" and value is not None:
         return _turned(node, value)
-    if value is None or not is_row_wise(node, opset):
+    if value is None or not (is_product(node) or is_row_wise(node, opset)):
         return None
     if node.op_type in BINARY:
         return _combined(node, shape)
@@ -91,9 +107,13 @@ def _plan(node: ir.Node, opset: int) -> _Plan | None:
         return _Plan((operand,), found.small, found.large)
     if not found.small[-1] == found.large[-1] == given[-1]:
         return None
-    return _Plan(
-        (operand,), (*found.small[:-1], shape[-1]), (*found.large[:-1], shape[-1])
-    )
+    small, large = ((*sizes[:-1], shape[-1]) for sizes in (found.small, found.large))
+    if node.op_type != "Gemm":
+        return _Plan((operand,), small, large)
+    rows = math.prod(small[:-1])
+    found = dataclasses.replace(found, small=(rows, given[-1]))
+    operand = _Operand(value, found.small, found)
+    return _Plan((operand,), small, large, (rows, shape[-1]))
 
 
 def _turned(node: ir.Node, value: ir.Value) -> _Plan | None:
@@ -193,7 +213,8 @@ def _pays(node: ir.Node, plan: _Plan) -> bool:
     """Return whether all that is computed once is more than what is written anew."""
     result, item = node.outputs[0], item_bytes(node.outputs[0])
     before, moved = work(node), math.prod(plan.small) * item
-    after = 1.0
+    products = (macs(node) or 0) * math.prod(plan.small) / math.prod(plan.large)
+    after = 1.0 + (plan.flat is not None) + products / MACS_PER_NODE
     for operand in plan.operands:
         moved += math.prod(operand.shape) * item
         if operand.found is None:
@@ -232,13 +253,18 @@ def _rewrite(node: ir.Node, plan: _Plan, rewriter: Rewriter) -> None:
     if node.op_type not in ("Concat", "Transpose"):
         inputs, attributes = along_last(node, inputs, len(plan.small), rewriter)
     new = rewriter.write(
-        node.op_type, inputs, attributes, plan.small, sources=(node,), like=old
-    )
+        node.op_type, inputs, attributes, plan.flat or plan.small,
+        sources=(node,), like=old,
+    )  # fmt: skip
     # Repeat the result, unless its readers see no difference
     found = [each.found for each in plan.operands if each.found is not None]
     sources = (node, *dict.fromkeys(one for each in found for one in each.nodes))
-    forms = {"Expand": plan.large, "Reshape": static_shape(old) or ()}
-    for op_type, shape in forms.items():
+    forms = (
+        ("Reshape", plan.small),
+        ("Expand", plan.large),
+        ("Reshape", static_shape(old) or ()),
+    )
+    for op_type, shape in forms:
         if shape != static_shape(new):
             target = rewriter.target(shape, f"{old.name}_shape")
             new = rewriter.write(
