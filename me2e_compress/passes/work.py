@@ -19,8 +19,7 @@ MOVED_BYTES_PER_NODE = 40_000
 Both at 2 us a node, which is what a GPU takes to launch a kernel and onnxruntime to
 start an operator that allocates; at 100 GMAC/s of float32 products and 20 GB/s through
 element-wise operators on two cores of an AMD Zen 5 (``python -m
-benchmarks.bench_folding --price`` measures a machine). The constants move little: what
-is folded on VAD-tiny is the same from 1 to 4 KB a node.
+benchmarks.bench_folding --price`` measures a machine).
 """
 
 SMALL_PRODUCTS_PER_NODE = 25

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import onnx_ir as ir
 import pytest
 
@@ -14,9 +13,8 @@ from me2e_compress.passes.fold_constants import (
     FoldConstants,
     evaluation,
     knowledge,
-    table,
 )
-from me2e_compress.passes.fold_constants.knowledge import Knowledge
+from me2e_compress.passes.fold_constants.evaluation import Knowledge
 from me2e_compress.runtime.opening import REFUSALS
 
 
@@ -43,16 +41,6 @@ def test_a_value_beyond_the_limit_stays_computed(
     found = FoldConstants(bytes_per_node=0).run(model, Context(ModuleMap.whole())).model
     assert max(rows) * 16 == knowledge.LARGEST
     assert [node.op_type for node in found.graph][-2:] == ["ReduceMax", "Add"]
-
-
-def test_the_table_makes_no_vector_that_the_file_does_not_tell_of() -> None:
-    numbers = [np.array(each, np.int64) for each in (0, 2**40, 1)]
-    values = [ir.Value(name=f"v{at}") for at in range(3)]
-    for node, inputs in (
-        (ir.node("Range", values), numbers),
-        (ir.node("ConstantOfShape", values[:1]), [np.array([2**40])]),
-    ):
-        assert table.evaluate(node, inputs, 17) is None
 
 
 def test_memory_that_runs_out_is_a_refusal() -> None:

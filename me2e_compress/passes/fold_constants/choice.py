@@ -17,7 +17,7 @@ from collections.abc import Container, Iterable
 import onnx_ir as ir
 
 from me2e_compress.graph.activations import value_bytes
-from me2e_compress.passes.fold_constants.knowledge import Expression, Knowledge
+from me2e_compress.passes.fold_constants.evaluation import Expression, Knowledge
 
 ENTRY_BYTES = 64
 """Bytes of an initializer in the file besides its data: name, shape, type."""

@@ -1,5 +1,6 @@
 """Evaluate constant expressions with onnxruntime: all at once, or one by one."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,11 +11,35 @@ import onnxruntime
 
 from me2e_compress.graph import array_of
 from me2e_compress.graph.rewrite import Array
-from me2e_compress.passes.fold_constants.knowledge import Expression, Knowledge
 from me2e_compress.runtime.opening import REFUSALS
 
 SILENT = 4
 """onnxruntime's log level "fatal": the notes report what cannot be evaluated."""
+
+
+@dataclasses.dataclass(eq=False)
+class Expression:
+    """Equal nodes of constants; each input is replaced by its first equal."""
+
+    nodes: list[ir.Node]
+    inputs: tuple[ir.Value | None, ...]
+
+
+@dataclasses.dataclass
+class Knowledge:
+    """What is known about the values of one graph.
+
+    ``first`` maps a value that is computed twice to the first value that equals it.
+    """
+
+    arrays: dict[ir.Value, Array]
+    expressions: list[Expression]
+    maker: dict[ir.Value, Expression]
+    first: dict[ir.Value, ir.Value]
+
+    def canonical(self, value: ir.Value) -> ir.Value:
+        """Return the first value equal to this one."""
+        return self.first.get(value, value)
 
 
 def evaluate(
@@ -28,7 +53,7 @@ def evaluate(
     if not needed:
         return {}, []
     try:
-        return _run(needed, list(values), known.arrays, known, opset), []
+        return run(needed, list(values), known.arrays, opset), []
     except REFUSALS:
         return _one_by_one(needed, values, known, opset)
 
@@ -48,7 +73,7 @@ def _one_by_one(
         if any(value in known.maker and value not in done for value in inputs):
             continue
         try:
-            done.update(_run([one], outputs, done, known, opset))
+            done.update(run([one], outputs, done, opset))
         except REFUSALS:
             refused.extend(one.nodes)
     found = {value: done[value] for value in values if value in done}
@@ -67,13 +92,13 @@ def _needed(values: Sequence[ir.Value], known: Knowledge) -> list[Expression]:
     return [one for one in known.expressions if one in wanted]
 
 
-def _run(
+def run(
     expressions: Sequence[Expression],
     values: Sequence[ir.Value],
     arrays: Mapping[ir.Value, Any],
-    known: Knowledge,
     opset: int,
 ) -> dict[ir.Value, Any]:
+    """Compute values of expressions, as written, in one session of onnxruntime."""
     names: dict[ir.Value, str] = {}
     feeds: dict[str, Any] = {}
     nodes = [_node(one, names, feeds, arrays) for one in expressions]

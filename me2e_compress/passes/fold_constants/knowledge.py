@@ -1,6 +1,5 @@
 """A forward sweep that finds the values of a graph that are known before it runs."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -10,8 +9,10 @@ from me2e_compress.graph import array_of, static_shape
 from me2e_compress.graph.activations import value_bytes
 from me2e_compress.graph.nodes import DRAWS, NATIVE, attribute_values
 from me2e_compress.graph.rewrite import Array, has_subgraph, is_standard
-from me2e_compress.passes.fold_constants import table
+from me2e_compress.passes.fold_constants import evaluation
+from me2e_compress.passes.fold_constants.evaluation import Expression, Knowledge
 from me2e_compress.passes.fold_constants.inference import learn_shapes
+from me2e_compress.runtime.opening import REFUSALS
 
 SMALL = 1024
 """Arrays of up to this many elements (shapes, indices) are computed immediately."""
@@ -31,31 +32,6 @@ COMPUTE = frozenset(
     {"Conv", "ConvTranspose", "Einsum", "Gemm", "GridSample", "MatMul", "Softmax"}
 )
 """Operators through which folding turns a computation into a weight."""
-
-
-@dataclasses.dataclass(eq=False)
-class Expression:
-    """Equal nodes of constants; each input is replaced by its first equal."""
-
-    nodes: list[ir.Node]
-    inputs: tuple[ir.Value | None, ...]
-
-
-@dataclasses.dataclass
-class Knowledge:
-    """What is known about the values of one graph.
-
-    ``first`` maps a value that is computed twice to the first value that equals it.
-    """
-
-    arrays: dict[ir.Value, Array]
-    expressions: list[Expression]
-    maker: dict[ir.Value, Expression]
-    first: dict[ir.Value, ir.Value]
-
-    def canonical(self, value: ir.Value) -> ir.Value:
-        """Return the first value equal to this one."""
-        return self.first.get(value, value)
 
 
 class Sweep:
@@ -153,7 +129,6 @@ class Sweep:
         ):
             return
         # Group nodes of equal operator, inputs and attributes
-        small = self._evaluate(node)
         inputs = tuple(
             None if value is None else self.known.canonical(value)
             for value in node.inputs
@@ -166,6 +141,7 @@ class Sweep:
             self.known.expressions.append(equal)
         equal.nodes.append(node)
         # Enter its outputs, with their arrays if they are small
+        small = self._evaluate(equal)
         for first, value in zip(equal.nodes[0].outputs, node.outputs, strict=True):
             self.known.maker[value] = equal
             if value is not first:
@@ -175,28 +151,28 @@ class Sweep:
                 if value.shape is None and not value.is_graph_output():
                     value.shape = ir.Shape(small.shape)
 
-    def _evaluate(self, node: ir.Node) -> Array | None:
-        if len(node.outputs) != 1:
-            return None
+    def _evaluate(self, one: Expression) -> Array | None:
+        node, arrays = one.nodes[0], self.known.arrays
+        output = node.outputs[0]
+        if len(node.outputs) != 1 or output in arrays:
+            return arrays.get(output)
         # Shapes need no data
         if node.op_type in ("Shape", "Size"):
             shape = static_shape(node.inputs[0])
             return None if shape is None else _shape(node, shape)
-        expected = static_shape(node.outputs[0])
+        # Other nodes are computed if they are small and fully known
+        expected = static_shape(output)
         if expected is None or math.prod(expected) > SMALL:
             return None
-        # Other nodes are computed if they are small and fully known
-        inputs = [
-            None if value is None else self.known.arrays.get(value)
-            for value in node.inputs
-        ]
-        if any(
-            array is None and value is not None
-            for array, value in zip(inputs, node.inputs, strict=True)
-        ):
+        if any(value is not None and value not in arrays for value in one.inputs):
             return None
-        result = table.evaluate(node, inputs, self.opset)
-        return result if result is None or result.shape == expected else None
+        try:
+            found = evaluation.run([one], [output], arrays, self.opset)[output]
+        except REFUSALS:
+            return None
+        # It may be a sequence, or have another shape than the file claims
+        is_array = isinstance(found, np.ndarray) and found.shape == expected
+        return found if is_array else None
 
 
 def _shape(node: ir.Node, shape: tuple[int, ...]) -> Array:
