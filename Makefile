@@ -57,12 +57,12 @@ $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)
 	$(BIN)/python -m pip install -q -c constraints.txt -e '.[highway,fast]'
 	touch $@
 
-$(VENV)/.test: pyproject.toml constraints.txt | $(VENV)
-	$(BIN)/python -m pip install -q -c constraints.txt -e '.[zoo,highway,fast,bench,ray,trt-check,test]'
+$(VENV)/.test: pyproject.toml constraints.txt models/requirements.txt | $(VENV)
+	$(BIN)/python -m pip install -q -c constraints.txt -r models/requirements.txt -e '.[highway,fast,bench,ray,trt-check,test]'
 	touch $@ $(VENV)/.demo
 
 $(VENV)/.docs: pyproject.toml constraints.txt | $(VENV)
-	$(BIN)/python -m pip install -q -c constraints.txt -e '.[zoo,highway,fast,ray,docs]'
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[highway,fast,ray,docs]'
 	touch $@
 
 $(VENV):

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from me2e_compress.cli.app import COMMANDS
-from me2e_compress.zoo.shipped import WEIGHTS
+from me2e_compress.shipped.drivers import WEIGHTS
 
 FRAMES = str(WEIGHTS / "highway-frames")
 ROUTE = {
@@ -45,9 +45,7 @@ USES = (
     "doctor",
     "list",
     "export highway -o copy.onnx",
-    "export tcp -o tcp.onnx",
     "inspect highway",
-    "frames vad-tiny -n 1 -o synthetic",
     "frames highway -n 4 -o frames",
     "plan highway --scheme full",
     f"calibrate highway {FRAMES} -o ranges.json",

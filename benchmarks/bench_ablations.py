@@ -23,15 +23,15 @@ from benchmarks.paper.published import (
     MODULES_AWAY_OF_VAD,
     PublishedDrive,
 )
+from benchmarks.subjects import write_source
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import Me2eError
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
-from me2e_compress.workflows.export import export_stack
+from me2e_compress.shipped.drivers import sample_frames
 from me2e_compress.workflows.inspect import weigh
-from me2e_compress.zoo.shipped import sample_frames
 
 LEDGER_M = {
     "uniad-scheme-1": 14.455,
@@ -121,7 +121,7 @@ def rows(name: str, out: Path) -> Iterable[str]:
     """
     stack, source = STACKS[name], out / f"{name}.onnx"
     if not source.is_file():
-        export_stack(name, source)
+        write_source(name, source)
     frames = sample_frames(source)
     recording = None if frames is None else CalibrationSet(frames)
     context = Context(ModuleMap.load(stack.preset), recording)

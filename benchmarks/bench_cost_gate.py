@@ -26,14 +26,14 @@ from me2e_compress.graph import static_shape
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.shipped.drivers import shipped
 from me2e_compress.targets import Target
 from me2e_compress.targets.biases import biased_end
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.onnxruntime.costs import costs_of
 from me2e_compress.targets.onnxruntime.kernels import end_of, has_kernel
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
-from me2e_compress.zoo.export import export
-from me2e_compress.zoo.shipped import shipped
+from models.export import export
 
 NEAR = 0.05
 """A difference of that part of the float time is a tie."""

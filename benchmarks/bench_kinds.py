@@ -2,7 +2,7 @@
 
     python -m benchmarks.bench_kinds OUT [--only vit,detr] [--peer-python PYTHON]
 
-The models are those of :mod:`benchmarks.model_kinds` (extra ``models``). First every
+The models are those of :mod:`benchmarks.model_kinds` (transformers). First every
 tool simplifies what was exported: nodes, MB with the weights beside the graph, CPU
 seconds of the work, and the largest relative error of an output on a frame that is held
 out, against torch. Then ours and the peers

@@ -3,7 +3,7 @@
     python -m benchmarks.bench_observers outliers OUT
     python -m benchmarks.bench_observers scenes benchmarks/observers
 
-``outliers`` gives TCP and VAD-tiny of the zoo, whose weights are random, outliers of
+``outliers`` gives TCP and VAD-tiny of models/, whose weights are random, outliers of
 trained size, and prints the SQNR of every output on held-out frames under each method.
 ``scenes`` prints how far ranges of the driver differ between recordings, and between a
 few scenes and all: the sources of two constants of ``calibration/review.py``.
@@ -191,15 +191,14 @@ def losses(
 def _subject(
     name: str, out: Path
 ) -> tuple[ir.Model, CalibrationSet, CalibrationSet, ModuleMap]:
-    from benchmarks.subjects import SCENE, make
+    from benchmarks.subjects import make, write_frames
     from me2e_compress.workflows.checks import load_map
-    from me2e_compress.workflows.frames import FramesOptions, record_frames
 
     calibrated, held_out = FRAMES[name]
     subject = make(name, out, calibrated)
     folder = subject.folder / f"held-out-{held_out}"
     if not folder.is_dir():
-        record_frames(name, folder, FramesOptions(held_out, 1, SCENE))
+        write_frames(name, folder, held_out, 1)
     model = graph.load(subject.model)
     rewrite.lift_constants(model)
     graph.infer_shapes(model)

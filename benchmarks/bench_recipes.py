@@ -23,8 +23,8 @@ from me2e_compress.fidelity.liveness import LivenessTally
 from me2e_compress.manager import recipe
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.compress import CompressOptions, compress
-from me2e_compress.workflows.frames import FramesOptions, record_frames
-from me2e_compress.zoo.export import export
+from models.export import export
+from models.frames import record
 
 STACK, PLAN = "vad-tiny", "ego_fut_preds"
 OF_OTHERS = ("minus-", "uniad-")
@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         source = export(STACK, folder / f"{STACK}.onnx")
         seen, held_out = (
-            record_frames(STACK, folder / name, FramesOptions(count, seed, length))
+            record(STACK, folder / name, count, seed=seed, scene_length=length)
             for name, count, seed, length in (
                 ("frames", 8, 0, 4),
                 ("held-out", 4, 1, 1),

@@ -24,7 +24,7 @@ every file: others read the exported file after our passes ``static-geometry`` a
 that against the file as exported.
 
 ``vad-tiny-original`` is VAD-tiny as the published code writes it
-(:mod:`benchmarks.original_patterns`); ``deformable-detr`` needs the extra ``models``
+(:mod:`benchmarks.original_patterns`); ``deformable-detr`` needs transformers
 and has no PyTorch row.
 """
 

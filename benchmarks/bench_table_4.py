@@ -22,6 +22,7 @@ import onnx_ir as ir
 
 from benchmarks.paper.published import INT8_COUNTS
 from benchmarks.paper.weigh import int8_counts
+from benchmarks.subjects import write_source
 from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import Me2eError
@@ -32,7 +33,6 @@ from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.compress import CompressOptions, compress
-from me2e_compress.workflows.export import export_stack
 from me2e_compress.workflows.lint import LintOptions, lint
 
 PRESETS = {"uniad-tiny": "uniad", "vad-tiny": "vad"}
@@ -83,7 +83,7 @@ def prepared(name: str, out: Path) -> Path:
     source, exact = out / f"{name}.onnx", out / name / "exact.onnx"
     exact.parent.mkdir(parents=True, exist_ok=True)
     if not source.is_file():
-        export_stack(name, source)
+        write_source(name, source)
     if not exact.is_file():
         unchecked = CompressOptions(module_map=PRESETS[name], verify_frames=0)
         compress(source, exact, "exact", options=unchecked)

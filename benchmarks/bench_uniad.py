@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from me2e_compress.zoo.stacks import Stack, find
+from models.stacks import Stack, find
 
 STEPS = ("export", "torch", "onnxruntime", "truth")
 
@@ -74,7 +74,7 @@ def _model(given: argparse.Namespace) -> Path:
 
 
 def _export(given: argparse.Namespace) -> dict[str, object]:
-    from me2e_compress.zoo.export import export
+    from models.export import export
 
     path = _model(given)
     if given.resume and path.exists():
@@ -85,7 +85,7 @@ def _export(given: argparse.Namespace) -> dict[str, object]:
 
 
 def _frames(spec: Stack, count: int) -> list[dict[str, np.ndarray]]:
-    from me2e_compress.zoo.synthetic_frames import frames
+    from models.synthetic_frames import frames
 
     return list(frames(spec, count, 7, scene_length=count))
 
@@ -100,7 +100,7 @@ def _nothing(spec: Stack) -> dict[str, np.ndarray]:
 def _torch(given: argparse.Namespace) -> dict[str, object]:
     import torch
 
-    from me2e_compress.zoo.export import build
+    from models.export import build
 
     spec, model = find(given.stack), build(given.stack)
 
@@ -162,7 +162,7 @@ def _truth(given: argparse.Namespace) -> dict[str, object]:
     import onnx_ir as ir
 
     from me2e_compress.graph.modules import ModuleMap, assign
-    from tests.zoo.truth import record
+    from models.tests.truth import record
 
     known = record(given.stack, opset=given.opset)
     graph = ir.load(_model(given))

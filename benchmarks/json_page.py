@@ -38,7 +38,6 @@ from me2e_compress.workflows.lint import RuleSummary
 from me2e_compress.workflows.measured_loss import MeasuredLoss
 from me2e_compress.workflows.runtime_loss import RuntimeLoss
 from me2e_compress.workflows.split import SplitResult
-from me2e_compress.zoo.weights_record import WeightsRecord
 
 PAGE = Path(__file__).parents[1] / "docs" / "json.md"
 FORMS = Path(__file__).with_name("json_forms.txt")

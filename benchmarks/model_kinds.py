@@ -3,7 +3,7 @@
     python -m benchmarks.model_kinds OUT [--only vit,detr]
 
 Each becomes ``OUT/NAME/source.onnx`` with ``frames`` and ``held-out`` beside it. The
-architectures are those of ``transformers``' configurations (extra ``models``) or of
+architectures are those of ``transformers``' configurations or of
 :mod:`benchmarks.own_kinds`; the way each is exported is the kind: float16, weights in a
 file beside the graph, a symbolic batch and image size, torch's older and newer
 exporter. Normalisations have seen images, so that signals neither vanish nor explode.

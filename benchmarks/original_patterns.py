@@ -1,6 +1,6 @@
-"""VAD-tiny of the zoo in the forms of the original code (hustvl/VAD).
+"""VAD-tiny of models/ in the forms of the original code (hustvl/VAD).
 
-The zoo writes the network more thriftily than the published code does. Here the same
+models/ writes the network more thriftily than the published code does. Here the same
 weights compute the same outputs in the original's way, so that a measurement says what
 the passes do for who exports that:
 
@@ -20,28 +20,28 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from me2e_compress.zoo.bev.attention import (
+from models.bev.attention import (
     DecoderAttention,
     MultiheadAttention,
     PackedAttention,
     deformable_attention,
 )
-from me2e_compress.zoo.bev.decoder import Decoded, Decoder
-from me2e_compress.zoo.bev.encoder import (
+from models.bev.decoder import Decoded, Decoder
+from models.bev.encoder import (
     BevEncoder,
     CameraAttention,
     TemporalSelfAttention,
 )
-from me2e_compress.zoo.bev.sizes import ATTENTION_HEADS, CAMERAS, EMBED, PILLAR_POINTS
-from me2e_compress.zoo.export import build, save, trace
-from me2e_compress.zoo.stacks import VAD_TINY
-from me2e_compress.zoo.vad.config import MAP_REACH, MAP_SCORE
-from me2e_compress.zoo.vad.perception import AgentOutputs, MapOutputs
-from me2e_compress.zoo.vad.planner import PlanningHead
+from models.bev.sizes import ATTENTION_HEADS, CAMERAS, EMBED, PILLAR_POINTS
+from models.export import build, save, trace
+from models.stacks import VAD_TINY
+from models.vad.config import MAP_REACH, MAP_SCORE
+from models.vad.perception import AgentOutputs, MapOutputs
+from models.vad.planner import PlanningHead
 
 NAME = "vad-tiny-original"
 OF = "vad-tiny"
-"""The stack of the zoo whose weights and frames it has."""
+"""The stack whose weights and frames it has."""
 OPSET = 17
 READS_MAP = "pts_bbox_head.motion_map_decoder"
 EPSILON = 1e-5
@@ -49,18 +49,18 @@ EPSILON = 1e-5
 
 
 def export(path: Path) -> None:
-    """Write the ONNX file, with the metadata of the zoo's."""
+    """Write the ONNX file, with the metadata of the stack's."""
     spec = VAD_TINY.with_heads(None)
     save(trace(spec, original(), OPSET), spec.metadata(), path)
 
 
 def original(seed: int = 0) -> nn.Module:
-    """Build the zoo's stack with the zoo's weights, in the original's forms."""
+    """Build the stack with its weights, in the original's forms."""
     return restored(build(OF, seed=seed))
 
 
 def restored(model: nn.Module) -> nn.Module:
-    """Give a stack of the zoo the original's code, in place.
+    """Give a stack of models/ the original's code, in place.
 
     Motion's map attention gets sequences first; in front of the others stand the
     transpositions that the original has around its layers.
@@ -297,4 +297,4 @@ FORMS: dict[type[nn.Module], type[nn.Module]] = {
     Decoder: Refining,
     PlanningHead: Head,
 }
-"""The original's form of each module of the zoo."""
+"""The original's form of each module of models/."""

@@ -1,8 +1,8 @@
-"""TCP of the zoo with the branches that the original answers too (OpenDriveLab/TCP).
+"""TCP of models/ with the branches that the original answers too (OpenDriveLab/TCP).
 
-The zoo leaves out what is used in training alone: the speed, the value of both branches
-and the joint features, which the original's forward returns beside the waypoints and
-the actions. Who exports that model gets all eight.
+The stack leaves out what is used in training alone: the speed, the value of both
+branches and the joint features, which the original's forward returns beside the
+waypoints and the actions. Who exports that model gets all eight.
 """
 
 import dataclasses
@@ -12,14 +12,14 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.drawing import draw_weights
-from me2e_compress.zoo.export import build, save, trace
-from me2e_compress.zoo.stacks import TCP
-from me2e_compress.zoo.tcp.stack import GAINS, Tcp
+from models.drawing import draw_weights
+from models.export import build, save, trace
+from models.stacks import TCP
+from models.tcp.stack import GAINS, Tcp
 
 NAME = "tcp-original"
 OF = "tcp"
-"""The stack of the zoo whose weights and frames it has."""
+"""The stack whose weights and frames it has."""
 OPSET = 17
 OUTPUTS = (
     *("pred_speed", "pred_value_traj", "pred_features_traj", "pred_wp"),
@@ -28,7 +28,7 @@ OUTPUTS = (
 
 
 def export(path: Path, seed: int = 0) -> None:
-    """Write the ONNX file, with the metadata of the zoo's."""
+    """Write the ONNX file, with the metadata of the stack's."""
     spec = dataclasses.replace(TCP.with_heads(None), outputs=OUTPUTS)
     made = build(OF, seed=seed)
     assert isinstance(made, Tcp)
@@ -36,7 +36,7 @@ def export(path: Path, seed: int = 0) -> None:
 
 
 class Branches(nn.Module):
-    """The zoo's network, and the branches behind what it computes on the way."""
+    """The stack's network, and the branches behind what it computes on the way."""
 
     def __init__(self, model: Tcp, seed: int) -> None:
         super().__init__()

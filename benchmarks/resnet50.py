@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.resnet import ResNet50
-from me2e_compress.zoo.stacks import VAD_TINY
-from me2e_compress.zoo.synthetic_frames import frames
+from models.resnet import ResNet50
+from models.stacks import VAD_TINY
+from models.synthetic_frames import frames
 
 SIDE = 224
 CLASSES = 1000

@@ -10,7 +10,7 @@ resident set in MB; OUT.npz gets the outputs of the last.
 
 Engines: ``onnxruntime`` (defaults), ``ours`` (a Session of this package: the same
 onnxruntime, with the kernels of fused nodes), ``openvino-f32``, ``openvino-bf16``, and
-``torch``, ``torch-compile``, where MODEL.onnx is the name of a stack of the zoo or
+``torch``, ``torch-compile``, where MODEL.onnx is the name of a stack of models/ or
 ``vad-tiny-original``.
 """
 
@@ -36,8 +36,8 @@ def torch_eager(
     import torch
 
     from benchmarks import original_patterns
-    from me2e_compress.zoo.export import build
-    from me2e_compress.zoo.stacks import find
+    from models.export import build
+    from models.stacks import find
 
     torch.set_num_threads(threads)
     originally = stack == original_patterns.NAME

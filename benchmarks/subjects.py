@@ -4,10 +4,10 @@
 * ``bev-head``: see :mod:`benchmarks.bev_head`.
 * ``vad-tiny``: the reference stack.
 * ``vad-tiny-original``: the same, see :mod:`benchmarks.original_patterns`.
-* ``uniad-tiny``, ``tcp``: other stacks of the zoo.
+* ``uniad-tiny``, ``tcp``: other stacks of models/.
 * ``tcp-original``: with all eight outputs, see :mod:`benchmarks.original_tcp`.
 * ``highway``: the driver that ships; its frames need the extra ``highway``.
-* the models of :mod:`benchmarks.model_kinds`, which need the extra ``models``.
+* the models of :mod:`benchmarks.model_kinds`, which need transformers.
 
 The model in the folder is what ``quantize-int8`` sees: the exact passes are done.
 """
@@ -21,14 +21,17 @@ import numpy as np
 from benchmarks import bev_head, original_patterns, original_tcp, resnet50
 from benchmarks.subject import Subject, at
 from me2e_compress import graph
+from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.export import export_stack
 from me2e_compress.workflows.frames import FramesOptions, record_frames
+from models.export import export
+from models.frames import record
 
 __all__ = ["SUBJECTS", "Subject", "at", "make"]
 
 ORIGINALS = {each.NAME: each for each in (original_patterns, original_tcp)}
-"""Stacks of the zoo in the forms of the published code."""
+"""Stacks of models/ in the forms of the published code."""
 PRESETS = {
     "vad-tiny": "vad",
     "vad-tiny-original": "vad",
@@ -37,7 +40,7 @@ PRESETS = {
     "tcp-original": "tcp",
     "highway": "highway",
 }
-"""Module maps of the stacks of the zoo."""
+"""Module maps of the stacks of models/."""
 SUBJECTS = ("resnet50", "bev-head", *PRESETS)
 WHOLE = """
 [modules.network]
@@ -65,6 +68,22 @@ def make(name: str, out: Path, frames: int, held_out: int = HELD_OUT) -> Subject
     return subject
 
 
+def write_source(name: str, path: Path) -> None:
+    """Write a driver that ships, or a stack of models/."""
+    if name in SHIPPED:
+        export_stack(name, path)
+    else:
+        export(name, path)
+
+
+def write_frames(name: str, folder: Path, count: int, seed: int) -> None:
+    """Record frames of a driver that ships, or of a stack of models/."""
+    if name in SHIPPED:
+        record_frames(name, folder, FramesOptions(count, seed, SCENE))
+    else:
+        record(name, folder, count, seed=seed, scene_length=SCENE)
+
+
 def _make_kind(subject: Subject) -> Subject:
     """Write a model of another kind; one module holds all of it."""
     from benchmarks import model_kinds
@@ -82,7 +101,7 @@ def _export(subject: Subject) -> None:
         if subject.name in ORIGINALS:
             ORIGINALS[subject.name].export(subject.source)
         else:
-            export_stack(subject.name, subject.source)
+            write_source(subject.name, subject.source)
         preset = f"modules/presets/{PRESETS[subject.name]}.toml"
         text = (Path(graph.__file__).parent / preset).read_text("utf-8")
     else:
@@ -97,7 +116,7 @@ def _export(subject: Subject) -> None:
 def _record(name: str, folder: Path, count: int, seed: int) -> None:
     if name in PRESETS:
         stack = ORIGINALS[name].OF if name in ORIGINALS else name
-        record_frames(stack, folder, FramesOptions(count, seed, SCENE))
+        write_frames(stack, folder, count, seed)
     elif name == "bev-head":
         bev_head.record(folder, count, seed)
     else:

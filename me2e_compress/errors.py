@@ -56,6 +56,23 @@ FORMER = {
     "--abilities": "--abilities is gone since 0.3.0: the rules are those of 0.0.4",
     "--penalties": "--penalties is gone since 0.3.0: they are Bench2Drive's",
     "--modelled": f"--modelled {_NOW} --joules, measured",
+    **{
+        f"stack {name}": f"{name} {_NOW} a file: python -m models.export {name}; its"
+        f" frames: python -m models.frames {name}"
+        for name in ("vad-tiny", "uniad-tiny", "uniad-trt", "tcp")
+    },
+    **{
+        f"export {option}": f"{option} {_NOW} python -m models.export"
+        for option in (
+            "--opset",
+            "--heads",
+            "--seed",
+            "--dialect",
+            "--weights",
+            "--ema",
+        )
+    },
+    "demo --stack": f"--stack {_NOW} python -m models.export",
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""
 

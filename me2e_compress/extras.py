@@ -9,9 +9,7 @@ MODULES = {
     "highway": ("highway_env", "gymnasium", "cv2", "jinja2", "matplotlib"),
     "fast": ("numba", "llvmlite"),
     "ray": ("ray",),
-    "zoo": ("torch", "onnxscript", "safetensors"),
     "bench": ("onnxslim",),
-    "models": ("transformers",),
     "trt-check": ("tensorrt_rtx",),
 }
 """The modules that each extra brings, as they are imported."""

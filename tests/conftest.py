@@ -1,10 +1,7 @@
 import gc
 from collections.abc import Iterator
-from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
-import onnx
 import onnx_ir as ir
 import pytest
 
@@ -12,11 +9,6 @@ from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.workflows import first_opening
 from tests import profiles
-
-if TYPE_CHECKING:
-    from me2e_compress.zoo.vad.stack import VadTiny
-    from tests.zoo.truth import Truth
-    from tests.zoo.vad.sizes import VadSize
 
 DRIVER = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -93,35 +85,3 @@ def driver_map() -> ModuleMap:
 @pytest.fixture
 def context(driver_map: ModuleMap) -> Context:
     return Context(driver_map)
-
-
-@pytest.fixture(
-    scope="session",
-    params=["small", pytest.param("published", marks=pytest.mark.slow)],
-)
-def vad_size(request: pytest.FixtureRequest) -> "VadSize":
-    """How large VAD-tiny is: what runs at its published size is slow."""
-    from tests.zoo.vad.sizes import SIZES
-
-    return SIZES[request.param]
-
-
-@pytest.fixture(scope="session")
-def vad_tiny(vad_size: "VadSize", tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The exported reference stack, seed 0, opset 17, nuScenes heads."""
-    return vad_size.export(tmp_path_factory.mktemp("zoo") / "vad-tiny.onnx")
-
-
-@pytest.fixture(scope="session")
-def vad_torch(vad_size: "VadSize") -> "VadTiny":
-    """The same in torch."""
-    return vad_size.build()
-
-
-@pytest.fixture(scope="session")
-def vad_truth(vad_size: "VadSize", vad_tiny: Path, vad_torch: "VadTiny") -> "Truth":
-    """What its trace knew: the module of every node, and torch's own MACs."""
-    from tests.zoo.truth import truth_of
-
-    plain = onnx.load(vad_tiny, load_external_data=False)
-    return truth_of(vad_size.stack, vad_torch, plain=plain)

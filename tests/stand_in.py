@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 from onnx import numpy_helper
 
-from me2e_compress.zoo.shipped import SHIPPED
+from me2e_compress.shipped.drivers import SHIPPED
 from tests.frames import record
 
 WIDTH = 8

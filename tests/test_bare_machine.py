@@ -19,19 +19,11 @@ from me2e_compress.extras import MODULES
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS: Mapping[str, list[str]] = PROJECT["optional-dependencies"]
-TOOLS = ("bench", "docs", "models", "test")
+TOOLS = ("bench", "docs", "test")
 """Extras whose own packages no module of ours imports: they are blocked together."""
 PACKAGE = "me2e_compress"
 ALL, EVERY_TOOL = "all at once", "+".join(TOOLS)
 
-TORCH = (
-    "zoo.bev",
-    "zoo.tcp",
-    "zoo.uniad",
-    "zoo.vad",
-    "zoo.drawing",
-    "zoo.resnet",
-)
 WORLD = (
     "evaluators.highway.blind",
     "evaluators.highway.driven_frames",
@@ -72,7 +64,6 @@ KERNELS = (
 )
 ROOMS: Mapping[str, tuple[str, ...]] = {
     "highway": WORLD,
-    "zoo": TORCH,
     "fast": KERNELS,
     "trt-check": ("targets.tensorrt.rtx.rtx_main",),
 }
@@ -116,8 +107,7 @@ def modules_of(packages: set[str]) -> set[str]:
 def blocked() -> dict[str, list[str]]:
     """Return the modules that are missing without each extra, and without any.
 
-    Without one it is what the extra names, and what none of the others needs. The torch
-    of `models` is that of `zoo`.
+    Without one it is what the extra names, and what none of the others needs.
     """
     needs = {extra: list(map(Requirement, listed)) for extra, listed in EXTRAS.items()}
     base = distributions(map(Requirement, PROJECT["dependencies"]))

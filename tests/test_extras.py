@@ -1,6 +1,7 @@
 """What is said where an extra is not installed, or only half."""
 
 import pickle
+import re
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -21,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 
 def commands() -> Mapping[str, tuple[str, ...]]:
     """Return words that need an extra, by the module of it that is broken."""
-    frames = str(ROOT / "me2e_compress/zoo/weights/highway-frames")
+    frames = str(ROOT / "me2e_compress/shipped/weights/highway-frames")
     return {
         "highway_env": ("evaluate", "blind", "--routes", "1", "-o", "out"),
         "cv2": ("evaluate", "highway", "--routes", "1", "-o", "out"),
@@ -30,7 +31,6 @@ def commands() -> Mapping[str, tuple[str, ...]]:
             *("--samples", "1", "--figure", "f.png"),
         ),
         "jinja2": ("study", "smoke", "-o", "out", "--dry-run"),
-        "torch": ("export", "tcp", "-o", "tcp.onnx"),
         "ray": (*("evaluate", "blind", "--routes", "1", "--engine", "ray"), "-o", "o"),
         "tensorrt_rtx": ("lint", "highway", "--target", "tensorrt", "--trt-check"),
     }
@@ -61,6 +61,15 @@ def test_a_half_installed_extra_is_one_line(
     assert reason in line
     (extra, *_) = (name for name, brings in MODULES.items() if module in brings)
     assert line.endswith(f"pip install --force-reinstall 'me2e-compress[{extra}]'")
+
+
+def test_nothing_in_the_package_imports_torch() -> None:
+    torch = re.compile(
+        r"^\s*(?:import|from) torch\b|import_module\(.torch", re.MULTILINE
+    )
+    package = ROOT / "me2e_compress"
+    files = [path for path in package.rglob("*.py") if torch.search(path.read_text())]
+    assert files == []
 
 
 @pytest.mark.parametrize("extra", MODULES)
@@ -122,7 +131,7 @@ def test_a_defect_of_ours_keeps_its_traceback(
 @pytest.mark.parametrize(
     "error",
     [
-        MissingExtraError("torch", "zoo"),
+        MissingExtraError("ray", "ray"),
         BrokenPackageError("cv2", "highway", "libGL.so.1"),
         MissingPackageError("pandas"),
     ],

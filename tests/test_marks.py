@@ -20,7 +20,7 @@ from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.workflows.latency_figure import draw_modules
-from me2e_compress.zoo.export import save as save_export
+from models.export import save as save_export
 from tests.graph.test_files import weighted
 from tests.workflows.test_latency_figure import trace_of
 

@@ -60,9 +60,7 @@ _PANELS = {
         ),
     },
     "Graphs and frames": {
-        "export": (
-            "Write a reference stack: random weights, a checkpoint's, or our driver."
-        ),
+        "export": "Write a trained driver that ships.",
         "inspect": (
             "Show what a graph holds: interface, and nodes, parameters, MACs by module."
         ),
@@ -140,7 +138,8 @@ class LazyGroup(TyperGroup):
         if name is None:
             return name, known, rest
         for word in rest:
-            if gone := FORMER.get(word.partition("=")[0]):
+            option = word.partition("=")[0]
+            if gone := FORMER.get(f"{name} {option}", FORMER.get(option)):
                 ctx.fail(gone)
         # only the command that is called is imported
         loaded = COMMANDS[name].load()

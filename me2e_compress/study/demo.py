@@ -2,10 +2,12 @@
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 
 from me2e_compress.evaluators.highway.engine import LocalEngine
+from me2e_compress.manager import recipe
 from me2e_compress.quantization.plan import plan_of
-from me2e_compress.runtime.providers import CPU, PROVIDERS
+from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
@@ -16,18 +18,20 @@ from me2e_compress.study.tables import differences, scoreboards
 from me2e_compress.study.verdict import before_and_after, road_verdict
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.study.write import StudyFiles, write_study
+from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.claims import check_ours
-from me2e_compress.workflows.compare import CompareResult
+from me2e_compress.workflows.compare import CompareResult, compare
+from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import CompressResult, beside
-from me2e_compress.workflows.demo_stack import Demo
-from me2e_compress.workflows.export import ExportOptions, export_stack
+from me2e_compress.workflows.export import export_stack
+from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.workflows.listener import Listener
-from me2e_compress.workflows.module_changes import ModuleChanges
+from me2e_compress.workflows.module_changes import ModuleChanges, compare_modules
 from me2e_compress.workflows.result import Result, Table
 
 CALIBRATION_FRAMES, HELD_OUT_FRAMES = 64, 24
 LATENCY_SAMPLES = 100
-FLOAT = "float"
+DRIVER, FLOAT = "highway", "float"
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -71,10 +75,14 @@ class DriveResult(Result):
 
 
 @dataclasses.dataclass(frozen=True)
-class DriverDemo(Demo):
-    """Compress the shipped driver and compare both on the road.
+class DriverDemo:
+    """Compress the shipped driver and compare both, on frames and on the road.
 
     Attributes:
+        out: The folder that everything is written to.
+        recipe_name: A shipped recipe, or a TOML file.
+        provider: What runs the graphs.
+        force: Replace files that we did not write, too.
         routes: Routes that both drive: a number or ``ID,ID``.
         workers: Number of concurrent routes.
 
@@ -84,13 +92,18 @@ class DriverDemo(Demo):
         GraphError: The output folder is a file, or a user's file would be overwritten.
     """
 
+    out: Path
+    recipe_name: str = "full-fused"
+    provider: Provider = CPU
+    force: bool = False
     routes: str = "5"
     workers: int = 2
     _told: list[Section] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
         """Check recipe, routes and outputs first: the work takes minutes."""
-        super().__post_init__()
+        recipe.load(self.recipe_name)
+        check_folder(self.out, ())
         pick_routes(load_routes(), self.routes)
         records = (beside(self._small, what) for what in ("report", "plan"))
         pages = (self.out / name for name in (JSON, MARKDOWN, HTML))
@@ -103,13 +116,18 @@ class DriverDemo(Demo):
     @property
     def steps(self) -> dict[str, Callable[[Listener], Result]]:
         """The steps by name, in order."""
-        return {"compress": self.compress, **super().steps, "drive": self.drive}
+        return {
+            "compress": self.compress,
+            "weigh": self.weigh,
+            "compare": self.compare,
+            "drive": self.drive,
+        }
 
     def compress(self, listener: Listener) -> CompressResult:
         """Copy the driver, record frames, and compress it."""
-        export_stack(self.name, self._source, ExportOptions(force=self.force))
-        self._record(self._source, (CALIBRATION_FRAMES, HELD_OUT_FRAMES), listener)
-        found = self._compressed(listener, allow_empty=True)
+        export_stack(DRIVER, self._source, force=self.force)
+        self._record(listener)
+        found = self._compressed(listener)
         self._told.append(Section("The passes", found.tables()))
         plan = plan_of(found.report.model)
         if plan is not None:
@@ -118,13 +136,14 @@ class DriverDemo(Demo):
 
     def weigh(self, listener: Listener) -> ModuleChanges:
         """Compare the modules before and after."""
-        found = super().weigh(listener)
+        found = compare_modules(self._source, self._small)
         self._told.append(Section("The modules", found.tables()))
         return found
 
     def compare(self, listener: Listener) -> CompareResult:
         """Compare the compressed graph with the driver on other frames."""
-        found = super().compare(listener)
+        graphs = self._source, self._small
+        found = compare(*graphs, self._held_out, listener, provider=self.provider)
         self._told.append(Section("The outputs", found.tables()))
         return found
 
@@ -133,7 +152,7 @@ class DriverDemo(Demo):
         # a study of two variants under ideal conditions
         everything = load_routes()
         study = Study(
-            f"{self.name} before and after {self.recipe_name}",
+            f"{DRIVER} before and after {self.recipe_name}",
             (
                 Variant(FLOAT, str(self._source)),
                 Variant(self.recipe_name, str(self._small)),
@@ -156,6 +175,42 @@ class DriverDemo(Demo):
             *self._elsewhere(),
         )
         return DriveResult(found, written, self.recipe_name, ending)
+
+    def _record(self, listener: Listener) -> None:
+        """Record frames to calibrate on, and others to compare on, of the next seed."""
+        folders = {self._frames: CALIBRATION_FRAMES, self._held_out: HELD_OUT_FRAMES}
+        for seed, (folder, count) in enumerate(folders.items()):
+            asked = FramesOptions(count, seed, force=self.force, provider=self.provider)
+            record_frames(self._source, folder, asked, listener)
+
+    def _compressed(self, listener: Listener) -> CompressResult:
+        """Compress on the recorded frames, int8 in the form that the provider runs."""
+        passes = recipe.load(self.recipe_name)
+        quantizes = any(each.quantizes for each in passes)
+        # fidelity is measured on frames of another seed, see `compare`
+        options = CompressOptions(
+            target=self.provider.target if quantizes else None, measure_frames=0,
+            allow_empty=True, provider=self.provider, force=self.force,
+        )  # fmt: skip
+        return compress(
+            self._source, self._small, passes, self._frames, options, listener
+        )
+
+    @property
+    def _source(self) -> Path:
+        return self.out / f"{DRIVER}.onnx"
+
+    @property
+    def _small(self) -> Path:
+        return self.out / f"{DRIVER}.{self.recipe_name}.onnx"
+
+    @property
+    def _frames(self) -> Path:
+        return self.out / "frames"
+
+    @property
+    def _held_out(self) -> Path:
+        return self.out / "frames-held-out"
 
     def _files(self) -> Section:
         """List the files linked from the page."""
@@ -186,6 +241,6 @@ class DriverDemo(Demo):
             return ()
         return (
             f"Its int8 is for {target}, which drives here. For TensorRT:",
-            f"  me2e-compress compress {self.name} -r {self.recipe_name} --target"
-            f" tensorrt --frames {self._frames} -o {self.name}.trt.onnx",
+            f"  me2e-compress compress {DRIVER} -r {self.recipe_name} --target"
+            f" tensorrt --frames {self._frames} -o {DRIVER}.trt.onnx",
         )

@@ -16,13 +16,13 @@ from me2e_compress.manager import recipe
 from me2e_compress.passes import Pass
 from me2e_compress.registry import documents
 from me2e_compress.runtime.providers import provider_named
+from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
 from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.other_evaluators import HIGHWAY, is_highway
-from me2e_compress.zoo.shipped import SHIPPED
 
 
 def load_study(

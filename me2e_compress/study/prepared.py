@@ -24,7 +24,7 @@ from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import beside
 from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import Listener
-from me2e_compress.zoo.weights_record import named_weights
+from me2e_compress.workflows.weights_record import named_weights
 
 
 @dataclass(frozen=True)

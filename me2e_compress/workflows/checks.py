@@ -10,12 +10,12 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.driving.adapter.stated import adapted
-from me2e_compress.errors import GraphError, RecipeError
+from me2e_compress.errors import FORMER, GraphError, RecipeError
 from me2e_compress.graph.modules import ModuleMap, map_of
 from me2e_compress.graph.opset import lowered
 from me2e_compress.graph.shapes import unshaped_plugins
+from me2e_compress.shipped.drivers import SHIPPED, shipped
 from me2e_compress.workflows.listener import Listener
-from me2e_compress.zoo.shipped import SHIPPED, shipped
 
 LARGEST = 1e15
 """The largest number of an option: beyond, milliseconds are no whole microseconds."""
@@ -37,7 +37,8 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
         return path
     if str(text) in SHIPPED:
         return shipped(str(text))
-    raise GraphError(f"{text}: no such file; models that ship: {', '.join(SHIPPED)}")
+    line = f"{text}: no such file; models that ship: {', '.join(SHIPPED)}"
+    raise GraphError(FORMER.get(f"stack {text}", line))
 
 
 def read_graph(

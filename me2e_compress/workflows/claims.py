@@ -15,8 +15,8 @@ from pathlib import Path
 
 from me2e_compress.errors import GraphError
 from me2e_compress.registry.marks import is_marked
+from me2e_compress.shipped import drivers as shipped
 from me2e_compress.workflows.checks import Given, check_output
-from me2e_compress.zoo import shipped
 
 
 @contextlib.contextmanager

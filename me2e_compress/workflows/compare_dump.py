@@ -23,6 +23,7 @@ from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
+from me2e_compress.shipped.drivers import SHIPPED, shipped
 from me2e_compress.targets.quantized import describe_quantized
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.compress_result import beside
@@ -30,7 +31,6 @@ from me2e_compress.workflows.first_difference import headline_of, with_modules
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, counted, number, table
-from me2e_compress.zoo.shipped import SHIPPED, shipped
 
 SAME_DB = 60.0
 """Above, two float32 programs differ by the order of their sums (60 dB: 0.1 %)."""

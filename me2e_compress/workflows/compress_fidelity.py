@@ -21,11 +21,11 @@ from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.others_load import cpu_seconds
 from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
+from me2e_compress.shipped.drivers import sample_frames
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.workflows.measured_loss import NOT_ASKED, MeasuredLoss
 from me2e_compress.workflows.runtime_loss import RuntimeTally, has_int8_kernels
-from me2e_compress.zoo.shipped import sample_frames
 
 KEPT_OUT = "kept out of calibration"
 SHARED = "calibrated on as well: there is no other"

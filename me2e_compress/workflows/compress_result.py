@@ -16,7 +16,7 @@ from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.lint import LintResult
 from me2e_compress.workflows.measured_loss import MeasuredLoss
 from me2e_compress.workflows.result import Result, Status, Table, megabytes, plain
-from me2e_compress.zoo.weights_record import named_weights
+from me2e_compress.workflows.weights_record import named_weights
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

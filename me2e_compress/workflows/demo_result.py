@@ -14,10 +14,7 @@ def figure(found: Result) -> str:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class DemoResult(Result):
-    """The results of ``compress``, ``weigh``, ``compare``, and ``drive`` or ``time``.
-
-    They are named so, and in that order.
-    """
+    """Of ``compress``, ``weigh``, ``compare`` and ``drive``, in this order."""
 
     steps: Mapping[str, Result]
 

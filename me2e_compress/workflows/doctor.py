@@ -19,7 +19,6 @@ from me2e_compress.runtime.energy.reader import Absent
 from me2e_compress.workflows.result import Result, Table, table
 
 _EXTRAS = (
-    ("torch", "zoo", "export the reference stacks, train the driver"),
     ("highway_env", "highway", "drive models in closed loop"),
     ("tensorrt_rtx", "trt-check", "parse and build for TensorRT without a GPU"),
     ("onnxslim", "bench", "compare with onnxslim in the benchmarks"),

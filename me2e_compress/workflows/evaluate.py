@@ -16,6 +16,7 @@ from me2e_compress.metrics.deadlines import Deadlines, charged
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.metrics.scores import score as score_episodes
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import check_folder, check_number, model_path
@@ -34,7 +35,6 @@ from me2e_compress.workflows.other_evaluators import (
 )
 from me2e_compress.workflows.result import Result, Table, number
 from me2e_compress.workflows.score import driving_score, score_records, scores_table
-from me2e_compress.zoo.shipped import SHIPPED
 
 _FLAGS = {"frame_limit_s": "frame-limit", "module_map": "map"}
 """Command-line names of options that differ from their Python names."""

@@ -16,7 +16,7 @@ from me2e_compress.calibration.recording import (
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file
-from me2e_compress.errors import EvaluationError, FramesError
+from me2e_compress.errors import FramesError
 from me2e_compress.extras import need_extra
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Frame
@@ -28,11 +28,7 @@ from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_opening import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, counted
-from me2e_compress.zoo.stacks import STACKS, find
-from me2e_compress.zoo.synthetic_frames import frames as synthetic
 
-SCENE_LENGTH = 8
-"""Frames of a synthetic scene, half a second apart."""
 DRIVEN_SCENE_LENGTH = 16
 """Frames of a stretch of a route, half a second apart."""
 
@@ -44,11 +40,11 @@ class FramesOptions:
     Attributes:
         count: number of frames.
         seed: seed of everything random.
-        scene_length: frames a scene; None is `SCENE_LENGTH` of a synthetic world,
-            `DRIVEN_SCENE_LENGTH` of a driven route, all that a log has.
+        scene_length: frames a scene; None is `DRIVEN_SCENE_LENGTH` of a driven route,
+            all that a log has.
         force: replace outputs that we did not write, too.
         provider: what opens the model whose frames they are.
-        log: recorded driving that they are made from; None makes them up.
+        log: recorded driving that they are made from; None lets the expert drive.
         adapter: TOML file that adapts an ONNX file to the policy contract, or the name
             of one that ships: the frames are in the model's own form.
         road: generation of the road that the expert drives; None is 1.
@@ -71,7 +67,7 @@ class FramesOptions:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class FramesResult(Result):
-    """A recording that was written for a stack or model."""
+    """A recording that was written for a model."""
 
     stack: str
     output: Path
@@ -84,7 +80,7 @@ class FramesResult(Result):
 
     @property
     def headline(self) -> str:
-        """The folder, its frames, the stack, and the seed or log."""
+        """The folder, its frames, the model, and the seed or log."""
         log, seed = self.options.log, self.options.seed
         said = f"{self.output}: {counted(self.count, 'frame')} of {self.stack}"
         return f"{said}, {f'seed {seed}' if log is None else f'from {LOGS.text(log)}'}"
@@ -103,7 +99,7 @@ class FramesResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return the recording: stack, folder, frames, seed, log."""
+        """Return the recording: model, folder, frames, seed, log."""
         return self.records()[0]
 
 
@@ -113,16 +109,15 @@ def record_frames(
     options: FramesOptions | None = None,
     listener: Listener = SILENT,
 ) -> Path:
-    """Make frames of a stack or a driver and write them, all or nothing.
+    """Make frames of a driver and write them, all or nothing.
 
-    For stacks of the zoo a synthetic world is drawn. For a driver that ships, or any
-    ONNX file that keeps the policy contract, the expert drives fresh routes of
-    highway-env. With a log, recorded driving is laid out as the driver or file takes
-    it. A run that was killed goes on after its last whole scene. The folder is
-    returned.
+    For a driver that ships, or any ONNX file that keeps the policy contract, the expert
+    drives fresh routes of highway-env. With a log, recorded driving is laid out as the
+    file takes it. A run that was killed goes on after its last whole scene. The folder
+    is returned.
 
     Raises:
-        GraphError: The stack or file is missing or altered, or the folder is the input.
+        GraphError: The file is missing or altered, or the folder is the input.
         FramesError: The count is below 1, the folder holds something else, the log
             cannot feed the model, or a road is named that nobody would drive on.
         EvaluationError: The file does not keep the policy contract, the adapter
@@ -143,19 +138,17 @@ def _recorded(
 ) -> Path:
     pixels: Mapping[str, PixelInput] = {}
     about: dict[str, str | int] = {"stack": str(source), "seed": options.seed}
-    if options.road is not None and (options.log or not _drives(source, options)):
+    if options.road is not None and options.log:
         raise FramesError(f"--road {options.road}: nobody drives for these frames")
-    # frames come from a log, from the expert's driving, or from a synthetic world
+    # frames come from a log, or from the expert's driving
     if options.log is not None:
         make, of, pixels = _logged(source, options.log, options)
         about = {"stack": str(source), "log": LOGS.text(options.log)}
-    elif _drives(source, options):
+    else:
         about |= {"road": 2} if options.road == 2 else {}
         model = model_path(source)
         try_file(model, listener, options.provider)
         make, of = _driven(model, options), sha256_of(model)
-    else:
-        make, of = _synthetic(str(source), options), str(source)
     # a recording is continued only if the sources and the adapter are the same
     if options.adapter is not None:
         of += f" {Adapter.digest(adapter_file(options.adapter))}"
@@ -187,18 +180,6 @@ def _logged(
     )
 
 
-def _drives(source: str | Path, options: FramesOptions) -> bool:
-    """Return whether the expert drives for a source; a drawn stack takes no adapter."""
-    if Path(source).is_file() or find(str(source)).trained:
-        return True
-    if options.adapter is not None:
-        raise EvaluationError(
-            f"adapter {options.adapter}: {source} is a stack of the zoo; name the ONNX"
-            " file that it adapts"
-        )
-    return False
-
-
 def _policy(model: Path, options: FramesOptions) -> OnnxPolicy:
     adapter = None
     if options.adapter is not None:
@@ -220,15 +201,3 @@ def _driven(model: Path, options: FramesOptions) -> Source:
         first=begin.place,
         road=options.road or 1,
     )
-
-
-def _synthetic(stack: str, options: FramesOptions) -> Source:
-    length = SCENE_LENGTH if options.scene_length is None else options.scene_length
-
-    def make(begin: Begin) -> Iterator[Frame]:
-        first = begin.frame
-        made = synthetic(STACKS[stack], options.count, options.seed, length, first)
-        for index, arrays in enumerate(made, first):
-            yield Frame(index, index % length == 0, dict(arrays))
-
-    return make

@@ -27,7 +27,7 @@ from me2e_compress.workflows.module_costs import (
     with_activations,
     with_latency,
 )
-from me2e_compress.zoo.weights_record import named_weights
+from me2e_compress.workflows.weights_record import named_weights
 
 _SHAPES = "import-normalize,fold-constants{through_compute=false}"
 

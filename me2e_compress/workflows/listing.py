@@ -25,9 +25,9 @@ from me2e_compress.quantization.rules import RULE_SETS, RULES
 from me2e_compress.registry import Entry, Option, Registry, describe
 from me2e_compress.runtime.energy.energy_counter import ENERGY_COUNTERS
 from me2e_compress.runtime.providers import PROVIDERS
+from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.result import Result, Table, table
-from me2e_compress.zoo.stacks import STACKS
 
 _OURS = "me2e-compress"
 _COMMENT = re.compile(r"(?:#.*\n)+")
@@ -96,11 +96,8 @@ def _module_maps() -> tuple[Entry, ...]:
 
 
 def _stacks() -> tuple[Entry, ...]:
-    trained, drawn = "trained; ships with the package", "weights drawn from a seed"
-    return tuple(
-        Entry(name, _OURS, trained if each.trained else drawn)
-        for name, each in STACKS.items()
-    )
+    words = "trained; ships with the package"
+    return tuple(Entry(name, _OURS, words) for name in SHIPPED)
 
 
 def _file(path: Traversable) -> Entry:

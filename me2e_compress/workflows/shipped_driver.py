@@ -7,7 +7,7 @@ from me2e_compress.driving.contract import Policy
 from me2e_compress.driving.host_stage import HostStage
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
-from me2e_compress.zoo.shipped import shipped
+from me2e_compress.shipped.drivers import shipped
 
 
 @dataclass(frozen=True)

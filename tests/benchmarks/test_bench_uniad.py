@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks import bench_uniad
-from me2e_compress.zoo.stacks import UNIAD_TINY
+from models.stacks import UNIAD_TINY
 
 
 class Counting:

@@ -25,7 +25,7 @@ VARY = [
     ),
     (
         "out/study.json",
-        f'"policy": "{PACKAGE}/zoo/weights/highway.onnx"',
+        f'"policy": "{PACKAGE}/shipped/weights/highway.onnx"',
         f'"policy": "{PACKAGE}/weights/highway.onnx"',
     ),
 ]

@@ -3,8 +3,8 @@
 import torch
 
 from benchmarks.original_patterns import FORMS, restored
-from me2e_compress.zoo.vad.stack import VadTiny
-from tests.zoo.vad.sizes import SIZES
+from models.tests.vad.sizes import SIZES
+from models.vad.stack import VadTiny
 
 
 def test_the_forms_of_the_original_compute_the_same() -> None:

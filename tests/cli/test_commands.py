@@ -16,10 +16,8 @@ from me2e_compress.targets.tensorrt.tensorrt_engine import (
     TensorRTEngine,
 )
 from me2e_compress.workflows import build as workflow
-from me2e_compress.workflows.export import ExportResult
 from me2e_compress.workflows.frames import FramesOptions, FramesResult
 from me2e_compress.workflows.listing import KINDS, REGISTRIES
-from me2e_compress.zoo.weights_record import WeightsRecord
 from tests.command import Cli, strict
 from tests.docs.documents import faults
 from tests.installed import install
@@ -187,25 +185,13 @@ def test_an_exported_stack_is_a_document(cli: Cli, tmp_path: Path) -> None:
     assert found["bytes"] == (tmp_path / "m.onnx").stat().st_size
 
 
-def test_a_stack_of_a_checkpoint_names_it(cli: Cli, tmp_path: Path) -> None:
-    output = tmp_path / "m.onnx"
-    output.write_bytes(b"1234")
-    record = WeightsRecord("a.pth", "0" * 64, epoch=3, converted={"float16": 9})
-
-    print_json(ExportResult("tcp", output, 17, record).document())
-
-    found = strict(cli.capsys.readouterr().out)
-    assert faults("export", found) == []
-    assert found["weights"]["epoch"] == 3
-
-
 def test_frames_that_there_are_count_not_those_asked_for(
     cli: Cli, tmp_path: Path
 ) -> None:
     for name in ("000000.npz", "000001.npz"):
         (tmp_path / name).touch()
 
-    print_json(FramesResult("vad-tiny", tmp_path, FramesOptions(count=3)).document())
+    print_json(FramesResult("highway", tmp_path, FramesOptions(count=3)).document())
 
     found = strict(cli.capsys.readouterr().out)
     assert faults("frames", found) == []

@@ -15,7 +15,7 @@ from me2e_compress.calibration.recording import write_recording
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph import rewrite
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.zoo.state_dict import read_state_dict
+from models.state_dict import read_state_dict
 from tests.command import Cli
 
 M, F = "dense.onnx", "dense.onnx frames"
@@ -61,7 +61,7 @@ REFUSED = {
     **{f"{line} -o no/o.x": "no/o.x: no such folder no"
        for line in (*WRITERS, "routes")},
     **{f"{line} -o frames": "frames is a folder"
-       for line in (*WRITERS, "routes", "export vad-tiny")},
+       for line in (*WRITERS, "routes", "export highway")},
     **{f"{line} -o dense.onnx": "dense.onnx is a file: name a folder"
        for line in (f"frames {M}", f"evaluate {M}", "study study.toml")},
     "study study.toml -o frames": "frames is the input: choose another folder",

@@ -95,16 +95,10 @@ SEARCH = {
 }
 OTHERS = {
     "export vad-huge -o out.onnx": "vad-huge",
-    "export vad-tiny -o out.onnx --opset 99": "opset 99",
-    "export tcp -o out.onnx --weights in.onnx": r"in\.onnx: not read as weights",
-    "export highway -o out.onnx --opset 16": "--opset.*cannot be chosen",
-    "export highway -o out.onnx --seed 0": "--seed.*cannot be chosen",
-    "export highway -o out.onnx --heads nuscenes": "--heads.*cannot be chosen",
-    "export highway -o out.onnx --weights a.pth": "--weights.*cannot be chosen",
     "compare dense.onnx path.onnx frames": "no output in common",
     "compare dense.onnx frames --outputs none": "none: no such folder or file",
     "compare dense.onnx frames --outputs frames": "the dump is of another graph",
-    "frames vad-huge -o out": "no stack 'vad-huge' in the zoo",
+    "frames vad-huge -o out": "vad-huge: no such file; models that ship",
     "plan latin.json": r"latin\.json: not a plan",
     "plan dense.onnx --against none.onnx": "none.onnx: no such file; models",
     "inspect dense.onnx --trace t.json --frames frames": "--trace and --frames",

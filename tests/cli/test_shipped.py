@@ -8,9 +8,9 @@ import pytest
 
 from me2e_compress.errors import GraphError
 from me2e_compress.registry.marks import IN_JSON
+from me2e_compress.shipped import drivers as shipped
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.workflows.checks import model_path
-from me2e_compress.zoo import shipped
 from tests.command import Cli
 from tests.evaluators.highway.drivers import EXIT, straight_on
 from tests.stand_in import record_driver, write_model, write_shipped

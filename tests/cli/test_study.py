@@ -11,9 +11,9 @@ from me2e_compress.cli.commands.study import study
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway import evaluator
 from me2e_compress.registry.marks import IN_JSON
+from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.study import Study, load_study
-from me2e_compress.zoo.shipped import shipped
 from tests.command import Cli, write_frames
 from tests.evaluators.highway.drivers import CROSSING, straight_on
 from tests.study.conftest import Here

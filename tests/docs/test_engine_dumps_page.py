@@ -12,7 +12,7 @@ import pytest
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import Session, SessionPort, replay
-from me2e_compress.zoo.shipped import shipped
+from me2e_compress.shipped.drivers import shipped
 from tests.command import Cli, cli, command
 from tests.docs.pages import ROOT, blocks
 from tests.frames import record

@@ -1,14 +1,12 @@
 """What the index shows, what the wheel holds, what a source distribution needs."""
 
 import re
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 
-from me2e_compress.zoo.shipped import SHIPPED
+from me2e_compress.shipped.drivers import SHIPPED
 from tests.docs.pages import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -30,27 +28,12 @@ def test_the_project_says_who_and_for_whom() -> None:
 
 
 @pytest.mark.xdist_group("installed")
-def test_the_wheel_is_small_and_leaves_the_checkpoint_out(site: Path) -> None:
-    weights = {file.name for file in (site / "me2e_compress/zoo/weights").iterdir()}
+def test_the_wheel_is_small_and_holds_what_ships(site: Path) -> None:
+    weights = {file.name for file in (site / "me2e_compress/shipped/weights").iterdir()}
     forms = (".json", ".onnx", "-frames")
     assert weights == {f"{name}{form}" for name in SHIPPED for form in forms}
     (wheel,) = site.parent.glob("wheels[0-9]*/me2e_compress-*.whl")
     assert wheel.stat().st_size < MOST_BYTES
-
-
-@pytest.mark.xdist_group("installed")
-def test_a_checkpoint_that_the_wheel_lacks_is_one_line(site: Path) -> None:
-    asked = "from me2e_compress.zoo.shipped import checkpoint; checkpoint('highway')"
-    done = subprocess.run(
-        [sys.executable, "-c", asked],
-        cwd=site,
-        env={"PYTHONPATH": str(site)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    last = done.stderr.strip().splitlines()[-1]
-    assert "the wheel leaves the checkpoint out; take me2e_compress/zoo" in last
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ world = World(load_routes()[0])
     "driver": f"""
 import sys, types
 sys.path.append({str(ROOT)!r})  # it is no part of the package
-from driver import course
+from models.driver import course
 won = types.SimpleNamespace(driver="driver.onnx", scores=types.SimpleNamespace())
 won.scores.driving_score = 0.0
 course.run = lambda asked, folder, workers: (won,)  # days of work

@@ -9,8 +9,8 @@ import me2e_compress as me2e
 from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import Observation, Trajectory
 from me2e_compress.driving.onnx_policy import OnnxPolicy
+from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.cameras import CameraRig
-from me2e_compress.zoo.shipped import shipped
 from tests.command import Command, command
 from tests.docs.pages import ROOT, blocks
 from tests.stacks import dense_frames, write_dense

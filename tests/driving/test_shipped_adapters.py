@@ -20,7 +20,7 @@ from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.export import ExportOptions, export_stack
 from me2e_compress.workflows.frames import FramesOptions, record_frames
-from me2e_compress.zoo.stacks import STACKS, TCP, VAD_TINY
+from models.stacks import STACKS, TCP, VAD_TINY
 from tests.driving.observed import motion, observation
 from tests.evaluators.highway.drivers import EXIT, straight_on
 

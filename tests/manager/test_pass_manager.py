@@ -11,7 +11,7 @@ from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager import PassManager, Report, recipe
 from me2e_compress.passes.base import Context, Pass
-from me2e_compress.zoo.shipped import sample_frames, shipped
+from me2e_compress.shipped.drivers import sample_frames, shipped
 from tests.manager import passes
 
 CHAIN = """

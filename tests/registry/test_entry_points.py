@@ -30,7 +30,7 @@ def __getattr__(name: str) -> object:
     if name == "Broken":
         raise RuntimeError("two\nlines")
     if name == "Lacking":
-        raise MissingExtraError("torch", "zoo")
+        raise MissingExtraError("ray", "ray")
     raise AttributeError(name)
 
 
@@ -78,7 +78,7 @@ def test_an_entry_that_cannot_be_used_is_named(name: str, message: str) -> None:
 
 @pytest.mark.usefixtures("others")
 def test_what_needs_an_extra_says_which() -> None:
-    with pytest.raises(MissingExtraError, match=r"me2e-compress\[zoo\]"):
+    with pytest.raises(MissingExtraError, match=r"me2e-compress\[ray\]"):
         SHAPES.get("lacking")
 
 

@@ -47,6 +47,8 @@ def test_an_option_that_is_gone_is_a_usage_error(
     [
         ("search highway frames -o r.toml --max-mb 5 --on-road", "a study"),
         ("study s.toml -o out --records out/records", "python -m benchmarks.paper"),
+        ("export vad-tiny --opset 13 -o m.onnx", "python -m models.export"),
+        ("demo --stack vad-tiny", "python -m models.export"),
     ],
 )
 def test_an_option_of_another_command_that_is_gone(
@@ -56,6 +58,14 @@ def test_an_option_of_another_command_that_is_gone(
 
     assert refused.code == 2
     assert f"is gone since 0.3.0: use {instead}" in refused.err
+    assert "gone since" not in cli("frames none.onnx --seed 1 -o made").err
+
+
+@pytest.mark.parametrize("line", ["export tcp -o m.onnx", "frames tcp -o made"])
+def test_a_stack_that_is_gone_is_a_file(line: str, cli: Cli) -> None:
+    assert cli.refused(line).startswith(
+        "me2e-compress: tcp is gone since 0.3.0: use a file: python -m models.export"
+    )
 
 
 def test_what_is_named_instead_is_taken() -> None:

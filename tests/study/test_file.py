@@ -13,10 +13,10 @@ from me2e_compress.errors import (
 )
 from me2e_compress.manager import recipe
 from me2e_compress.runtime.providers import CPU, CpuProvider
+from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.study import Condition, load_study
 from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
-from me2e_compress.zoo.shipped import shipped
 from tests.command import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED
 

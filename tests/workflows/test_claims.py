@@ -15,9 +15,9 @@ from me2e_compress.calibration.recording import partial_of, write_recording
 from me2e_compress.errors import GraphError
 from me2e_compress.registry.marks import MARK
 from me2e_compress.runtime.frames import Frame
+from me2e_compress.shipped import drivers as shipped
 from me2e_compress.workflows.claims import check_ours, writing
 from me2e_compress.workflows.frames import record_frames
-from me2e_compress.zoo import shipped
 
 THEIRS = "is there, and me2e-compress did not write it"
 OURS = f"# {MARK}\n"

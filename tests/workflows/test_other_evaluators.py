@@ -12,9 +12,9 @@ from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.evaluators import EVALUATORS
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.registry import registry
+from me2e_compress.shipped.drivers import shipped
 from me2e_compress.workflows.evaluate import EvaluateOptions
 from me2e_compress.workflows.other_evaluators import evaluator_named, kept
-from me2e_compress.zoo.shipped import shipped
 from tests.evaluators.bench2drive.files import checkpoint, record, write
 from tests.metrics.drives import drive
 

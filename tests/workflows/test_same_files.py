@@ -108,8 +108,8 @@ CASES: dict[str, tuple[str, Call]] = {
         lambda: export_stack("highway", "hw.onnx"),
     ),
     "record_frames": (
-        "frames vad-tiny -n 1 -o made --seed 3",
-        lambda: me2e.record_frames("vad-tiny", "made", me2e.FramesOptions(1, 3)),
+        "frames highway -n 1 -o made --seed 3",
+        lambda: me2e.record_frames("highway", "made", me2e.FramesOptions(1, 3)),
     ),
     "evaluate": (
         "evaluate blind -o results --routes ParkedObstacle_0 --latency fps:4",

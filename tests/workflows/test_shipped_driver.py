@@ -4,9 +4,9 @@ from pathlib import Path
 
 from me2e_compress.driving.policies import driver_named
 from me2e_compress.evaluators.highway.drivers import image_size_of
+from me2e_compress.shipped.drivers import shipped
 from me2e_compress.study import load_study
 from me2e_compress.workflows.evaluate import driver_of
-from me2e_compress.zoo.shipped import shipped
 
 STUDY = """
 title = "Half of it"

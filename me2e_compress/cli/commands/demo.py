@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -12,24 +12,17 @@ from me2e_compress.cli.verbosity import is_json, is_verbose
 from me2e_compress.extras import need_extra
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows.demo_result import DemoResult, figure
-from me2e_compress.workflows.demo_stack import StackDemo
 from me2e_compress.workflows.result import Result
-from me2e_compress.zoo.shipped import SHIPPED
 
 Output = Annotated[
     Path, typer.Option("-o", "--output", "--out", help="the folder to write")
 ]
-Stack = Annotated[
-    Literal["highway", "vad-tiny"],
-    typer.Option(help="the trained driver, or a stack of published size"),
-]
 Recipe = Annotated[str, typer.Option("-r", "--recipe", "--scheme", help=given.RECIPE)]
-Routes = Annotated[str, typer.Option(help=f"{given.ROUTES}; highway")]
+Routes = Annotated[str, typer.Option(help=given.ROUTES)]
 
 
 def demo(
     output: Output = Path("out"),
-    stack: Stack = "highway",
     recipe: Recipe = "full-fused",
     routes: Routes = "5",
     workers: given.Workers = 2,
@@ -39,19 +32,13 @@ def demo(
 ) -> None:
     """Run the main job on what ships: compress, verify, compare, drive, report.
 
-    The trained driver is compressed and drives before and after; vad-tiny, at its
-    published size and with random weights, is compressed, compared and timed.
+    The trained driver is compressed and drives before and after.
     """
-    # the trained driver drives, other stacks are only timed
-    runs = provider_named(provider, plugins or ())
-    if stack in SHIPPED:
-        need_extra("highway", "driving in the demo")
-        from me2e_compress.study.demo import DriverDemo
+    need_extra("highway", "driving in the demo")
+    from me2e_compress.study.demo import DriverDemo
 
-        driver = stack, output, recipe, runs, force
-        steps = DriverDemo(*driver, routes, workers).steps
-    else:
-        steps = StackDemo(stack, output, recipe, runs, force).steps
+    runs = provider_named(provider, plugins or ())
+    steps = DriverDemo(output, recipe, runs, force, routes, workers).steps
     # each step says what it found as soon as it is done
     output.mkdir(parents=True, exist_ok=True)
     found = dict[str, Result]()

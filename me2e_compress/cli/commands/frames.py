@@ -14,8 +14,7 @@ from me2e_compress.workflows import frames as workflow
 Length = Annotated[
     int | None,
     typer.Option(
-        help=f"frames a scene; default {workflow.SCENE_LENGTH} for a synthetic world,"
-        f" else {workflow.DRIVEN_SCENE_LENGTH}, of a log all"
+        help=f"frames a scene; default {workflow.DRIVEN_SCENE_LENGTH}, of a log all"
     ),
 ]
 Log = Annotated[
@@ -27,9 +26,7 @@ Log = Annotated[
 def frames(
     stack: Annotated[
         str,
-        typer.Argument(
-            help="vad-tiny, uniad-tiny, uniad-trt, tcp, highway, highway-2, or M.onnx"
-        ),
+        typer.Argument(help="highway, highway-2, or M.onnx"),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="the folder")],
     count: given.Count = 256,
@@ -44,10 +41,9 @@ def frames(
 ) -> None:
     """Write calibration frames, coherent in time, seen by six cameras.
 
-    A synthetic world is drawn for stacks of the zoo; for a driver that ships, or any
-    ONNX file that keeps the policy contract (--adapter), the expert drives fresh routes
-    of a --road. With --from, recorded driving is laid out as the file takes it
-    (docs/writing-logs.md).
+    For a driver that ships, or any ONNX file that keeps the policy contract
+    (--adapter), the expert drives fresh routes of a --road. With --from, recorded
+    driving is laid out as the file takes it (docs/writing-logs.md).
     """
     options = workflow.FramesOptions(
         count,

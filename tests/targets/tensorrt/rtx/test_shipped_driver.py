@@ -13,9 +13,9 @@ from me2e_compress.passes import Context
 from me2e_compress.quantization.plan import make_plan, stamp_plan, tensors_of
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.shipped.drivers import shipped
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx import check
-from me2e_compress.zoo.shipped import shipped
 
 SCHEMES = ("feature-ext", "prediction", "full")
 

@@ -1,0 +1,1 @@
+"""What ships: trained drivers with their cards, and recorded frames of theirs."""

@@ -1,0 +1,140 @@
+"""Trained models that come with the package, each with a card and digests."""
+
+import functools
+import hashlib
+from pathlib import Path
+from typing import Self
+
+import pydantic
+
+from me2e_compress.errors import FORMER, GraphError
+from me2e_compress.registry.documents import reading
+from me2e_compress.shipped.model_files import write
+
+WEIGHTS = Path(__file__).with_name("weights")
+"""One ``NAME.onnx``, ``NAME.json`` and ``NAME-frames`` per model."""
+
+SHIPPED = ("highway", "highway-2")
+"""Names of the models."""
+
+
+class TrainingData(pydantic.BaseModel):
+    """Seeds of the training routes, none used for evaluation, and frames."""
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+
+    seeds: tuple[int, ...]
+    frames: int = pydantic.Field(ge=0)
+
+
+class ModelCard(pydantic.BaseModel):
+    """The card of a shipped model; the model's files must have its digests.
+
+    Attributes:
+        sha256: of the ``.onnx``, lower-case hex.
+        bytes: of the ``.onnx``.
+        parameters: number of trained parameters.
+        seed: of the initial weights and of all random choices in training.
+        data: the training data.
+        command: a description of the training, and a command that trains such a model.
+        hours: of training, on the machine that the page of ``command`` names; None: not
+            measured.
+        scores: by name including the unit (``driving_score_percent``); None: not
+            measured, as a whole or one by one.
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+
+    sha256: str = pydantic.Field(pattern="^[0-9a-f]{64}$")
+    bytes: int = pydantic.Field(gt=0)
+    parameters: int = pydantic.Field(gt=0)
+    seed: int
+    data: TrainingData
+    command: str
+    hours: float | None = None
+    scores: dict[str, float | None] | None = None
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a card.
+
+        Raises:
+            GraphError: the file is missing or not a card.
+        """
+        with reading(path, GraphError, "not a model card"):
+            return cls.model_validate_json(path.read_bytes(), strict=True)
+
+
+def card(name: str) -> ModelCard:
+    """Return the card of a shipped model.
+
+    Raises:
+        GraphError: unknown model, or its card is missing or malformed.
+    """
+    if name not in SHIPPED:
+        line = f"no model {name!r} ships; there is {', '.join(SHIPPED)}"
+        raise GraphError(FORMER.get(f"stack {name}", line))
+    return ModelCard.load(WEIGHTS / f"{name}.json")
+
+
+def shipped(name: str) -> Path:
+    """Return the file of a shipped model after checking its digest, once per process.
+
+    Raises:
+        GraphError: unknown model, or its file or card is missing or altered.
+    """
+    return _checked(WEIGHTS / f"{name}.onnx", card(name).sha256)
+
+
+def sample_frames(model: Path) -> Path | None:
+    """Return the recorded frames of a shipped model, if a file is a copy of one.
+
+    Two frames of a drive suffice to verify exact passes, but not to calibrate.
+    """
+    name = _copied(model)
+    frames = WEIGHTS / f"{name}-frames"
+    return frames if name is not None and frames.is_dir() else None
+
+
+def is_copy(path: Path) -> bool:
+    """Return whether a file is a copy of a model that ships."""
+    return path.is_file() and _copied(path) is not None
+
+
+def _copied(model: Path) -> str | None:
+    """Return the name of the shipped model that a file is a copy of."""
+    for name in SHIPPED:
+        known = card(name)
+        if model.stat().st_size != known.bytes:
+            continue
+        if hashlib.sha256(model.read_bytes()).hexdigest() == known.sha256:
+            return name
+    return None
+
+
+@functools.cache
+def _checked(path: Path, expected: str) -> Path:
+    try:
+        found = hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise GraphError(
+            f"{path}: cannot be read: {error.strerror}; expected sha256 {expected}"
+        ) from error
+    if found != expected:
+        raise GraphError(
+            f"{path}: altered or incomplete: sha256 {found}, expected {expected}"
+        )
+    return path
+
+
+def copy(name: str, target: Path) -> Path:
+    """Write a copy of a shipped model atomically and return its path.
+
+    Raises:
+        GraphError: as `shipped`, or ``target`` is the shipped file or cannot be
+            written.
+    """
+    source = shipped(name)
+    if target.exists() and target.samefile(source):
+        raise GraphError(f"{target} is the shipped model: choose another output")
+    return write(target, source.read_bytes())

@@ -1,0 +1,1 @@
+"""The reference stacks and the driver in torch, with what exports and trains them."""

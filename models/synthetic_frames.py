@@ -1,0 +1,161 @@
+"""Synthetic calibration frames: random scenes of a moving world, six cameras."""
+
+import math
+from collections.abc import Iterator
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from me2e_compress.errors import FramesError
+from models.stacks import Stack
+from models.synthetic_cameras import LIDAR_HEIGHT_M, SCALE, render, rig
+from models.synthetic_world import (
+    FRAME_S,
+    EgoPose,
+    SyntheticWorld,
+    draw_world,
+)
+from models.tcp.config import COMMANDS, SPEED_UNIT_MPS
+
+Frame = dict[str, NDArray[np.float32 | np.int64]]
+
+SENSOR_NOISE = 2.0
+"""Standard deviation of pixel noise, in 1 / 255."""
+
+STRIP_HW = (256, 900)
+
+FRONT, FRONT_LEFT, FRONT_RIGHT = 0, 1, 2
+"""Indices of cameras among the six."""
+
+CUTS = ((FRONT_LEFT, 0, 1400), (FRONT, 200, 1400), (FRONT_RIGHT, 200, 1600))
+"""Camera, first and last column of 1600, from left to right (Bench2DriveZoo, branch
+tcp/admlp, team_code/tcp_b2d_agent.py): 4000 columns, before they are made 900."""
+
+TARGET_S = 4.0
+"""How far ahead of the vehicle its target point is."""
+
+FOLLOW_LANE = 3
+"""Index among left, right, straight, follow, change left and change right."""
+
+
+def frames(
+    spec: Stack, n: int, seed: int, scene_length: int = 8, first: int = 0
+) -> Iterator[Frame]:
+    """Yield ``n`` frames by input name, without the recurrent inputs.
+
+    Frame ``first`` must begin a scene; counts below 1 are a FramesError.
+    """
+    if n < 1 or scene_length < 1:
+        raise FramesError(
+            f"{n} frames in scenes of {scene_length}: both must be at least 1"
+        )
+    # One world per scene
+    cameras = rig(spec.scale)
+    lidar2img = np.stack([camera.lidar2img() for camera in cameras])[None]
+    for start in range(first, n, scene_length):
+        scene = start // scene_length
+        world = draw_world(np.random.default_rng([seed, scene]))
+        for step in range(min(scene_length, n - start)):
+            # Each frame has its own noise, whatever was drawn before
+            noise = np.random.default_rng([seed, scene, step + 1])
+            seconds = step * FRAME_S
+            boxes = world.boxes_at(seconds)
+            seen = render(world, world.ego(seconds), boxes, spec.scale)
+            if spec.sees == "strip":
+                state, target = route_state(world, step)
+                image = _normalise(spec, strip(seen)[None], noise)
+                yield {"img": image, "state": state, "target_point": target}
+                continue
+            known: Frame = {
+                "img": _normalise(spec, seen, noise)[None],
+                "lidar2img": lidar2img,
+                "can_bus": _can_bus(world, step),
+                **_place_and_time(world.ego(seconds), seconds),
+                "command": np.array([spec.straight_on]),
+            }
+            wanted = spec.inputs.keys() - spec.recurrent.keys()
+            yield {name: value for name, value in known.items() if name in wanted}
+
+
+def _normalise(
+    spec: Stack, seen: NDArray[np.uint8 | np.float32], noise: np.random.Generator
+) -> NDArray[np.float32]:
+    """Convert [n, h, w, 3] RGB pixels to [n, 3, H, W], zero-padded at the bottom."""
+    # Sensor noise, then rounding to grey levels
+    grain = noise.normal(0, SENSOR_NOISE, seen.shape[:3])[..., None]
+    pixels = np.clip(np.rint(seen + grain), 0, 255).astype(np.float32)
+    mean = np.array(spec.image.mean, np.float32)
+    std = np.array(spec.image.std, np.float32)
+    if spec.image.order == "bgr":
+        pixels = pixels[..., ::-1]
+    out = np.zeros((len(seen), 3, *spec.inputs["img"][-2:]), np.float32)
+    height, width = seen.shape[1:3]
+    out[:, :, :height, :width] = ((pixels - mean) / std).transpose(0, 3, 1, 2)
+    return out
+
+
+def _place_and_time(ego: EgoPose, seconds: float) -> Frame:
+    """Return position, orientation (its axes as rows) and time of the lidar."""
+    cos, sin = math.cos(ego.yaw), math.sin(ego.yaw)
+    axes = np.array([[sin, -cos, 0], [cos, sin, 0], [0, 0, 1]], np.float32)
+    return {
+        "l2g_r_mat": axes[None],
+        "l2g_t": np.array([[ego.x, ego.y, LIDAR_HEIGHT_M]], np.float32),
+        "timestamp": np.array([seconds], np.float32),
+    }
+
+
+def _can_bus(world: SyntheticWorld, step: int) -> NDArray[np.float32]:
+    """Return the vehicle's motion as CAN bus, [18] float32.
+
+    0-2 metres moved since the last frame (world axes), 3-6 quaternion, 7 speed, 10-12
+    acceleration, 13-15 angular rate, 16 yaw in radians, 17 change of yaw in degrees;
+    the changes are zero at the start of a scene.
+    """
+    now, before = world.ego(step * FRAME_S), world.ego(max(step - 1, 0) * FRAME_S)
+    turned = now.yaw - before.yaw
+    out = np.zeros(18, np.float32)
+    out[0:2] = now.x - before.x, now.y - before.y
+    out[3], out[6] = math.cos(now.yaw / 2), math.sin(now.yaw / 2)
+    out[7] = world.speed_mps + world.accel_mps2 * step * FRAME_S
+    out[10] = world.accel_mps2
+    out[15] = turned / FRAME_S
+    out[16], out[17] = now.yaw, math.degrees(turned)
+    return out
+
+
+def strip(seen: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Join three of six images: [6, 360, 640, 3] to [256, 900, 3] grey levels."""
+    parts = [seen[i, :, round(a * SCALE) : round(b * SCALE)] for i, a, b in CUTS]
+    wide = np.concatenate(parts, axis=1).astype(np.float32)
+    rows = interpolation(wide.shape[0], STRIP_HW[0])
+    columns = interpolation(wide.shape[1], STRIP_HW[1])
+    shrunk: NDArray[np.float32] = np.einsum(
+        "hr,rwc,vw->hvc", rows, wide, columns, optimize=True
+    )
+    return shrunk
+
+
+@cache
+def interpolation(before: int, after: int) -> NDArray[np.float32]:
+    """Return weights [after, before] of linear interpolation between pixel centres."""
+    at = (np.arange(after) + 0.5) * before / after - 0.5
+    at = np.clip(at, 0, before - 1)
+    away = np.abs(at[:, None] - np.arange(before))
+    weights: NDArray[np.float32] = np.maximum(1 - away, 0).astype(np.float32)
+    return weights
+
+
+def route_state(
+    world: SyntheticWorld, step: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return state [1, 9] and target point [1, 2], as `Tcp.forward` takes them."""
+    now = world.ego(step * FRAME_S)
+    there = world.ego(step * FRAME_S + TARGET_S)
+    right, ahead = now.to_lidar(there.x, there.y)
+    target = np.array([[ahead, right]], np.float32)
+    speed = world.speed_mps + world.accel_mps2 * step * FRAME_S
+    command = np.eye(COMMANDS, dtype=np.float32)[FOLLOW_LANE : FOLLOW_LANE + 1]
+    first = np.array([[speed / SPEED_UNIT_MPS]], np.float32)
+    return np.concatenate([first, target, command], 1), target
