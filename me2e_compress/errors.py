@@ -72,6 +72,10 @@ FORMER = {
             "--ema",
         )
     },
+    **{
+        f"adapter tcp-{name}": f"tcp-{name} {_NOW} models.tcp.policy"
+        for name in ("control", "fusion", "beta-control", "beta-fusion")
+    },
     "demo --stack": f"--stack {_NOW} python -m models.export",
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""

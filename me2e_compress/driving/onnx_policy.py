@@ -107,7 +107,6 @@ class OnnxPolicy:
         self._begins = True
         known = self.session.first_state(self.first.held)
         self.inputs.reset()
-        self.outputs.reset()
         own = {name: each for name, each in known.items() if name in self.recurrent}
         self._state = {**self.first.zeros, **own}
 
@@ -124,7 +123,7 @@ class OnnxPolicy:
         plan = self.outputs.trajectory(outputs, feeds, observation)
         if plan is not None and self.stage is not None:
             plan = self._changed(plan, self.stage, outputs)
-        return self.outputs.answer(plan, outputs, observation)
+        return self.outputs.answer(plan, outputs)
 
     def _changed(
         self, plan: Trajectory, stage: HostStage, outputs: dict[str, Array]

@@ -1,13 +1,10 @@
-"""Controls as models say them: numbers, Beta distributions, scored actions."""
+"""Controls as models say them."""
 
-import math
 from typing import Any
 
 import numpy as np
 import pydantic
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from me2e_compress.driving.adapter.controls import ControlAdapter
 from me2e_compress.driving.contract import PedalsAndWheel
@@ -66,71 +63,14 @@ def test_what_is_beyond_its_range_is_clipped_only_if_asked() -> None:
     assert read({**THREE, "clip": True}, **said) == PedalsAndWheel(1.0, -1.0, 0.0)
 
 
-BETA = {"beta": {"alpha": "mu", "beta": "sigma"}}
-
-
-@pytest.mark.parametrize(
-    ("alpha", "beta", "acceleration"),
-    [
-        (3.0, 2.0, 1 / 3),  # the mode of Beta(3, 2) is 2/3
-        (0.5, 2.0, -1.0),
-        (2.0, 1.0, 1.0),
-        (0.75, 0.25, 0.5),  # no mode: the mean 3/4
-    ],
-)
-def test_tcp_takes_the_mode_of_a_beta_distribution(
-    alpha: float, beta: float, acceleration: float
-) -> None:
-    throttle, steer, brake = read(BETA, mu=[[alpha, 2.0]], sigma=[[beta, 2.0]])
-
-    assert throttle - brake == pytest.approx(acceleration)
-    assert steer == 0.0
-
-
-def test_or_its_mean() -> None:
-    mean = {"beta": {**BETA["beta"], "take": "mean"}}
-
-    assert read(mean, mu=[3.0, 1.0], sigma=[1.0, 3.0]) == PedalsAndWheel(0.5, -0.5, 0.0)
-
-
-@given(st.tuples(*[st.floats(0, 1e6)] * 4))
-def test_every_beta_distribution_is_in_range(four: tuple[float, ...]) -> None:
-    throttle, steer, brake = read(BETA, mu=four[:2], sigma=four[2:])
-
-    assert 0.0 <= throttle <= 1.0
-    assert -1.0 <= steer <= 1.0
-    assert 0.0 <= brake <= 1.0
-
-
-def test_the_action_with_the_largest_score() -> None:
-    actions = [[0.0, 0.0, 1.0], [0.7, -0.5, 0.0], [0.7, 0.5, 0.0]]
-    control = {"scored": {"scores": "s", "actions": actions}}
-
-    assert read(control, s=[[0.1, 0.9, 0.9]]) == PedalsAndWheel(0.7, -0.5, 0.0)
-
-
 @pytest.mark.parametrize(
     ("control", "outputs", "message"),
     [
-        (BETA, {"mu": [1.0, -1.0], "sigma": [1.0, 1.0]}, "no parameters of a Beta"),
-        (BETA, {"mu": [1.0, math.nan], "sigma": [1.0, 1.0]}, "no parameters"),
-        (BETA, {"mu": [1.0, math.inf], "sigma": [1.0, 1.0]}, "no parameters"),
-        (BETA, {"mu": [1.0], "sigma": [1.0, 1.0]}, "mu has 1 numbers, it must have 2"),
         (THREE, {"gas": [1, 2], "wheel": 0, "stop": 0}, r"gas has 2 .*gas\[0\] for"),
         (
             {"throttle": "gas[2]", "steer": "wheel"},
             {"gas": [1, 2], "wheel": 0},
             r"gas has 2 numbers: there is no gas\[2\]",
-        ),
-        (
-            {"scored": {"scores": "s", "actions": [[0, 0, 0]]}},
-            {"s": [math.nan]},
-            "a score of s is not finite",
-        ),
-        (
-            {"scored": {"scores": "s", "actions": [[0, 0, 0]]}},
-            {"s": [1, 2]},
-            "s has 2 numbers, it must have 1",
         ),
     ],
 )
@@ -148,8 +88,6 @@ def test_outputs_that_are_no_control(
         {"throttle": "a"},
         {"steer": "a"},
         {"acceleration": "a", "steer": "b", "brake": "c"},
-        {**THREE, **BETA},
-        {**BETA, "scored": {"scores": "s", "actions": [[0, 0, 0]]}},
         {**THREE, "steer_range": [1.0, 1.0]},
     ],
 )

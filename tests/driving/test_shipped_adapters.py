@@ -1,4 +1,4 @@
-"""The adapters that ship: how they feed a graph, and how they read TCP's heads."""
+"""The adapters that ship: how they feed a graph."""
 
 from pathlib import Path
 
@@ -9,16 +9,12 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.inputs import ModelInputs
 from me2e_compress.driving.answer import checked
-from me2e_compress.driving.contract import Answer, PedalsAndWheel, Trajectory
-from me2e_compress.driving.latency import FixedLatency
+from me2e_compress.driving.contract import Answer, Trajectory
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
-from me2e_compress.evaluators.highway.runner import drive
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.session import Session
-from me2e_compress.workflows.export import ExportOptions, export_stack
 from me2e_compress.workflows.frames import FramesOptions, record_frames
 from models.stacks import STACKS, TCP, VAD_TINY
 from tests.driving.observed import motion, observation
@@ -60,60 +56,6 @@ def test_the_trajectory_head(tcp: Path) -> None:
 
     assert isinstance(found, Trajectory)
     assert found.times_s.tolist() == [0.5, 1.0, 1.5, 2.0]
-
-
-@pytest.mark.parametrize(
-    ("adapter", "throttle", "steer"),
-    [("tcp-control", 0.7, 0.1), ("tcp-beta-control", 1 / 3, 0.0)],
-)
-def test_the_control_head(
-    tcp: Path, adapter: str, throttle: float, steer: float
-) -> None:
-    assert answer(tcp, adapter) == pytest.approx((throttle, steer, 0.0))
-
-
-def test_both_heads_as_bench2drives_agent_merges_them(tcp: Path) -> None:
-    """The plan presses 0.75 and goes straight; starting it presses 0.5 at most."""
-    assert answer(tcp, "tcp-fusion") == pytest.approx((0.5, 0.05, 0.0))
-
-
-def test_both_heads_as_the_originals_agent_fuses_them(tcp: Path) -> None:
-    """In its axes the way goes to the right, so the wheel follows the target point."""
-    found = answer(tcp, "tcp-beta-fusion")
-
-    quarter_turns = -np.arctan2(5.0, 20.0) / (np.pi / 2)
-    steer = 0.7 * quarter_turns * (0.75 + 0.75 / 40 + 0.3)
-    assert isinstance(found, PedalsAndWheel)
-    assert found == pytest.approx((0.7 * 0.75 + 0.3 / 3, steer, 0.0))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("heads", "adapter", "latency_us"),
-    [
-        ("bench2drive", "tcp", 500_000),
-        ("bench2drive", "tcp-control", 500_000),
-        ("bench2drive", "tcp-fusion", 500_000),
-        ("beta", "tcp-beta-control", 100_000),
-        ("beta", "tcp-beta-fusion", 100_000),
-    ],
-)
-def test_tcp_drives_a_route_at_its_published_size(
-    tmp_path: Path, heads: str, adapter: str, latency_us: int
-) -> None:
-    """Weights are random: it gets nowhere, but no decision fails.
-
-    By its Beta heads it collides within a second, so those decide more often.
-    """
-    model = tmp_path / "tcp.onnx"
-    export_stack("tcp", model, ExportOptions(heads=heads))
-    policy = OnnxDriver(model, Path(adapter)).open()
-    conditions = Conditions(FixedLatency(latency_us), image_size=image_size_of(policy))
-
-    episode = drive(EXIT, policy, conditions)
-
-    assert episode.failure is None
-    assert len(episode.decisions) > 3
 
 
 def test_tcp_sees_its_strip_and_its_state(tcp: Path, tmp_path: Path) -> None:
@@ -195,8 +137,5 @@ def test_a_file_of_that_name_wins(
 def test_no_such_adapter_names_those_that_ship() -> None:
     with pytest.raises(EvaluationError, match="adapter tpc: no such file; we ship"):
         adapter_file(Path("tpc"))
-
-
-def test_a_synthetic_world_takes_no_adapter(tmp_path: Path) -> None:
-    with pytest.raises(EvaluationError, match="tcp is a stack of the zoo"):
-        record_frames("tcp", tmp_path / "f", FramesOptions(1, adapter=Path("tcp")))
+    with pytest.raises(EvaluationError, match=r"tcp-fusion is gone .*models\.tcp\.policy"):
+        adapter_file(Path("tcp-fusion"))

@@ -40,20 +40,21 @@ cameras = ["FRONT"]
 [feeds.state]
 parts = [{source = "speed", std = 12.0}, {source = "target-point"}]
 
+"""
+PLAN = """
 [plan]
 output = "wp"
 step_s = 0.5
-
+"""
+CONTROL = """
 [control]
 throttle = "action[0]"
 steer = "action[1]"
 brake = "action[2]"
-
-[fusion]
 """
 
 
-def checked(tmp_path: Path, adapter: str | None = ADAPTER) -> ModelCheck:
+def checked(tmp_path: Path, adapter: str | None = ADAPTER + PLAN) -> ModelCheck:
     model = tcp_like(tmp_path / "m.onnx")
     if adapter is None:
         return check_model(model)
@@ -73,11 +74,20 @@ def test_every_port_and_its_part(tmp_path: Path) -> None:
     ]
     assert [(each.name, each.use) for each in found.outputs] == [
         ("wp", "plan: 4 waypoints 0.5 s apart"),
-        ("action", "control: steer, throttle, brake"),
+        ("action", None),
         ("memory_out", "fed back to memory"),
         ("value", None),
     ]
-    assert found.drives_by == "both, fused (tcp)"
+    assert found.drives_by == "its plan"
+
+
+def test_controls_drive(tmp_path: Path) -> None:
+    found = checked(tmp_path, ADAPTER + CONTROL)
+
+    assert found.fits
+    assert found.drives_by == "its controls"
+    uses = {each.name: each.use for each in found.outputs}
+    assert uses["action"] == "control: steer, throttle, brake"
 
 
 def test_all_that_is_missing_is_told_at_once(tmp_path: Path) -> None:
@@ -105,7 +115,9 @@ def test_all_that_is_missing_is_told_at_once(tmp_path: Path) -> None:
     ],
 )
 def test_what_does_not_fit(tmp_path: Path, old: str, new: str, message: str) -> None:
-    (problem,) = checked(tmp_path, ADAPTER.replace(old, new)).problems
+    drives_by = CONTROL if "action" in old else PLAN
+    adapter = (ADAPTER + drives_by).replace(old, new)
+    (problem,) = checked(tmp_path, adapter).problems
 
     assert message.replace("\\", "") in problem
 

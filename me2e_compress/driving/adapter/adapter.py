@@ -14,7 +14,6 @@ from me2e_compress.driving.adapter.feeds import Feed
 from me2e_compress.driving.adapter.image_inputs import ImageInput, ImageNormalization
 from me2e_compress.driving.adapter.recurrent import RecurrentEntry
 from me2e_compress.driving.axes import Axes
-from me2e_compress.driving.waypoint_pid import FusionOptions
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph.files import sha256_of
 from me2e_compress.graph.recurrence import RECURRENT, declared_pairs
@@ -38,7 +37,6 @@ class Adapter(BaseModel):
             steps, which mode is taken; ``command_input = "command"`` lets the
             navigator's command pick it.
         control: Which outputs are the controls, which drive in place of the plan.
-        fusion: Options to fuse the plan and the controls.
         image: Normalisation of image inputs that have none of their own.
         axes: Ground frame of the model.
     """
@@ -51,16 +49,13 @@ class Adapter(BaseModel):
     recurrent: dict[str, RecurrentEntry] | None = None
     plan: PlanAdapter | None = None
     control: ControlAdapter | None = None
-    fusion: FusionOptions | None = None
     image: ImageNormalization | None = None
     axes: Axes = Axes.FORWARD_LEFT
 
     @model_validator(mode="after")
     def _one_driver(self) -> Self:
-        if self.fusion is not None and self.control is None:
-            raise ValueError("fusion fuses a plan with a control: name [control] too")
-        if self.plan is not None and self.control is not None and self.fusion is None:
-            raise ValueError("plan and control both drive: leave one out, or [fusion]")
+        if self.plan is not None and self.control is not None:
+            raise ValueError("plan and control both drive: leave one out")
         return self
 
     @classmethod

@@ -9,7 +9,6 @@ import numpy as np
 from me2e_compress.driving.adapter.adapter import Adapter
 from me2e_compress.driving.adapter.controls import ControlAdapter, output_named
 from me2e_compress.driving.contract import Answer, Observation, Trajectory
-from me2e_compress.driving.waypoint_pid import HeadFusion
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
@@ -23,32 +22,23 @@ COMMAND = "command"
 class ModelOutputs:
     """How a graph's outputs are read at each decision, without recurrent ones.
 
-    ``plan`` is None if the controls alone drive, ``control`` if the plan alone drives;
-    ``fusion`` fuses both and has state.
+    ``plan`` is None if the controls drive, ``control`` if the plan drives.
     """
 
     adapter: Adapter
     plan: PlanAdapter | None
     control: ControlAdapter | None
-    fusion: HeadFusion | None
 
     @classmethod
     def of(cls, session: Session, adapter: Adapter) -> Self:
         """Find the outputs of a graph to read."""
         outputs, control = list(session.outputs), adapter.control
-        fusion = None if adapter.fusion is None else HeadFusion(adapter.fusion)
         if control is not None:
             check_control(control, outputs)
-            if fusion is None:
-                return cls(adapter, None, control, None)
+            return cls(adapter, None, control)
         plan = plan_of(adapter.plan, session.metadata, outputs)
         check_command(plan, session.inputs)
-        return cls(adapter, plan, control, fusion)
-
-    def reset(self) -> None:
-        """Begin a route."""
-        if self.fusion is not None:
-            self.fusion.reset()
+        return cls(adapter, plan, None)
 
     def trajectory(
         self,
@@ -56,32 +46,19 @@ class ModelOutputs:
         feeds: Mapping[str, Array],
         observation: Observation,
     ) -> Trajectory | None:
-        """Return the plan in the ego frame; None where controls alone drive."""
+        """Return the plan in the ego frame; None where controls drive."""
         if self.plan is None:
             return None
         command = np.array([observation.command])
         points = self.plan.plan(outputs, {**feeds, COMMAND: command})
         return self.plan.trajectory(self.adapter.to_ego(points))
 
-    def answer(
-        self,
-        plan: Trajectory | None,
-        outputs: Mapping[str, Array],
-        observation: Observation,
-    ) -> Answer:
-        """Return the plan (as the host stage left it), the controls, or both fused."""
-        if self.control is None:
-            assert plan is not None
-            return plan
-        control = self.control.read(outputs)
-        if self.fusion is None or plan is None:
-            return control
-        # both heads, fused
-        speed_mps, points = observation.speed_mps, observation.target_points
-        if points is None:
-            raise EvaluationError("fusion aims at a target point, and there is none")
-        forward, left = points[0].tolist()
-        return self.fusion.fuse(plan, control, speed_mps, (-left, forward))
+    def answer(self, plan: Trajectory | None, outputs: Mapping[str, Array]) -> Answer:
+        """Return the plan (as the host stage left it), or the controls."""
+        if self.control is not None:
+            return self.control.read(outputs)
+        assert plan is not None
+        return plan
 
 
 def check_control(control: ControlAdapter, outputs: Sequence[str]) -> None:

@@ -93,7 +93,7 @@ def _no_start(name: str, port: SessionPort) -> dict[str, str]:
 class OutputUses:
     """Which outputs drive, and how they are read.
 
-    ``drives_by`` names the plan, the controls or both in words, and is empty if there
+    ``drives_by`` names the plan or the controls in words, and is empty if there
     is none; ``uses`` is by output; ``problems`` are names that do not exist.
     """
 
@@ -116,8 +116,6 @@ class OutputUses:
                 uses[found.plan.scores] = "scores, which pick the plan's mode"
         if found.control is not None:
             uses |= control_words(found.control, session.outputs)
-        if found.fusion is not None:
-            return cls(f"both, fused ({found.fusion.options.rule})", uses, ())
         return cls("its plan" if found.control is None else "its controls", uses, ())
 
     def ports(

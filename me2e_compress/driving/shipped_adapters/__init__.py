@@ -3,7 +3,7 @@
 from importlib import resources
 from pathlib import Path
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.errors import FORMER, EvaluationError
 
 __all__ = ["adapter_file", "shipped_adapters"]
 
@@ -21,6 +21,5 @@ def adapter_file(named: Path) -> Path:
         return named
     if str(named) in shipped_adapters():
         return Path(str(resources.files(__name__) / f"{named}.toml"))
-    raise EvaluationError(
-        f"adapter {named}: no such file; we ship {', '.join(shipped_adapters())}"
-    )
+    line = f"adapter {named}: no such file; we ship {', '.join(shipped_adapters())}"
+    raise EvaluationError(FORMER.get(f"adapter {named}", line))

@@ -79,8 +79,6 @@ def test_controls_drive_in_place_of_the_plan(tmp_path: Path) -> None:
         ("[control]\nsteer = 'gas[1]'", "control: either throttle, steer and brake"),
         ("[control]\nthrottle = 'gas'\nsteer = 'gas[1]'", "gas has 3 numbers: say"),
         (f"{VECTOR}\n[plan]\noutput = 'plan'", "plan and control both drive"),
-        ("[fusion]\nshare = 0.3", "fusion fuses a plan with a control"),
-        (f"{VECTOR}\n[fusion]\nshare = 2", "fusion.share: Input should be less"),
         ("[plan]\noutput = 'gas'\nstep_s = 0.5", "gas has shape [1, 3], a plan is"),
         ("[plan]\noutput = 'plan'\nstep_s = 0", "plan.step_s: Input should be greater"),
         ("[plan]\noutput = 'plan'\nshape = [6, 0]", "every side is 1 or more"),

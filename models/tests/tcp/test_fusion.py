@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
-from me2e_compress.driving.waypoint_pid import FusionOptions, HeadFusion
 from me2e_compress.errors import EvaluationError
+from models.tcp.fusion import HeadFusion, Rule
 
 AHEAD = (0.0, 30.0)
 TIMES = np.array([0.5, 1.0, 1.5, 2.0])
@@ -16,11 +16,10 @@ def straight(speed_mps: float) -> Trajectory:
 
 
 def fused(
-    control: PedalsAndWheel, speed_mps: float, rule: str = "tcp"
+    control: PedalsAndWheel, speed_mps: float, rule: Rule = "tcp"
 ) -> PedalsAndWheel:
     """Fuse with a plan that goes straight at 4 m/s."""
-    fusion = HeadFusion(FusionOptions.model_validate({"rule": rule}))
-    return fusion.fuse(straight(4.0), control, speed_mps, AHEAD)
+    return HeadFusion(rule).fuse(straight(4.0), control, speed_mps, AHEAD)
 
 
 def test_the_trajectory_leads_at_first() -> None:
@@ -31,7 +30,7 @@ def test_the_trajectory_leads_at_first() -> None:
 
 
 def test_the_control_leads_once_it_has_turned_eleven_times() -> None:
-    fusion = HeadFusion(FusionOptions())
+    fusion = HeadFusion("tcp")
     control = PedalsAndWheel(0.0, 0.5, 0.0)
 
     steers = [fusion.fuse(straight(4.0), control, 4.0, AHEAD).steer for _ in range(12)]
@@ -43,7 +42,7 @@ def test_the_control_leads_once_it_has_turned_eleven_times() -> None:
 
 
 def test_small_steers_are_no_turn() -> None:
-    fusion = HeadFusion(FusionOptions())
+    fusion = HeadFusion("tcp")
 
     for _ in range(20):
         fusion.fuse(straight(4.0), PedalsAndWheel(0.0, 0.33, 0.0), 4.0, AHEAD)
@@ -81,4 +80,4 @@ def test_one_waypoint_cannot_be_fused() -> None:
     plan = Trajectory(np.ones((1, 2)), np.ones(1))
 
     with pytest.raises(EvaluationError, match="one waypoint cannot be followed"):
-        HeadFusion(FusionOptions()).fuse(plan, PedalsAndWheel(0, 0, 0), 1.0, AHEAD)
+        HeadFusion("tcp").fuse(plan, PedalsAndWheel(0, 0, 0), 1.0, AHEAD)
