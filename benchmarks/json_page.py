@@ -55,7 +55,7 @@ NAMED = (
     ),
     *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity),
     *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
-    *(Int8Outcome, RuleSummary, WeightsRecord, RangeFinding, DumpResult),
+    *(Int8Outcome, RuleSummary, RangeFinding, DumpResult),
     *(FirstDifference, RuntimeLoss, JoinResult, SplitResult),
 )
 """Classes that the forms name; what their fields name is found."""

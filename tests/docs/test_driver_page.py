@@ -3,8 +3,6 @@
 import re
 from pathlib import Path
 
-import pytest
-
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.workflows.inspect import inspect
 
@@ -30,20 +28,3 @@ def test_parameters_and_macs_are_those_of_the_file() -> None:
 def test_modules_are_told_in_the_order_of_the_map() -> None:
     names = [item.module for item in inspect(shipped("highway"), None).modules]
     assert list(told()) == names
-
-
-FILES = r"`((?:me2e_compress|driver)/[\w/]+(?:\.py|/))`"
-
-
-@pytest.mark.parametrize("path", sorted(set(re.findall(FILES, PAGE.read_text()))))
-def test_a_file_it_names_is_there(path: str) -> None:
-    assert (ROOT / path).exists()
-
-
-def test_its_example_is_python_that_names_what_exists() -> None:
-    (example,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    pytest.importorskip("torch")
-    head, _, _ = example.partition("\ncourse = ")
-    names: dict[str, object] = {}
-    exec(compile(head, "driver.md", "exec"), names)
-    assert {"FULL", "HighwayConfig", "run"} <= set(names)
