@@ -17,7 +17,6 @@ __all__ = [
     "PreconditionError",
     "RecipeError",
     "StudyError",
-    "TrainingError",
     "VerificationError",
 ]
 
@@ -127,10 +126,6 @@ class EvaluationError(Me2eError):
 
 class StudyError(Me2eError):
     """A study is malformed, or names what it does not have."""
-
-
-class TrainingError(Me2eError):
-    """A driver cannot be trained as asked."""
 
 
 class MissingExtraError(Me2eError):

@@ -11,7 +11,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.errors import TrainingError
+from models.driver.errors import TrainingError
 
 Weights = Mapping[str, Tensor]
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Self
 
 from me2e_compress.driving.latency import FixedLatency
-from me2e_compress.errors import TrainingError
 from models.driver.data import Sequences
+from models.driver.errors import TrainingError
 from models.driver.network.config import HighwayConfig
 from models.driver.process import Training
 

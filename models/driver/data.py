@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.errors import TrainingError
 from models.driver.episodes import decode
+from models.driver.errors import TrainingError
 from models.driver.frenet import project
 from models.driver.network.config import STEP_S
 from models.driver.stored_episode import KEPT, Array, Bytes, read

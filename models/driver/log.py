@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from me2e_compress.errors import TrainingError
 from me2e_compress.runtime.atomic import write_bytes
+from models.driver.errors import TrainingError
 
 Row = dict[str, Any]
 

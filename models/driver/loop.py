@@ -9,13 +9,13 @@ from pathlib import Path
 import torch
 from torch.multiprocessing.spawn import ProcessException, spawn
 
-from me2e_compress.errors import TrainingError
 from me2e_compress.runtime.children import (
     end_with_parent,
     killed_on_error,
     sheltered,
 )
 from models.driver.checkpoint import TrainingCheckpoint
+from models.driver.errors import TrainingError
 from models.driver.network.config import HighwayConfig
 from models.driver.options import difference
 from models.driver.process import (

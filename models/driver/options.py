@@ -5,8 +5,8 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from me2e_compress.errors import TrainingError
 from me2e_compress.runtime.atomic import write_json
+from models.driver.errors import TrainingError
 
 Words = tuple[str, str, str]
 

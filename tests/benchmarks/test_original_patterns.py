@@ -1,4 +1,4 @@
-"""The original's forms of VAD-tiny compute what the zoo's do."""
+"""The original's forms of VAD-tiny compute what those of models/ do."""
 
 import torch
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.graph import sha256_of
@@ -28,6 +27,7 @@ from models.driver.episodes.collection import (
 )
 from models.driver.episodes.episode_arrays import Arrays, arrays_of
 from models.driver.episodes.recording_policy import RecordingPolicy
+from models.driver.errors import TrainingError
 from models.driver.options import claim
 
 SUFFIX, SKIPPED = ".npz", ".skipped"

@@ -3,10 +3,10 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.generate import propose, seed_of
 from me2e_compress.simulator.routes import SETS, Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from models.driver.errors import TrainingError
 
 MANIFEST = "dataset.json"
 FORMAT = 2

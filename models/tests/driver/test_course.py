@@ -15,7 +15,6 @@ import psutil
 import pytest
 
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.errors import TrainingError
 from me2e_compress.simulator.routes import load_routes
 from me2e_compress.workflows.listener import Listener
 from models.driver.checkpoint import TrainingCheckpoint
@@ -30,6 +29,7 @@ from models.driver.curriculum import (
     held_out_files,
 )
 from models.driver.episodes.collection import Collection, tasks_of
+from models.driver.errors import TrainingError
 from models.driver.log import Log
 from models.driver.network.stack import Highway
 from models.driver.options import difference

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.observe import can_bus_of
 from me2e_compress.simulator.scene import Ego
 from models.driver.data import Episodes, Sequences
+from models.driver.errors import TrainingError
 from models.tests.driver.made import SIZE, arrays_of, write
 from tests.profiles import scaled
 

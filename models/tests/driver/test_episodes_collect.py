@@ -16,7 +16,7 @@ import numpy as np
 import psutil
 import pytest
 
-from me2e_compress.errors import EvaluationError, TrainingError
+from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.generate import seed_of
 from me2e_compress.graph import sha256_of
 from me2e_compress.simulator.routes import SETS, Route, load_routes
@@ -28,6 +28,7 @@ from models.driver.episodes import (
     decode,
 )
 from models.driver.episodes import collection as room
+from models.driver.errors import TrainingError
 from tests.docs.pages import ROOT
 from tests.evaluators.highway.drivers import straight_on
 

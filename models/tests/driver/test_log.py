@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from me2e_compress.errors import TrainingError
+from models.driver.errors import TrainingError
 from models.driver.log import Log
 from models.driver.options import claim, difference
 

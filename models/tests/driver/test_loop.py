@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from me2e_compress.errors import TrainingError
 from models.driver.checkpoint import TrainingCheckpoint
 from models.driver.data import Sequences
+from models.driver.errors import TrainingError
 from models.driver.log import Log
 from models.driver.loop import train
 from models.driver.losses import LampHead

@@ -8,10 +8,10 @@ import pytest
 import torch
 from onnx import numpy_helper
 
-from me2e_compress.errors import TrainingError
 from me2e_compress.shipped.drivers import SHIPPED, card, shipped
 from models.driver.checkpoint import Start, TrainingCheckpoint
 from models.driver.data import Sequences
+from models.driver.errors import TrainingError
 from models.driver.losses import LampHead
 from models.driver.network.config import HighwayConfig
 from models.driver.network.stack import Highway, write_onnx

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import nn
 
-from me2e_compress.errors import TrainingError
 from models.driver.checkpoint import TrainingCheckpoint, fit
 from models.driver.course import load
+from models.driver.errors import TrainingError
 from models.driver.network.stack import Highway
 from models.tests.driver.made import LITTLE
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway import generate as gate
 from me2e_compress.evaluators.highway.generate import ScenarioRoutes, propose
 from me2e_compress.simulator.routes import Route, load_routes
 from models.driver import trial
 from models.driver.curriculum import Trial
+from models.driver.errors import TrainingError
 
 TYPES = ("ControlLoss", "HighwayCutIn")
 WHAT = Trial(seed=7, routes=3, scenarios=TYPES)

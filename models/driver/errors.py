@@ -1,0 +1,7 @@
+"""What training raises on purpose."""
+
+from me2e_compress.errors import Me2eError
+
+
+class TrainingError(Me2eError):
+    """A driver cannot be trained as asked."""
