@@ -114,8 +114,10 @@ class TcpPolicy:
         """Return the controls, or both heads fused."""
         feeds = self.graph.feeds(observation)
         outputs = self.graph.session.run(feeds)
-        read = likely_action if self.heads == "beta" else best_action
-        control = read(*(outputs[name] for name in OUTPUTS[self.heads]))
+        if self.heads == "beta":
+            control = likely_action(outputs["mu_branches"], outputs["sigma_branches"])
+        else:
+            control = best_action(outputs["action_index"])
         if self.fusion is None:
             return control
         plan = self.graph.outputs.trajectory(outputs, feeds, observation)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import Answer, PedalsAndWheel
@@ -26,15 +27,15 @@ ACTION = 6
 """Throttle 0.7, steer 0.1 of Bench2DriveZoo's 39."""
 
 
-def scores(**by_action: float) -> np.ndarray:
-    return np.array([by_action.get(f"a{k}", 0.0) for k in range(39)], np.float32)
+def scores(by_action: dict[int, float]) -> NDArray[np.float32]:
+    return np.array([by_action.get(k, 0.0) for k in range(39)], np.float32)
 
 
 @pytest.fixture
 def tcp(tmp_path: Path) -> Path:
     """TCP's ports: the way straight ahead at 4 m/s, the sixth action, a Beta's mode."""
     ports = ", ".join(f"float{list(at)} {name}" for name, at in TCP.inputs.items())
-    best = ", ".join(map(str, scores(**{f"a{ACTION}": 1.0})))
+    best = ", ".join(map(str, scores({ACTION: 1.0})))
     return straight_on(
         tmp_path / "tcp.onnx",
         inputs=ports,
@@ -149,7 +150,7 @@ def test_every_beta_distribution_is_in_range(four: tuple[float, ...]) -> None:
 
 
 def test_the_action_with_the_largest_score() -> None:
-    assert best_action(scores(a1=0.9, a2=0.9)) == PedalsAndWheel(0.7, -0.5, 0.0)
+    assert best_action(scores({1: 0.9, 2: 0.9})) == PedalsAndWheel(0.7, -0.5, 0.0)
     assert len(set(ACTIONS)) == 39
 
 
@@ -163,4 +164,4 @@ def test_outputs_that_are_no_control() -> None:
     with pytest.raises(EvaluationError, match="mu_branches has 1 numbers, it must h"):
         likely_action(np.ones(1), np.ones(2))
     with pytest.raises(EvaluationError, match="a score of action_index is not finite"):
-        best_action(scores(a3=math.nan))
+        best_action(scores({3: math.nan}))
