@@ -8,8 +8,9 @@ import warnings
 from pathlib import Path
 
 import torch
-from tests.passes.test_fuse_operators_exports import compressed, fused, moves
 from torch import Tensor, nn
+
+from models.tests.test_fuse_operators_exports import compressed, fused, moves
 
 LEVELS = ((12, 16), (6, 8), (3, 4))
 PIXELS = sum(height * width for height, width in LEVELS)
