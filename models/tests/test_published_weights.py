@@ -215,5 +215,5 @@ def test_anchors_of_uniad_are_asked_for(tmp_path: Path) -> None:
 
 
 def test_a_stack_without_an_original(tmp_path: Path) -> None:
-    with pytest.raises(GraphError, match="highway has no original"):
-        published_weights("highway", tmp_path / "a.pth")
+    with pytest.raises(GraphError, match="uniad-trt has no original"):
+        published_weights("uniad-trt", tmp_path / "a.pth")
