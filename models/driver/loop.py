@@ -110,7 +110,11 @@ def _cause(error: ProcessException) -> str:
     """Return the last line of a process's traceback, without our errors' names."""
     last = str(error).strip().splitlines()[-1]
     kind, _, words = last.partition(": ")
-    return words if kind.startswith("me2e_compress.errors.") else last
+    return (
+        words
+        if kind.startswith(("me2e_compress.errors.", "models.driver.errors."))
+        else last
+    )
 
 
 def _steps(checkpoint: Path, what: Training) -> int:

@@ -54,7 +54,7 @@ def test_there_is_room_for_all_that_learns(group: ProcessGroup) -> None:
 
 
 def test_who_waits_in_vain_gives_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("driver.process_group.PATIENCE_S", 0.1)
+    monkeypatch.setattr("models.driver.process_group.PATIENCE_S", 0.1)
     alone = ProcessGroup(
         torch.zeros(2, 5),
         mp.get_context("spawn").Barrier(2),

@@ -14,7 +14,7 @@ from me2e_compress.simulator.cameras import CameraRig
 from models.driver.network.bev_encoder import RECORD, motion_of
 from models.driver.network.config import HighwayConfig
 from models.driver.network.stack import Highway, stood_lately
-from models.stacks import find
+from models.stacks import HIGHWAY
 
 Feeds = dict[str, npt.NDArray[np.generic]]
 
@@ -46,7 +46,7 @@ def test_onnx_answers_as_torch_does(model: Highway, exported: Path, seed: int) -
     with torch.no_grad():
         wanted = model(*(torch.from_numpy(x) for x in feeds.values()))
     found = Session(exported, threads=1).run(feeds)
-    for name, tensor in zip(find("highway").outputs, wanted, strict=True):
+    for name, tensor in zip(HIGHWAY.outputs, wanted, strict=True):
         assert found[name] == pytest.approx(tensor.numpy(), abs=2e-4), name
 
 
