@@ -44,8 +44,8 @@ The questions, with test, edge, interval and correction, stand in [a file](quest
 
 Energy is measured where the machine has a counter; what is modelled from MACs and bytes stands in columns of its own. `--stack FOLDER` counts another stack's files in table 4, such as VAD-tiny's:
 
-    me2e-compress export vad-tiny -o vad-tiny.onnx
-    me2e-compress frames vad-tiny -n 8 -o vad-frames
+    python -m models.export vad-tiny -o vad-tiny.onnx
+    python -m models.frames vad-tiny -n 8 -o vad-frames
     for scheme in prediction feature-ext full; do
       me2e-compress compress vad-tiny.onnx -r $scheme --frames vad-frames -o vad-tiny/$scheme.onnx
     done

@@ -23,7 +23,7 @@ from me2e_compress.runtime.session import Session, detached
 
 ROUNDING_DB = 80.0
 """SQNR of two float32 values that differ by rounding alone: two runtimes are 3e-5 to
-6e-5 apart on UniAD-tiny (docs/uniad.md)."""
+6e-5 apart on UniAD-tiny (models/README.md)."""
 
 NARROW = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
 

@@ -19,7 +19,7 @@ from me2e_compress.runtime.session import Session
 
 ROUNDING = 1e-4
 """A deviation, over the length of the output, that may be rounding alone: two runtimes
-are 3e-5 to 6e-5 apart in float32 on UniAD-tiny (docs/uniad.md)."""
+are 3e-5 to 6e-5 apart in float32 on UniAD-tiny (models/README.md)."""
 
 Verdict: TypeAlias = Literal["alive", "constant", "frozen", "not judged"]
 
