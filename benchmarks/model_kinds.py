@@ -7,7 +7,8 @@ architectures are those of ``transformers``' configurations or of
 :mod:`benchmarks.own_kinds`; the way each is exported is the kind: float16, weights in a
 file beside the graph, a symbolic batch and image size, torch's older and newer
 exporter. Normalisations have seen images, so that signals neither vanish nor explode.
-A model that is there is not made again.
+A model that is there is not made again. Needs `pip install -c constraints.txt
+transformers`.
 """
 
 import argparse
