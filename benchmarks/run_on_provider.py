@@ -1,7 +1,7 @@
 """Run one frame of a file on one provider of onnxruntime, in a process of its own.
 
     python -m benchmarks.run_on_provider MODEL.onnx FRAME.npz OUT.npz --provider TEXT
-        [--plugins LIB] [--stock] [--bound] [--threads 0] [--warm-up 20] [--runs 200]
+        [--stock] [--bound] [--threads 0] [--warm-up 20] [--runs 200]
         [--seconds 60] [--energy]
 
 Prints one line of JSON: seconds on the clock of every run after the warm-up (until so
@@ -147,7 +147,7 @@ def energy(run: Run, provider: Provider) -> EnergyResult:
 
 def measured(given: Any) -> dict[str, Any]:
     """Open, run, and weigh one file."""
-    provider = provider_named(given.provider, given.plugins)
+    provider = provider_named(given.provider)
     device = getattr(provider, "device", 0)
     with np.load(given.frame) as held:
         feeds = {name: np.ascontiguousarray(held[name]) for name in held}
@@ -179,7 +179,6 @@ def main() -> None:
     parser.add_argument("frame", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--provider", default="cpu")
-    parser.add_argument("--plugins", type=Path, action="append", default=[])
     parser.add_argument("--stock", action="store_true")
     parser.add_argument("--bound", action="store_true")
     parser.add_argument("--threads", type=int, default=0)

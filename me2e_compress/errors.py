@@ -42,6 +42,7 @@ FORMER = {
     "--baseline-median-s": f"--baseline-median-s {_NOW} a study's key of that name",
     "--records": f"study --records {_NOW} python -m benchmarks.paper in the repository",
     "--weigh": f"study --weigh {_NOW} python -m benchmarks.paper in the repository",
+    "--plugins": f"--plugins {_NOW} --provider 'cpu{{plugins=[LIB.so]}}'",
     "study paper": f"the study paper {_NOW} benchmarks/paper/paper.toml",
     "study shifts": f"the study shifts {_NOW} benchmarks/shifts.toml",
     "study tail": f"the study tail {_NOW} benchmarks/tail.toml",

@@ -137,12 +137,13 @@ class LazyGroup(TyperGroup):
         name, known, rest = super().resolve_command(ctx, args)
         if name is None:
             return name, known, rest
-        for word in rest:
-            option = word.partition("=")[0]
-            if gone := FORMER.get(f"{name} {option}", FORMER.get(option)):
-                ctx.fail(gone)
         # only the command that is called is imported
         loaded = COMMANDS[name].load()
+        taken = {flag for each in loaded.params for flag in each.opts}
+        for flag in (word.partition("=")[0] for word in rest):
+            gone = FORMER.get(f"{name} {flag}") or FORMER.get(flag)
+            if gone and flag not in taken:
+                ctx.fail(gone)
         common = [each for each in self.params if each.name in COMMON]
         loaded.params = [*loaded.params, *common]  # before and after the command's name
         return name, loaded, rest

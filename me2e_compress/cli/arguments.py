@@ -38,11 +38,7 @@ Count = Annotated[int, typer.Option("-n", "--count", help="number of frames")]
 Seed = Annotated[int, typer.Option(min=0, help="seed of everything random")]
 Provider = Annotated[
     str,
-    typer.Option(help="runs the graph: cpu, cuda, tensorrt, tensorrt-rtx, or see list"),
-]
-Plugins = Annotated[
-    list[Path] | None,
-    typer.Option(help="a library of operators or plugins; once for each"),
+    typer.Option(help="runs the graph: cpu, cuda{plugins=[LIB.so]}, ... or see list"),
 ]
 Threads = Annotated[int, typer.Option(min=0, help="of onnxruntime; 0 takes all")]
 Workers = Annotated[int, typer.Option(min=1, help="processes at a time")]

@@ -2,7 +2,6 @@
 
 import inspect
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -15,7 +14,7 @@ from me2e_compress.evaluators.highway.evaluator import routes_named
 from me2e_compress.manager import recipe
 from me2e_compress.passes import Pass
 from me2e_compress.registry import documents
-from me2e_compress.runtime.providers import provider_named
+from me2e_compress.runtime.providers import PROVIDERS, provider_named
 from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study.condition import Condition
@@ -29,7 +28,6 @@ def load_study(
     path: str | Path,
     routes: str | None = None,
     provider: str | None = None,
-    plugins: Sequence[Path] = (),
     *,
     trust_code: bool = False,
 ) -> Study:
@@ -42,7 +40,6 @@ def load_study(
         path: The TOML file.
         routes: Routes to drive instead of the study's.
         provider: Execution provider instead of the study's, as a text.
-        plugins: Libraries of operators or plugins, in addition to the study's.
         trust_code: Accept a study that names code: a Python function that makes a
             policy, or libraries, both of which may lie next to it.
 
@@ -70,15 +67,17 @@ def load_study(
             raise StudyError(
                 f"{path}: variant {each.name}: neither it nor the study names a policy"
             )
-    # options of the caller take precedence
+    # options of the caller take precedence, and need no trust
     if provider is not None:
-        table.provider = provider
-    if not trust_code and (named := _code(table)):
+        table.provider, libraries = provider, ()
+    else:
+        libraries = PROVIDERS.parse(table.provider).plugins
+    if not trust_code and (named := [*_code(table), *map(str, libraries)]):
         raise StudyError(
             f"{path} runs code: {named[0]}; look at it first, then say --trust-code"
         )
     # resolve its names, and check what it refers to
-    study = _Reader(path).study(table, routes, plugins)
+    study = _Reader(path).study(table, routes)
     study.check_recordings()
     return study
 
@@ -176,15 +175,13 @@ class _Reader:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def study(
-        self, table: _Study, routes: str | None, plugins: Sequence[Path]
-    ) -> Study:
+    def study(self, table: _Study, routes: str | None) -> Study:
         if table.record is not None and (table.frames or table.held_out):
             raise StudyError(
                 f"{self.path}: give folders of frames, or what to record, not both"
             )
         # the caller's routes take precedence over the file's
-        libraries = (*map(self._beside, table.plugins), *plugins)
+        libraries = [self._beside(each) for each in table.plugins]
         which = routes if table.routes is None or routes else str(table.routes)
         driven, set_size = self._routes(which, table)
         return Study(

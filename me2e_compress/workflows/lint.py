@@ -58,8 +58,7 @@ class LintOptions:
             raise RecipeError(f"--{option} is for tensorrt, not for {self.target}")
         if self.provider != CPU and self.target and not self.judge.opens:
             raise RecipeError(
-                f"--provider and --plugins are onnxruntime's: lint for {self.target}"
-                " opens no session"
+                f"--provider is onnxruntime's: lint for {self.target} opens no session"
             )
 
     def of(self, model: ir.Model) -> Self:

@@ -1,4 +1,4 @@
-"""Commands that open a session take a provider and libraries of operators."""
+"""Commands that open a session take a provider with libraries of operators."""
 
 from pathlib import Path
 
@@ -49,9 +49,10 @@ def folder(dense: Path) -> Path:
 def test_what_is_missing_is_one_line_of_every_command(
     cli: Cli, monkeypatch: pytest.MonkeyPatch, line: str
 ) -> None:
-    said = cli.refused(f"{line} --plugins none.so")
+    said = cli.refused(f"{line} --provider cpu{{plugins=[none.so]}}")
     assert said.endswith("plugins library none.so: no such file")
-    assert "plugins library text.so: " in cli(f"{line} --plugins text.so").err
+    there = cli(f"{line} --provider cpu{{plugins=[text.so]}}").err
+    assert "plugins library text.so: " in there
     monkeypatch.setattr(ort, "get_available_providers", lambda: [CpuProvider.native])
     said = cli.refused(f"{line} --provider cuda")
     assert "provider cuda: onnxruntime" in said

@@ -114,7 +114,9 @@ OTHERS = {
     "lint dense.onnx --target onnxruntime --target-version 10.13": (
         "--target-version is for tensorrt, not for onnxruntime"
     ),
-    "lint dense.onnx --plugins in.onnx": "lint for tensorrt opens no session",
+    "lint dense.onnx --provider cpu{plugins=[in.onnx]}": (
+        "lint for tensorrt opens no session"
+    ),
     "ranges nowhere": "nowhere: no such ranges file or calibration cache",
     "ranges frames": "frames: no such ranges file or calibration cache",
     "ranges in.onnx": r"in\.onnx: not a calibration cache",

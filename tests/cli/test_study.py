@@ -173,6 +173,7 @@ Path(__file__).with_suffix(".sprung").touch()
         ("", "their_code:make"),
         ("", "python{factory=their_code:make}"),
         ('plugins = ["their.so"]', "blind"),
+        ('provider = "cpu{plugins=[their.so]}"', "blind"),
     ],
 )
 def test_a_study_that_names_code_is_refused_until_it_is_trusted(
@@ -197,4 +198,5 @@ def test_a_study_that_names_no_code_needs_no_trust(tmp_path: Path) -> None:
     (tmp_path / "mine.so").touch()
 
     assert load_study(tmp_path / "study.toml")
-    assert load_study(tmp_path / "study.toml", plugins=[tmp_path / "mine.so"])
+    mine = f"cpu{{plugins=[{tmp_path}/mine.so]}}"
+    assert load_study(tmp_path / "study.toml", provider=mine)

@@ -141,15 +141,15 @@ def test_a_file_where_you_are_is_not_beside_the_study(
         load_study(path)
 
 
-def test_libraries_of_the_study_and_of_the_command_line(models: Path) -> None:
+def test_libraries_of_the_study_and_of_its_provider(models: Path) -> None:
     for name in ("beside.so", "other.so"):
         (models / name).touch()
-    keys = 'provider = "cpu"\nplugins = ["beside.so"]\n'
+    other = models / "other.so"
+    keys = f'provider = "cpu{{plugins=[{other}]}}"\nplugins = ["beside.so"]\n'
 
-    toml = write(models, keys + GOOD)
-    study = load_study(toml, plugins=[models / "other.so"], trust_code=True)
+    study = load_study(write(models, keys + GOOD), trust_code=True)
 
-    libraries = (models / "beside.so", models / "other.so")
+    libraries = (other, models / "beside.so")
     assert study.provider == CpuProvider(plugins=libraries)
     assert set(libraries) <= set(study.inputs())
 

@@ -18,6 +18,9 @@ TacticSource = Annotated[
     list[str] | None,
     typer.Option(help="take kernels from CUBLAS, ... alone; once for each"),
 ]
+Plugins = Annotated[
+    list[Path] | None, typer.Option(help="a library of TensorRT plugins; once for each")
+]
 
 
 def build(
@@ -25,7 +28,7 @@ def build(
     output: Output,
     precision: Types = "graph",
     tactic_source: TacticSource = None,
-    plugins: given.Plugins = None,
+    plugins: Plugins = None,
     force: given.Force = False,
 ) -> None:
     """Build a TensorRT engine of a graph, for the GPU of this machine."""

@@ -37,7 +37,6 @@ def calibrate(
     onnxruntime_table: Table = None,
     threads: given.Threads = 0,
     provider: given.Provider = "cpu",
-    plugins: given.Plugins = None,
     force: given.Force = False,
 ) -> None:
     """Measure the ranges of every tensor that any scheme, rule set or target needs.
@@ -51,7 +50,7 @@ def calibrate(
         imported=imported, threads=threads,
         force=force, adapter=adapter,
         tensorrt_cache=tensorrt_cache, onnxruntime_table=onnxruntime_table,
-        dims=sizes(set_dim or ()), provider=provider_named(provider, plugins or ()),
+        dims=sizes(set_dim or ()), provider=provider_named(provider),
     )  # fmt: skip
     with listening() as listener:
         found = workflow.calibrate(model, frames, output, options, listener)

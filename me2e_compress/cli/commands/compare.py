@@ -49,13 +49,12 @@ def compare(
     adapter: given.Adapter = None,
     module_map: given.ModuleMap = None,
     provider: given.Provider = "cpu",
-    plugins: given.Plugins = None,
 ) -> None:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres.
 
     Exit code 1 if an output of the second hardly moves any more.
     """
-    runs_on = provider_named(provider, plugins or ())
+    runs_on = provider_named(provider)
     if where and (as_it_stands or outputs is not None):
         raise RecipeError(
             "--first-difference holds two graphs together, all nodes as they stand:"

@@ -55,7 +55,6 @@ def compress(
     set_dim: given.SetDim = None,
     adapter: given.Adapter = None,
     provider: given.Provider = "cpu",
-    plugins: given.Plugins = None,
     force: given.Force = False,
 ) -> None:
     """Apply passes to a graph, check each, and write the smaller graph and a report.
@@ -71,7 +70,7 @@ def compress(
         measure_frames=measure_frames, floor=floor, alive=alive, smaller=smaller,
         force=force, dims=sizes(set_dim or ()),
         adapter=adapter, unproven=unproven, allow_empty=allow_empty,
-        provider=provider_named(provider, plugins or ()),
+        provider=provider_named(provider),
     )  # fmt: skip
     with listening() as listener:
         found = workflow.compress(model, output, wanted, frames, options, listener)

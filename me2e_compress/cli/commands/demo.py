@@ -27,7 +27,6 @@ def demo(
     routes: Routes = "5",
     workers: given.Workers = 2,
     provider: given.Provider = "cpu",
-    plugins: given.Plugins = None,
     force: given.Force = False,
 ) -> None:
     """Run the main job on what ships: compress, verify, compare, drive, report.
@@ -37,7 +36,7 @@ def demo(
     need_extra("highway", "driving in the demo")
     from me2e_compress.study.demo import DriverDemo
 
-    runs = provider_named(provider, plugins or ())
+    runs = provider_named(provider)
     steps = DriverDemo(output, recipe, runs, force, routes, workers).steps
     # each step says what it found as soon as it is done
     output.mkdir(parents=True, exist_ok=True)

@@ -71,7 +71,6 @@ def evaluate(
     render: Render = None,
     evaluator: Evaluator = "highway",
     provider: given.Provider = "cpu",
-    plugins: given.Plugins = None,
     force: given.Force = False,
 ) -> None:
     """Drive a policy over routes of highway-env; run it again to go on.
@@ -80,7 +79,7 @@ def evaluate(
     for all. --check looks at POLICY, --adapter, --map and --provider alone; 1 if it
     could not drive.
     """
-    runs = provider_named(provider, plugins or ())
+    runs = provider_named(provider)
     # --check drives nothing, and needs no folder
     if check:
         _check(policy, adapter, module_map, runs)

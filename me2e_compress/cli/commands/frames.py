@@ -36,7 +36,6 @@ def frames(
     road: given.Road = None,
     seed: given.Seed = 0,
     provider: given.Provider = "cpu",
-    plugins: given.Plugins = None,
     force: given.Force = False,
 ) -> None:
     """Write calibration frames, coherent in time, seen by six cameras.
@@ -50,7 +49,7 @@ def frames(
         seed,
         scene_length,
         force,
-        provider_named(provider, plugins or ()),
+        provider_named(provider),
         None if log is None else LOGS.parse(log),
         adapter,
         road,

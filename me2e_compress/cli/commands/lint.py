@@ -27,10 +27,9 @@ def lint(
     sm: Annotated[int, typer.Option(help="GPU generation that is built for")] = 86,
     set_dim: given.SetDim = None,
     provider: given.Provider = "cpu",
-    plugins: given.Plugins = None,
 ) -> None:
     """Check a graph for the runtime that will run it; exit code 1 if it refuses."""
-    runs = provider_named(provider, plugins or ())
+    runs = provider_named(provider)
     dims = sizes(set_dim or ())
     options = workflow.LintOptions(target, trt_check, sm, dims, runs, target_version)
     with listening() as listener:

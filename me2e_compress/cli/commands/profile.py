@@ -40,7 +40,6 @@ def profile(
     module_map: given.ModuleMap = None,
     adapter: given.Adapter = None,
     provider: given.Provider = "cpu",
-    plugins: given.Plugins = None,
     force: given.Force = False,
 ) -> None:
     """Measure a model alone and warm, and write its latencies as a trace.
@@ -48,7 +47,7 @@ def profile(
     With --import nothing is run: the latencies are those that another tool measured.
     """
     # a measurement and an import share the options that both understand
-    device = provider_named(provider, plugins or ())
+    device = provider_named(provider)
     options = workflow.ProfileOptions(
         samples,
         threads=threads,

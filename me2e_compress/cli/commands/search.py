@@ -36,7 +36,6 @@ def search(
     count: given.JudgedFrames = 4,
     threads: given.Threads = 0,
     provider: given.Provider = "cpu",
-    plugins: given.Plugins = None,
     force: given.Force = False,
 ) -> None:
     """Find the scheme within the budgets that costs the plan least."""
@@ -44,7 +43,7 @@ def search(
         max_mb=max_mb, max_ms=max_ms, max_joules=max_joules, scheme=scheme, rules=rules,
         target=target, ranges=ranges, module_map=module_map, count=count,
         threads=threads, dims=sizes(set_dim or ()), force=force,
-        provider=provider_named(provider, plugins or ()), adapter=adapter,
+        provider=provider_named(provider), adapter=adapter,
     )  # fmt: skip
     with listening() as listener:
         found = workflow.search(model, frames, output, options, listener)

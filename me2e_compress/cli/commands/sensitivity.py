@@ -45,7 +45,6 @@ def sensitivity(
     count: given.JudgedFrames = 4,
     threads: given.Threads = 0,
     provider: given.Provider = "cpu",
-    plugins: given.Plugins = None,
     force: given.Force = False,
 ) -> None:
     """Measure what int8 costs module by module, and write a recipe within a limit.
@@ -61,7 +60,7 @@ def sensitivity(
         drive_limit=drive_limit, adapter=adapter, workers=workers,
         node_trials=node_trials, ranges=ranges, module_map=module_map, count=count,
         threads=threads, dims=sizes(set_dim or ()), force=force,
-        provider=provider_named(provider, plugins or ()),
+        provider=provider_named(provider),
     )  # fmt: skip
     with listening() as listener:
         found = workflow.measure_sensitivity(model, frames, output, options, listener)

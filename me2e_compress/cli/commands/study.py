@@ -30,7 +30,6 @@ def study(
     tables: Tables = None,
     dry_run: DryRun = False,
     provider: Provider = None,
-    plugins: given.Plugins = None,
     trust_code: TrustCode = False,
     workers: given.Workers = 1,
     engine: given.Engine = "local",
@@ -47,9 +46,8 @@ def study(
     from me2e_compress.study.write import write_study
     from me2e_compress.workflows.checks import check_folder
 
-    more = plugins or ()
     # read and check everything that the study needs before it starts
-    asked = load_study(definition, routes, provider, more, trust_code=trust_code)
+    asked = load_study(definition, routes, provider, trust_code=trust_code)
     if tables is not None:
         asked = asked.of_blocks(tables.split(","))
     inputs = (definition, *asked.inputs())
@@ -59,11 +57,10 @@ def study(
         show(ahead)
         return
     # the report quotes the command that repeats the study
-    options: list[tuple[str, str | Path | None]] = [
+    options: list[tuple[str, str | None]] = [
         ("--routes", routes),
         ("--tables", tables),
         ("--provider", provider),
-        *(("--plugins", each) for each in more),
     ]
     chosen = [str(word) for each in options if each[1] is not None for word in each]
     chosen += ["--trust-code"] * trust_code
