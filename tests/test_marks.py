@@ -42,7 +42,7 @@ def record(folder: Path) -> None:
 
 def recipe(path: Path) -> None:
     choice = Int8Choice(("head",), ("node",))
-    write_recipe(path, choice, {"fold-constants": {}}, "paper", "tensorrt")
+    write_recipe(path, choice, ["fold-constants"], "paper", "tensorrt")
 
 
 WRITERS: dict[str, Callable[[Path], object]] = {

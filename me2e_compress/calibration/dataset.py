@@ -207,7 +207,8 @@ def synthetic(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
         if static_shape(value) is None or value.dtype is None:
             raise PreconditionError(
                 f"input {value.name} is {value.type} {value.shape}: seeded inputs need"
-                " a static shape, give frames instead, or sizes (--set-dim)"
+                " a static shape, give frames instead, or sizes"
+                " (compress --set-dim)"
             )
         if value.dtype.numpy().kind not in "fiub":
             raise PreconditionError(

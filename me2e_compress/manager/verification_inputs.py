@@ -176,7 +176,7 @@ def _runnable_scenes(
         names = ", ".join(open_dimensions(shaped))
         raise PreconditionError(
             f"the graph runs at none of the sizes that were tried for {names}{reason};"
-            " give frames instead, or sizes (--set-dim)"
+            " give frames instead, or sizes (compress --set-dim)"
         )
     return found
 

@@ -19,7 +19,6 @@ from me2e_compress.calibration.review import not_in, review
 from me2e_compress.calibration.sample import FrameSubset, draw
 from me2e_compress.errors import FramesError
 from me2e_compress.manager import recipe
-from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.quantization.plan.overrides import keep_readers, overrides_text
 from me2e_compress.registry import drafts, marks
 from me2e_compress.runtime.atomic import write_bytes
@@ -112,7 +111,7 @@ def _ready(
         frames=part,
         provider=options.provider,
     )
-    passes = with_sizes(recipe.load(options.recipe), options.dims)
+    passes = recipe.load(options.recipe)
     return PreparedGraph.of(source, loaded, options.module_map, passes), part
 
 

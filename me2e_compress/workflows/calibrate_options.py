@@ -1,7 +1,6 @@
 """How ranges are measured or imported, and the files that this takes."""
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 
 from me2e_compress.calibration.exchange import TABLE_FILES
@@ -26,7 +25,6 @@ class CalibrateOptions:
         tensorrt_cache: write a TensorRT calibration cache too.
         onnxruntime_table: write onnxruntime's table too, into this folder.
         threads: threads of onnxruntime; 0 takes all.
-        dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         adapter: TOML file that says which outputs are fed back; give it to ``compress``
             too.
         provider: what runs the graph.
@@ -45,7 +43,6 @@ class CalibrateOptions:
     tensorrt_cache: str | Path | None = None
     onnxruntime_table: str | Path | None = None
     threads: int = 0
-    dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
     adapter: str | Path | None = None
     provider: Provider = CPU
     force: bool = False

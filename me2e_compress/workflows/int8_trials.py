@@ -1,7 +1,6 @@
 """A model that is calibrated once, for the trials of ``sensitivity`` and ``search``."""
 
 import dataclasses
-from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 
@@ -13,8 +12,6 @@ from me2e_compress.calibration.sample import draw
 from me2e_compress.driving.adapter.stated import adapted
 from me2e_compress.fidelity.sensitivity import Drive, Int8Choice, Trials, write_recipe
 from me2e_compress.manager import recipe
-from me2e_compress.passes import Pass
-from me2e_compress.passes.fix_shapes import FixShapes, with_sizes
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.providers import CPU, Provider
@@ -44,7 +41,6 @@ class TrialOptions:
         module_map: preset or TOML file; None finds the preset.
         count: number of frames to judge on.
         threads: threads of onnxruntime; 0 takes all.
-        dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         adapter: TOML file that says which output is the plan, which are fed back, and
             how the model drives.
         provider: what runs the graphs.
@@ -58,17 +54,12 @@ class TrialOptions:
     module_map: str | Path | None = None
     count: int = 4
     threads: int = 0
-    dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
     adapter: str | Path | None = None
     provider: Provider = CPU
     force: bool = False
 
     def __post_init__(self) -> None:
         check_count("--threads", self.threads, most=MOST_THREADS)
-
-    def exact(self) -> tuple[Pass, ...]:
-        """Return the passes before int8."""
-        return with_sizes(recipe.load("exact"), self.dims)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,9 +104,7 @@ class TrialFiles:
             frames=recording,
             provider=options.provider,
         )
-        ready = PreparedGraph.of(
-            self.model, loaded, options.module_map, options.exact()
-        )
+        ready = PreparedGraph.of(self.model, loaded, options.module_map)
         made = Trials(
             ready.model,
             ready.modules,
@@ -131,10 +120,7 @@ class TrialFiles:
 
     def write(self, choice: Int8Choice, options: TrialOptions) -> str:
         """Write the recipe, and return a line that says what it makes int8."""
-        before = {
-            each.name: each.dims if isinstance(each, FixShapes) else {}
-            for each in options.exact()
-        }
+        before = [each.name for each in recipe.load("exact")]
         overrides = write_recipe(
             self.output, choice, before, options.rules, options.target
         )

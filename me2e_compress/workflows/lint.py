@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
 
@@ -11,8 +11,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError, RecipeError
-from me2e_compress.passes import Context, Pass
-from me2e_compress.passes.fix_shapes import FixShapes
+from me2e_compress.passes import Pass
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import plan_of
@@ -21,7 +20,7 @@ from me2e_compress.targets import TARGETS, LintFinding, Severity, Target
 from me2e_compress.targets.base import SEVERITIES, worst_first
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx import BuildResult, check
-from me2e_compress.workflows.checks import load_map, model_path
+from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, counted, table
@@ -36,7 +35,6 @@ class LintOptions:
             by the plan that it carries, else ``tensorrt``.
         trt_check: also parse and build the graph by TensorRT-RTX.
         sm: GPU generation that is built for.
-        dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         provider: what opens a graph for onnxruntime.
         target_version: of TensorRT, such as ``10.13``, whose tables are asked; None
             warns of what 10.1 did not take.
@@ -49,7 +47,6 @@ class LintOptions:
     target: str | None = None
     trt_check: bool = False
     sm: int = 86
-    dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
     provider: Provider = CPU
     target_version: str | None = None
 
@@ -223,15 +220,11 @@ def lint(
         GraphError: The model does not exist, or onnxruntime crashes on it.
         ProviderError: The provider is not available.
         RecipeError: The target does not exist.
-        PreconditionError: No input has such an open dimension.
         MissingExtraError: TensorRT-RTX is asked for and not installed.
     """
     path = model_path(model)
     loaded = graph.load(path)
     options = (options or LintOptions()).of(loaded)
-    if options.dims:
-        modules = load_map(None, loaded)
-        loaded = FixShapes(options.dims).run(loaded, Context(modules)).model
     found = _found(loaded, path.name, options, listener)
     build = check(loaded, options.sm) if options.trt_check else None
     return LintResult(path, options, found, build)

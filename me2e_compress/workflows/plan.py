@@ -1,16 +1,14 @@
 """Plan which nodes become int8 and which stay float, by which rule, and why."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.errors import RecipeError
-from me2e_compress.manager import recipe
 from me2e_compress.passes import Context
-from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import (
     Decision,
@@ -40,7 +38,6 @@ class PlanOptions:
         target: runtime of the int8 graph; None is ``onnxruntime``.
         overrides: TOML file of exceptions.
         module_map: preset or TOML file; None finds the preset.
-        dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         force: replace outputs that we did not write, too.
     """
 
@@ -49,7 +46,6 @@ class PlanOptions:
     target: str | None = None
     overrides: str | Path | None = None
     module_map: str | Path | None = None
-    dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
     force: bool = False
 
 
@@ -209,6 +205,5 @@ def _made(
     """Return a plan as it is, or plan a float graph after the exact passes."""
     if isinstance(read, QuantPlan):
         return read
-    passes = with_sizes(recipe.load("exact"), options.dims)
-    ready = PreparedGraph.of(file, read, options.module_map, passes)
+    ready = PreparedGraph.of(file, read, options.module_map)
     return quantizer.plan(ready.model, Context(ready.modules))

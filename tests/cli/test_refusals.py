@@ -106,7 +106,6 @@ OTHERS = {
     "inspect open.onnx --set-dim n=x": "write NAME=SIZE, e.g. batch=1",
     "inspect open.onnx --set-dim n=0": "n=0 must be 1 or more",
     "inspect open.onnx --set-dim rows=1": "is called 'rows'; there is n",
-    "lint open.onnx --set-dim rows=1": "no open dimension is called 'rows'",
     "lint dense.onnx --target npu": "no target 'npu'; there are tensorrt",
     "lint dense.onnx --target onnxruntime --trt-check": "--trt-check is for tensorrt",
     "lint dense.onnx --target-version ten": "target-version: 'ten' is no version of",

@@ -49,6 +49,7 @@ def test_an_option_that_is_gone_is_a_usage_error(
         ("study s.toml -o out --records out/records", "python -m benchmarks.paper"),
         ("export vad-tiny --opset 13 -o m.onnx", "python -m models.export"),
         ("demo --stack vad-tiny", "python -m models.export"),
+        ("plan a.onnx --set-dim batch=1", "compress --set-dim"),
         ("compare a.onnx b.onnx frames --plugins c.so", "--provider 'cpu{plugins=["),
     ],
 )

@@ -10,7 +10,6 @@ from me2e_compress.cli.console import listening, show
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import calibrate as workflow
 from me2e_compress.workflows.calibrate_options import CalibrateOptions
-from me2e_compress.workflows.checks import sizes
 
 Frames = Annotated[
     Path | None, typer.Argument(help="the recorded FRAMES; --import needs none")
@@ -30,7 +29,6 @@ def calibrate(
     count: given.Count = 256,
     seed: given.Seed = 0,
     module_map: given.ModuleMap = None,
-    set_dim: given.SetDim = None,
     adapter: given.Adapter = None,
     imported: given.Import = None,
     tensorrt_cache: Cache = None,
@@ -50,7 +48,7 @@ def calibrate(
         imported=imported, threads=threads,
         force=force, adapter=adapter,
         tensorrt_cache=tensorrt_cache, onnxruntime_table=onnxruntime_table,
-        dims=sizes(set_dim or ()), provider=provider_named(provider),
+        provider=provider_named(provider),
     )  # fmt: skip
     with listening() as listener:
         found = workflow.calibrate(model, frames, output, options, listener)

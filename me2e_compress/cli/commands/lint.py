@@ -9,7 +9,6 @@ from me2e_compress.cli.console import listening, show
 from me2e_compress.cli.verbosity import is_verbose
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import lint as workflow
-from me2e_compress.workflows.checks import sizes
 
 TrtCheck = Annotated[
     bool, typer.Option("--trt-check", help="also parse and build it by TensorRT-RTX")
@@ -25,13 +24,11 @@ def lint(
     trt_check: TrtCheck = False,
     target_version: TargetVersion = None,
     sm: Annotated[int, typer.Option(help="GPU generation that is built for")] = 86,
-    set_dim: given.SetDim = None,
     provider: given.Provider = "cpu",
 ) -> None:
     """Check a graph for the runtime that will run it; exit code 1 if it refuses."""
     runs = provider_named(provider)
-    dims = sizes(set_dim or ())
-    options = workflow.LintOptions(target, trt_check, sm, dims, runs, target_version)
+    options = workflow.LintOptions(target, trt_check, sm, runs, target_version)
     with listening() as listener:
         found = workflow.lint(model, options, listener)
     every = found.tables(shown=len(found.findings)) if is_verbose() else None

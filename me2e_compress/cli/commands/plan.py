@@ -8,7 +8,6 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import show
 from me2e_compress.workflows import plan as workflow
-from me2e_compress.workflows.checks import sizes
 
 Model = Annotated[
     str, typer.Argument(help="the ONNX file, or highway; float or with a plan")
@@ -27,15 +26,12 @@ def plan(
     target: given.Target = None,
     overrides: given.Overrides = None,
     module_map: given.ModuleMap = None,
-    set_dim: given.SetDim = None,
     against: Against = None,
     output: Output = None,
     nodes: Nodes = False,
     force: given.Force = False,
 ) -> None:
     """Show which nodes become int8, which stay float, by which rule, and why."""
-    options = workflow.PlanOptions(
-        scheme, rules, target, overrides, module_map, sizes(set_dim or ()), force
-    )
+    options = workflow.PlanOptions(scheme, rules, target, overrides, module_map, force)
     found = workflow.plan(model, output, against, options)
     show(found, (*found.tables(), *found.details()) if nodes else None)

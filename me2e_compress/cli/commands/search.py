@@ -9,7 +9,6 @@ from me2e_compress.cli.console import listening, show
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows import search as workflow
-from me2e_compress.workflows.checks import sizes
 
 MAX_JOULES = "most joules a frame, measured by a counter"
 MaxMb = Annotated[float | None, typer.Option(help="most MB of weights")]
@@ -32,7 +31,6 @@ def search(
     target: given.TrialTarget = DEFAULT_TARGET,
     ranges: given.SavedRanges = None,
     module_map: given.ModuleMap = None,
-    set_dim: given.SetDim = None,
     count: given.JudgedFrames = 4,
     threads: given.Threads = 0,
     provider: given.Provider = "cpu",
@@ -42,7 +40,7 @@ def search(
     options = workflow.SearchOptions(
         max_mb=max_mb, max_ms=max_ms, max_joules=max_joules, scheme=scheme, rules=rules,
         target=target, ranges=ranges, module_map=module_map, count=count,
-        threads=threads, dims=sizes(set_dim or ()), force=force,
+        threads=threads, force=force,
         provider=provider_named(provider), adapter=adapter,
     )  # fmt: skip
     with listening() as listener:

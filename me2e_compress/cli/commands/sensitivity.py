@@ -9,7 +9,6 @@ from me2e_compress.cli.console import listening, show
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows import sensitivity as workflow
-from me2e_compress.workflows.checks import sizes
 
 Limit = Annotated[
     float,
@@ -41,7 +40,6 @@ def sensitivity(
     node_trials: NodeTrials = 16,
     ranges: given.SavedRanges = None,
     module_map: given.ModuleMap = None,
-    set_dim: given.SetDim = None,
     count: given.JudgedFrames = 4,
     threads: given.Threads = 0,
     provider: given.Provider = "cpu",
@@ -59,7 +57,7 @@ def sensitivity(
         scheme=scheme, rules=rules, target=target, limit=limit, drive=drive,
         drive_limit=drive_limit, adapter=adapter, workers=workers,
         node_trials=node_trials, ranges=ranges, module_map=module_map, count=count,
-        threads=threads, dims=sizes(set_dim or ()), force=force,
+        threads=threads, force=force,
         provider=provider_named(provider),
     )  # fmt: skip
     with listening() as listener:

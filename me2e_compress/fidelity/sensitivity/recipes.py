@@ -1,7 +1,7 @@
 """Choose what stays float, and write the choice as a recipe."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from me2e_compress.errors import EvaluationError
@@ -105,17 +105,17 @@ def _driving_loss(trials: Trials, choice: Int8Choice) -> float:
 def write_recipe(
     path: Path,
     choice: Int8Choice,
-    passes: Mapping[str, Mapping[str, int]],
+    passes: Sequence[str],
     rules: str,
     target: str,
 ) -> Path | None:
     """Write a recipe and, if nodes stay float, the overrides beside it.
 
-    ``passes`` run before int8, by name, with sizes for open dimensions. Returns the
-    file of overrides, None if none is needed.
+    ``passes`` are the names of those before int8. Returns the file of overrides, None
+    if none is needed.
     """
     # the exact passes, then int8
-    lines = [_entry(name, dims) for name, dims in passes.items()]
+    lines = [f"[[pass]]\nname = {toml_string(name)}\n" for name in passes]
     overrides = path.with_name(path.stem + ".overrides.toml")
     if choice.modules:
         options = [
@@ -136,12 +136,6 @@ def write_recipe(
         text = marks.IN_TOML + overrides_text(choice.overrides().override)
         write_bytes(overrides, text.encode())
     return overrides
-
-
-def _entry(name: str, dims: Mapping[str, int]) -> str:
-    sizes = ", ".join(f"{toml_string(dim)} = {size}" for dim, size in dims.items())
-    given = f"dims = {{{sizes}}}\n" if dims else ""
-    return f"[[pass]]\nname = {toml_string(name)}\n{given}"
 
 
 def _array(names: tuple[str, ...]) -> str:

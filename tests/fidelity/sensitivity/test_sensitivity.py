@@ -132,7 +132,7 @@ def test_the_recipe_makes_the_graph_that_was_judged(tmp_path: Path) -> None:
     choice = Int8Choice(("backbone", "head"), ("/head/MatMul_3",))
     path = tmp_path / "elsewhere" / "advised.toml"
     path.parent.mkdir()
-    overrides = write_recipe(path, choice, {"fold-constants": {}}, "paper", "tensorrt")
+    overrides = write_recipe(path, choice, ["fold-constants"], "paper", "tensorrt")
 
     *_, int8 = recipe.load(path)
     made = int8.run(
@@ -151,9 +151,7 @@ def test_the_recipe_makes_the_graph_that_was_judged(tmp_path: Path) -> None:
 def test_a_recipe_without_int8_has_no_int8(tmp_path: Path) -> None:
     path = tmp_path / "r.toml"
 
-    assert (
-        write_recipe(path, Int8Choice(()), {"fold-constants": {}}, "paper", "x") is None
-    )
+    assert write_recipe(path, Int8Choice(()), ["fold-constants"], "paper", "x") is None
     assert [each.name for each in recipe.load(path)] == ["fold-constants"]
 
 
