@@ -44,6 +44,8 @@ FORMER = {
     "--weigh": f"study --weigh {_NOW} python -m benchmarks.paper in the repository",
     "--plugins": f"--plugins {_NOW} --provider 'cpu{{plugins=[LIB.so]}}'",
     "--set-dim": f"--set-dim {_NOW} compress --set-dim, and the graph that it writes",
+    "--drive": f"sensitivity --drive {_NOW} a study whose variants are the recipes",
+    "--drive-limit": f"--drive-limit {_NOW} a study whose variants are the recipes",
     "study paper": f"the study paper {_NOW} benchmarks/paper/paper.toml",
     "study shifts": f"the study shifts {_NOW} benchmarks/shifts.toml",
     "study tail": f"the study tail {_NOW} benchmarks/tail.toml",

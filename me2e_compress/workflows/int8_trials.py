@@ -10,16 +10,13 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import draw
 from me2e_compress.driving.adapter.stated import adapted
-from me2e_compress.fidelity.sensitivity import Drive, Int8Choice, Trials, write_recipe
+from me2e_compress.fidelity.sensitivity import Int8Choice, Trials, write_recipe
 from me2e_compress.manager import recipe
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS
 from me2e_compress.workflows.checks import (
-    MOST_THREADS,
-    Given,
-    check_count,
     load_map,
     output_path,
 )
@@ -40,9 +37,7 @@ class TrialOptions:
         ranges: file of saved ranges, instead of calibrating.
         module_map: preset or TOML file; None finds the preset.
         count: number of frames to judge on.
-        threads: threads of onnxruntime; 0 takes all.
-        adapter: TOML file that says which output is the plan, which are fed back, and
-            how the model drives.
+        adapter: TOML file that says which output is the plan, and which are fed back.
         provider: what runs the graphs.
         force: replace outputs that we did not write, too.
     """
@@ -53,13 +48,9 @@ class TrialOptions:
     ranges: str | Path | None = None
     module_map: str | Path | None = None
     count: int = 4
-    threads: int = 0
     adapter: str | Path | None = None
     provider: Provider = CPU
     force: bool = False
-
-    def __post_init__(self) -> None:
-        check_count("--threads", self.threads, most=MOST_THREADS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,21 +61,16 @@ class TrialFiles:
     frames: Path
     output: Path
 
-    def claimed(
-        self, options: TrialOptions, *inputs: Given
-    ) -> AbstractContextManager[None]:
+    def claimed(self, options: TrialOptions) -> AbstractContextManager[None]:
         """Claim the recipe and its overrides while they are made."""
         output = output_path(self.output)
         named = (options.ranges, options.module_map, options.adapter)
-        read = (self.model, self.frames, *named, *inputs)
+        read = (self.model, self.frames, *named)
         overrides = output.with_name(output.stem + ".overrides.toml")
         return writing([output, overrides], read, force=options.force)
 
     def trials(
-        self,
-        options: TrialOptions,
-        listener: Listener,
-        drive: Drive | None = None,
+        self, options: TrialOptions, listener: Listener
     ) -> tuple[Trials, tuple[str, ...]]:
         """Prepare the graph, calibrate once, and name the modules to try."""
         # check names and frames before anything is run
@@ -112,8 +98,6 @@ class TrialFiles:
             place,
             _ranges(ready, recording, options, listener),
             draw(recording, options.count, 0),
-            drive=drive,
-            threads=options.threads,
             provider=options.provider,
         )
         return made, scheme.modules
@@ -144,7 +128,7 @@ def _ranges(
         )
         return ranges
     method = RULE_SETS.parse(options.rules).method
-    return Calibrator(method, options.threads, provider=options.provider).run(
+    return Calibrator(method, provider=options.provider).run(
         ready.model,
         tensors,
         recording,

@@ -15,7 +15,7 @@ from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows.budgets import check_budgets, joules_of, need_counter
-from me2e_compress.workflows.checks import model_path
+from me2e_compress.workflows.checks import MOST_THREADS, check_count, model_path
 from me2e_compress.workflows.int8_trials import TrialFiles, TrialOptions
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, significant, table
@@ -29,14 +29,17 @@ class SearchOptions(TrialOptions):
         max_mb: most MB of weights.
         max_ms: most milliseconds per frame, on this CPU, so for its target alone.
         max_joules: most joules per frame, as a counter measures them.
+        threads: threads of onnxruntime that ms and joules are measured with; 0 takes
+            all.
     """
 
     max_mb: float | None = None
     max_ms: float | None = None
     max_joules: float | None = None
+    threads: int = 0
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        check_count("--threads", self.threads, most=MOST_THREADS)
         check_budgets(self.max_mb, self.max_ms, self.max_joules)
         if self.max_ms is not None and self.target != DEFAULT_TARGET:
             raise RecipeError(

@@ -17,7 +17,6 @@ F = "dense.onnx frames --map map.toml"
         f"search {F} -o out --max-ms",
         f"search {F} -o out --max-joules",
         f"sensitivity {F} -o out --limit",
-        f"sensitivity {F} -o out --drive 1 --drive-limit",
         "evaluate blind --routes 1 -o out --dt-ms",
         "evaluate blind --routes 1 -o out --frame-limit",
     ],

@@ -38,7 +38,7 @@ READERS = [
     f"plan {M} --overrides o.toml",
     f"plan {M} --against other.onnx",
     f"search {F} --max-mb 1 --ranges ranges.json",
-    f"sensitivity {F} --drive 1 --adapter a.toml",
+    f"sensitivity {F} --adapter a.toml",
 ]
 """Commands whose last word is a file that they read."""
 RECORDED = [

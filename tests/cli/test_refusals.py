@@ -91,7 +91,6 @@ SEARCH = {
     f"search {F} -o out --max-ms 1 --target tensorrt": "use --target onnxruntime",
     f"search {F} -o out --max-mb 0.0000001": "nothing fits",
     f"search {F} -o out --max-mb 1 --scheme int4": "no scheme int4; there are .*int8",
-    f"sensitivity {F} -o out --drive 1": "camera",
 }
 OTHERS = {
     "export vad-huge -o out.onnx": "vad-huge",

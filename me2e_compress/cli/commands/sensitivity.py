@@ -14,12 +14,6 @@ Limit = Annotated[
     float,
     typer.Option(help="most loss of the recipe: metres of the plan, see below"),
 ]
-Drive = Annotated[
-    str | None, typer.Option(help="drive each module's int8: all, N, ID,ID or a file")
-]
-DriveLimit = Annotated[
-    float | None, typer.Option(help="with --drive: most points of DS that may be lost")
-]
 NodeTrials = Annotated[
     int, typer.Option(min=0, help="most variants of the worst module's nodes; 0: none")
 ]
@@ -33,15 +27,11 @@ def sensitivity(
     rules: given.TrialRules = "safe",
     target: given.TrialTarget = DEFAULT_TARGET,
     limit: Limit = 0.1,
-    drive: Drive = None,
-    drive_limit: DriveLimit = None,
     adapter: given.Adapter = None,
-    workers: given.Workers = 1,
     node_trials: NodeTrials = 16,
     ranges: given.SavedRanges = None,
     module_map: given.ModuleMap = None,
     count: given.JudgedFrames = 4,
-    threads: given.Threads = 0,
     provider: given.Provider = "cpu",
     force: given.Force = False,
 ) -> None:
@@ -50,15 +40,11 @@ def sensitivity(
     Halves of the worst module's nodes are tried next, to find those to blame.
     The loss is how far the plan moves, metres, mean over the frames; of a model
     whose plan is not known, the noise of its worst output relative to the signal.
-    With --drive every module, all together and the float model drive the routes
-    too; the episodes stay in RECIPE.drives, and run again, it goes on from them.
     """
     options = workflow.SensitivityOptions(
-        scheme=scheme, rules=rules, target=target, limit=limit, drive=drive,
-        drive_limit=drive_limit, adapter=adapter, workers=workers,
-        node_trials=node_trials, ranges=ranges, module_map=module_map, count=count,
-        threads=threads, force=force,
-        provider=provider_named(provider),
+        scheme=scheme, rules=rules, target=target, limit=limit,
+        adapter=adapter, node_trials=node_trials, ranges=ranges, module_map=module_map,
+        count=count, force=force, provider=provider_named(provider),
     )  # fmt: skip
     with listening() as listener:
         found = workflow.measure_sensitivity(model, frames, output, options, listener)

@@ -7,12 +7,11 @@ from me2e_compress.fidelity.sensitivity.analysis import (
 )
 from me2e_compress.fidelity.sensitivity.recipes import advise, write_recipe
 from me2e_compress.fidelity.sensitivity.search import Budget, Candidate, search
-from me2e_compress.fidelity.sensitivity.trials import Drive, Int8Choice, Score, Trials
+from me2e_compress.fidelity.sensitivity.trials import Int8Choice, Score, Trials
 
 __all__ = [
     "Budget",
     "Candidate",
-    "Drive",
     "Int8Choice",
     "ModuleSensitivity",
     "Score",

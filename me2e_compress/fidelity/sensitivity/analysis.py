@@ -16,7 +16,6 @@ class ModuleSensitivity:
 
     Attributes:
         nodes: int8 nodes then.
-        driving: driving score; None if nothing is driven.
         blamed: of the worst module the nodes that are costly alone, with their measured
             losses, worst first; empty if the loss is spread over the module.
     """
@@ -24,7 +23,6 @@ class ModuleSensitivity:
     module: str
     nodes: int
     score: Score
-    driving: float | None = None
     blamed: tuple[tuple[str, float], ...] = ()
 
 
@@ -36,15 +34,11 @@ class Sensitivity:
         findings: modules, worst first.
         together: of all modules.
         trials: number of variants.
-        float_driving: driving score of the float model; None if nothing is driven.
-        driving: of all modules in int8; likewise.
     """
 
     findings: tuple[ModuleSensitivity, ...]
     together: Score
     trials: int
-    float_driving: float | None = None
-    driving: float | None = None
 
 
 def analyse(
@@ -56,9 +50,8 @@ def analyse(
 ) -> Sensitivity:
     """Score every module alone, then halves of the worst one's nodes.
 
-    Modules are driven if the trials have a hook for that; nodes are not. Halving runs
-    at most ``node_trials`` variants; ``progress`` is called as ``progress(steps done,
-    steps, module)``.
+    Halving runs at most ``node_trials`` variants; ``progress`` is called as
+    ``progress(steps done, steps, module)``.
     """
     active = [name for name in modules if names_of(trials, name)]
     # every module alone
@@ -66,10 +59,9 @@ def analyse(
     for done, module in enumerate(active):
         if progress:
             progress(done, len(active) + 1, module)
-        choice = Int8Choice((module,))
-        score, driving = trials.score(choice), trials.driving(choice)
+        score = trials.score(Int8Choice((module,)))
         nodes = len(names_of(trials, module))
-        findings.append(ModuleSensitivity(module, nodes, score, driving))
+        findings.append(ModuleSensitivity(module, nodes, score))
     findings.sort(key=lambda each: -each.score.loss)
     # halves of the worst
     worst = findings[0] if findings else None
@@ -78,16 +70,9 @@ def analyse(
             progress(len(active), len(active) + 1, f"nodes of {worst.module}")
         blamed = _blamed(trials, worst.module, worst.score.loss, node_trials)
         findings[0] = dataclasses.replace(worst, blamed=blamed)
-    # all modules together, beside the float model
-    every = Int8Choice(tuple(active))
-    together = trials.score(every)
-    return Sensitivity(
-        tuple(findings),
-        together,
-        trials.done,
-        float_driving=trials.driving(Int8Choice(())),
-        driving=trials.driving(every),
-    )
+    # all modules together
+    together = trials.score(Int8Choice(tuple(active)))
+    return Sensitivity(tuple(findings), together, trials.done)
 
 
 def names_of(trials: Trials, module: str) -> tuple[str, ...]:

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.sensitivity.analysis import Sensitivity
 from me2e_compress.fidelity.sensitivity.trials import Int8Choice, Trials
 from me2e_compress.quantization.plan.overrides import overrides_text
@@ -13,37 +12,21 @@ from me2e_compress.registry.documents import toml_string
 from me2e_compress.runtime.atomic import write_bytes
 
 
-def advise(
-    trials: Trials,
-    found: Sensitivity,
-    limit: float,
-    driving_limit: float | None = None,
-) -> Int8Choice:
+def advise(trials: Trials, found: Sensitivity, limit: float) -> Int8Choice:
     """Choose what keeps the loss within a limit, with as little in float as possible.
 
-    It starts with all modules in int8. Until the measured losses are within the limits,
-    the costliest module first gives up the blamed nodes, the worst first, then all of
-    its nodes. Then each that was given up, the last first, returns to int8 if the
-    losses stay within the limits: errors may cancel, or one costly node hide behind
-    another.
-
-    ``driving_limit`` is how far the closed-loop score may lie below the float model's;
-    it is checked once the loss is within its limit. The choice has no module if nothing
-    keeps the limits.
-
-    Raises:
-        EvaluationError: a limit of driving, but trials without a drive hook.
+    It starts with all modules in int8. Until the measured loss is within the limit, the
+    costliest module first gives up the blamed nodes, the worst first, then all of its
+    nodes. Then each that was given up, the last first, returns to int8 if the loss
+    stays within the limit: errors may cancel, or one costly node hide behind another.
+    The choice has no module if nothing keeps the limit.
     """
 
     def fits(given: Sequence[_Sacrifice]) -> bool:
         choice = _without(trials, found, given)
-        if not choice.modules:
-            return True
-        if trials.score(choice).loss > limit:
-            return False
-        return driving_limit is None or _driving_loss(trials, choice) <= driving_limit
+        return not choice.modules or trials.score(choice).loss <= limit
 
-    # give up nodes and modules until the limits are kept
+    # give up nodes and modules until the limit is kept
     order, given = _sacrifices(found), list[_Sacrifice]()
     while not fits(given):
         given.append(order[len(given)])
@@ -93,13 +76,6 @@ def _without(
     floats = [name for module in names if module in left for name in names[module]]
     modules = (name for name in trials.modules.names() if name in left)
     return Int8Choice(tuple(modules), tuple(floats))
-
-
-def _driving_loss(trials: Trials, choice: Int8Choice) -> float:
-    whole, got = trials.driving(Int8Choice(())), trials.driving(choice)
-    if whole is None or got is None:
-        raise EvaluationError("a limit of driving needs trials that are driven")
-    return whole - got
 
 
 def write_recipe(

@@ -1,9 +1,7 @@
 """Judge many int8 variants of one float model that is calibrated once."""
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
-from typing import TypeAlias
 
 import onnx_ir as ir
 
@@ -33,10 +31,6 @@ class Int8Choice:
         return Overrides(
             override=tuple(keep_float(name, "sensitive") for name in self.floats)
         )
-
-
-Drive: TypeAlias = Callable[[Int8Choice, ir.Model], float]
-"""Gives the closed-loop score of a choice, whose graph it gets; larger is better."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,10 +63,8 @@ class Trials:
 
     ``model`` is the float graph after the exact passes, shapes inferred; fidelity is
     judged on the graph as ``target`` writes it; ``ranges`` cover every tensor that any
-    variant needs; ``frames`` are read once for every variant; ``drive`` gives
-    closed-loop scores, None drives nothing; 0 ``threads`` takes all. ``reference``
-    holds the float model's answers, ``done`` counts the variants that were built and
-    run.
+    variant needs; ``frames`` are read once for every variant. ``reference`` holds the
+    float model's answers, ``done`` counts the variants that were built and run.
     """
 
     def __init__(
@@ -84,8 +76,6 @@ class Trials:
         ranges: Ranges,
         frames: Frames,
         *,
-        drive: Drive | None = None,
-        threads: int = 0,
         provider: Provider = CPU,
     ) -> None:
         self.model = model
@@ -94,13 +84,9 @@ class Trials:
         self._rules = rules
         self._target = target
         self.ranges = ranges
-        self._drive = drive
-        self._session = partial(
-            Session, threads=threads, release=True, provider=provider
-        )
+        self._session = partial(Session, release=True, provider=provider)
         # every choice is judged once
         self._known: dict[Int8Choice, Score] = {}
-        self._driven: dict[Int8Choice, float] = {}
         self.reference = Reference.of(self._session(model), frames)
 
     def plan(self, choice: Int8Choice) -> QuantPlan:
@@ -132,11 +118,3 @@ class Trials:
             )
             self.done += 1
         return self._known[choice]
-
-    def driving(self, choice: Int8Choice) -> float | None:
-        """Return the closed-loop score of a choice; None without a hook."""
-        if self._drive is None:
-            return None
-        if choice not in self._driven:
-            self._driven[choice] = self._drive(choice, self.variant(choice))
-        return self._driven[choice]

@@ -61,4 +61,4 @@ def trials(tmp_path: Path, bad: int) -> Trials:
     ranges = Calibrator(threads=1).run(
         model, target.tensors(everything, model), recording
     )
-    return Trials(model, MODULES, rules, target, ranges, recording, threads=1)
+    return Trials(model, MODULES, rules, target, ranges, recording)

@@ -1,14 +1,11 @@
 import dataclasses
 from pathlib import Path
 
-import onnx_ir as ir
 import pytest
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.compare import Displacement, Fidelity
 from me2e_compress.fidelity.sensitivity import (
-    Drive,
     Int8Choice,
     Score,
     Trials,
@@ -20,8 +17,6 @@ from me2e_compress.fidelity.sensitivity.analysis import names_of
 from me2e_compress.manager import recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.targets import TARGETS
 from tests.fidelity.sensitivity.delicate import delicate, trials
 from tests.nets import MODULES
 
@@ -153,49 +148,6 @@ def test_a_recipe_without_int8_has_no_int8(tmp_path: Path) -> None:
 
     assert write_recipe(path, Int8Choice(()), ["fold-constants"], "paper", "x") is None
     assert [each.name for each in recipe.load(path)] == ["fold-constants"]
-
-
-def driven(judge: Trials, drive: Drive) -> Trials:
-    return Trials(
-        judge.model, MODULES, RULE_SETS.parse("paper"), TARGETS.parse("tensorrt"),
-        judge.ranges, judge.reference.frames, drive=drive, threads=1,
-    )  # fmt: skip
-
-
-def test_modules_are_driven_once_and_nodes_of_them_are_not(tmp_path: Path) -> None:
-    seen: list[Int8Choice] = []
-
-    def drive(choice: Int8Choice, made: ir.Model) -> float:
-        seen.append(choice)
-        int8 = [n.op_type for n in made.graph].count("QuantizeLinear")
-        return 100.0 - int8
-
-    judge = trials(tmp_path, 3)
-    found = analyse(driven(judge, drive), ("backbone", "head"))
-
-    modules = [("backbone",), ("head",), (), ("backbone", "head")]
-    assert seen == [Int8Choice(names) for names in modules]
-    assert found.float_driving == 100.0
-    assert {each.module: each.driving for each in found.findings} == {
-        "backbone": 98.0,
-        "head": 96.0,
-    }
-    assert found.driving == 94.0
-    assert analyse(judge, ("backbone",)).findings[0].driving is None
-
-
-def test_the_advice_keeps_a_limit_of_driving(tmp_path: Path) -> None:
-    def drive(choice: Int8Choice, made: ir.Model) -> float:
-        return 80.0 if "head" in choice.modules else 99.0
-
-    judge = trials(tmp_path, 3)
-    on_road = driven(judge, drive)
-    found = analyse(on_road, ("backbone", "head"), node_trials=0)
-
-    assert advise(on_road, found, 1e9, 19.0) == Int8Choice(("backbone", "head"))
-    assert advise(on_road, found, 1e9, 18.9) == Int8Choice(("backbone",))
-    with pytest.raises(EvaluationError, match="needs trials that are driven"):
-        advise(judge, found, 1e9, 1.0)
 
 
 def test_a_model_without_a_plan_is_judged_by_its_worst_output(tmp_path: Path) -> None:
