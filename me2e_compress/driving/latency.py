@@ -206,35 +206,29 @@ class MeasuredLatency(LatencySource):
         return {"measured": True, "scale": self.scale}
 
 
-def parse_latency(
-    text: str, *, in_order: bool = False, scale: float = 1.0, seed: int = 0
-) -> LatencySource:
+def parse_latency(text: str, *, seed: int = 0) -> LatencySource:
     """Build the latency source of a text, e.g. ``fps:10`` or ``trace:FILE``.
 
-    ``in_order``, ``scale`` (positive) and ``seed`` (0 or more) override the text unless
-    they are at their defaults; in a layered source they apply to the source below.
+    A ``seed`` above 0 overrides the text; in a layered source it applies to the source
+    below.
 
     Raises:
         EvaluationError: No such source, or an option that it refuses or has not.
     """
-    source = LATENCY_SOURCES.parse(text)
-    return with_draws(source, in_order=in_order, scale=scale, seed=seed)
+    return with_draws(LATENCY_SOURCES.parse(text), seed=seed)
 
 
 def with_draws(
-    source: LatencySource, *, in_order: bool = False, scale: float = 1.0, seed: int = 0
+    source: LatencySource, *, in_order: bool = False, seed: int = 0
 ) -> LatencySource:
     """Say how a source draws from its trace; see `parse_latency`."""
-    check_positive("scale", scale)
     # options belong to the innermost source
     below = getattr(source, "source", None)
     if isinstance(below, LatencySource):
-        drawn = with_draws(below, in_order=in_order, scale=scale, seed=seed)
+        drawn = with_draws(below, in_order=in_order, seed=seed)
         return LATENCY_SOURCES.with_options(source, {"source": drawn})
     # those at their defaults leave the source as it is; who draws nothing has no seed
     options: dict[str, object] = {"in_order": True} if in_order else {}
-    if scale != 1.0:
-        options["scale"] = scale
     if seed and "seed" in type(source).__dataclass_fields__:
         options["seed"] = seed
     return LATENCY_SOURCES.with_options(source, options) if options else source

@@ -28,6 +28,7 @@ class Condition(ConditionOptions):
             ``agents{source=trace, per_agent_us=3000}``.
         mean_of: Instead of a latency: every decision takes the mean of this drive,
             ``VARIANT.CONDITION``, whose condition comes earlier.
+        in_order: Replay a trace in its order, which keeps bursts.
         limit_fps: Frame limiter: a decision takes at least one period.
         seed: Seed of draws from traces; None takes the study's.
         against: Another condition that differs from this one in one thing: drives are
@@ -41,6 +42,7 @@ class Condition(ConditionOptions):
     name: str
     latency: str = ""
     mean_of: str = ""
+    in_order: bool = False
     limit_fps: float | None = None
     seed: int | None = None
     against: str = ""

@@ -4,7 +4,6 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress import graph
-from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import POLICIES, Driver, driver_named
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
@@ -19,7 +18,7 @@ from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.targets.onnxruntime import slow_here
-from me2e_compress.workflows.checks import check_folder, check_number, model_path
+from me2e_compress.workflows.checks import check_folder, model_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.deadlines_table import deadlines_table
 from me2e_compress.workflows.first_opening import try_file
@@ -36,7 +35,7 @@ from me2e_compress.workflows.other_evaluators import (
 from me2e_compress.workflows.result import Result, Table, number
 from me2e_compress.workflows.score import driving_score, score_records, scores_table
 
-_FLAGS = {"frame_limit_s": "frame-limit", "module_map": "map"}
+_FLAGS = {"module_map": "map"}
 """Command-line names of options that differ from their Python names."""
 
 
@@ -45,7 +44,6 @@ class EvaluateOptions(DrivingOptions):
     """Which routes are driven, under which conditions, and what is made of them.
 
     Attributes:
-        host_stage: changes the model's plan on the host: ``collision-optimizer``.
         module_map: preset or TOML file that says plan and state of the model; None
             leaves them to its metadata.
         render: draw these routes as GIF and PNG; chosen as ``routes`` is.
@@ -54,15 +52,10 @@ class EvaluateOptions(DrivingOptions):
             ``name{option=value}``, which gets the policy as its option ``policy``.
     """
 
-    host_stage: str = ""
     module_map: str | None = None
     render: str | None = None
     force: bool = False
     evaluator: str = HIGHWAY
-
-    def __post_init__(self) -> None:
-        check_number("--dt-ms", self.dt_ms)
-        check_number("--frame-limit", self.frame_limit_s)
 
     def check_for_others(self) -> None:
         """Raise EvaluationError if an option of highway alone is not at its default."""
@@ -183,8 +176,6 @@ def _evaluated(
     shown = () if options.render is None else pick_routes(routes, options.render)
     # find the driver, and open its graph in a process of its own first
     driver = driver_of(policy, options.adapter, options.provider, options.module_map)
-    if options.host_stage:
-        driver = with_stage(driver, options.host_stage)
     if isinstance(driver, OnnxDriver):
         try_file(driver.path, listener, options.provider)
 
@@ -203,16 +194,6 @@ def _evaluated(
     model = graph.load(driver.path) if isinstance(driver, OnnxDriver) else None
     slow = None if model is None else slow_here(model, options.provider)
     return EvaluateResult(policy, output, scores, pictures, late, slow)
-
-
-def with_stage(driver: Driver, host_stage: str) -> Driver:
-    """Return a driver whose plan a host stage changes; it must have a network."""
-    stage = HOST_STAGES.parse(host_stage)
-    if not isinstance(driver, OnnxDriver):
-        raise EvaluationError(
-            f"{driver.name} has no network: there are no outputs for a host stage"
-        )
-    return dataclasses.replace(driver, host_stage=stage)
 
 
 def _pictures(job: Job, routes: tuple[Route, ...], folder: Path) -> tuple[Path, ...]:

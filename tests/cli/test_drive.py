@@ -113,7 +113,7 @@ def test_a_profile_is_a_latency_trace(cli: Cli, manifest: Path) -> None:
     assert len(shown["samples_us"]) == 4
     assert shown["p50_us"] <= shown["max_us"]
     assert shown["p90_us"] is shown["p99_us"] is None  # of four samples
-    cli.done(f"{BLIND} --latency trace:trace.json --in-order --latency-scale 1000")
+    cli.done(f"{BLIND} --latency trace{{trace=trace.json,in_order=true,scale=1000}}")
 
 
 JOULES = (

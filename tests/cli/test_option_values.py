@@ -17,8 +17,6 @@ F = "dense.onnx frames --map map.toml"
         f"search {F} -o out --max-ms",
         f"search {F} -o out --max-joules",
         f"sensitivity {F} -o out --limit",
-        "evaluate blind --routes 1 -o out --dt-ms",
-        "evaluate blind --routes 1 -o out --frame-limit",
     ],
 )
 def test_a_number_that_is_none(cli: Cli, dense: Path, line: str, value: str) -> None:

@@ -138,7 +138,6 @@ DRIVE = {
     "--routes 1 --weather snow=1": "weather option 'snow'",
     "--routes 1 --weather night=dark": "weather option night",
     "--routes 1 --latency fast": "no latency source 'fast'",
-    "--routes 1 --dt-ms 30": "a step of 30 ms",
 }
 SCORE = {
     "score nodir": "nodir: no such folder$",

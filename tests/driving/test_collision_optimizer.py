@@ -7,13 +7,12 @@ from scipy.optimize import check_grad
 
 from me2e_compress.driving.host_stage import HOST_STAGES, CollisionOptimizer, _Problem
 from me2e_compress.driving.latency import parse_latency
-from me2e_compress.driving.policies import Driver
+from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.drivers import ExpertDriver, OnnxDriver
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.testing import check_form
-from me2e_compress.workflows.evaluate import with_stage
 from tests.evaluators.highway.drivers import PARKED, straight_on
 
 Floats = npt.NDArray[np.float64]
@@ -105,17 +104,17 @@ def test_a_model_without_the_output_is_refused_when_it_is_opened(
 
 
 @pytest.mark.parametrize(
-    ("driver", "stage", "words"),
+    ("policy", "words"),
     [
-        (ExpertDriver(), "collision-optimizer", "expert has no network"),
-        (OnnxDriver(Path("m.onnx")), "smoother", "no host stage 'smoother'"),
+        ("expert{host_stage=collision-optimizer}", "expert has no option 'host_stage'"),
+        ("onnx{path=m.onnx, host_stage=smoother}", "no host stage 'smoother'"),
     ],
 )
 def test_a_stage_that_does_not_fit_is_refused_before_anything_drives(
-    driver: Driver, stage: str, words: str
+    policy: str, words: str
 ) -> None:
     with pytest.raises(EvaluationError, match=words):
-        with_stage(driver, stage)
+        driver_named(policy)
 
 
 def test_a_stage_that_answers_no_host_work_is_named(

@@ -14,6 +14,7 @@ from me2e_compress.driving.latency import (
     NoLatency,
     TraceLatency,
     parse_latency,
+    with_draws,
 )
 from me2e_compress.driving.layered_latency import AgentsLatency
 from me2e_compress.errors import EvaluationError
@@ -47,7 +48,7 @@ def test_none_charges_nothing() -> None:
 
 
 def test_a_trace_in_order_starts_over_on_every_route(trace: Path) -> None:
-    source = parse_latency(f"trace:{trace}", in_order=True, scale=2.0)
+    source = parse_latency(f"trace{{trace={trace}, in_order=true, scale=2}}")
 
     for route in ("a", "b"):
         assert charges(source, route, 4) == [20_000, 40_000, 140_000, 20_000]
@@ -68,7 +69,7 @@ def test_a_negative_seed_is_refused_before_anything_drives(
     trace: Path, in_order: bool
 ) -> None:
     with pytest.raises(EvaluationError, match="latency: seed -1: must be 0 or more"):
-        parse_latency(f"trace:{trace}", in_order=in_order, seed=-1)
+        with_draws(TraceLatency(trace), in_order=in_order, seed=-1)
 
 
 def test_a_route_does_not_depend_on_what_drove_before() -> None:
@@ -82,7 +83,7 @@ def test_a_route_does_not_depend_on_what_drove_before() -> None:
 
 
 def test_a_measurement_is_scaled_and_says_so() -> None:
-    source = parse_latency("measured", scale=3.0)
+    source = parse_latency("measured{scale=3}")
 
     assert source == MeasuredLatency(3.0)
     assert source.measures
@@ -108,18 +109,16 @@ def test_other_words_are_refused_on_one_line(text: str, words: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "options", "words"),
+    ("text", "words"),
     [
-        ("none", {"scale": 2.0}, "none has no option 'scale'; it has none"),
-        ("fps:10", {"scale": 2.0}, "fps has no option 'scale'; it has fps"),
-        ("measured", {"in_order": True}, "measured has no option 'in_order'"),
+        ("none{scale=2}", "none has no option 'scale'; it has none"),
+        ("fps{fps=10, scale=2}", "fps has no option 'scale'; it has fps"),
+        ("measured{in_order=true}", "measured has no option 'in_order'"),
     ],
 )
-def test_an_option_that_a_source_has_not_is_refused(
-    text: str, options: dict[str, Any], words: str
-) -> None:
+def test_an_option_that_a_source_has_not_is_refused(text: str, words: str) -> None:
     with pytest.raises(EvaluationError, match=words):
-        parse_latency(text, **options)
+        parse_latency(text)
 
 
 def test_a_seed_is_of_everything_and_harms_no_source_without() -> None:
@@ -129,7 +128,7 @@ def test_a_seed_is_of_everything_and_harms_no_source_without() -> None:
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("inf"), float("nan")])
 def test_a_scale_is_positive(scale: float) -> None:
     with pytest.raises(EvaluationError, match="scale"):
-        parse_latency("measured", scale=scale)
+        parse_latency(f"measured{{scale={scale}}}")
 
 
 def test_percentiles_are_samples() -> None:
@@ -260,10 +259,10 @@ def test_layers_have_the_form_of_a_latency_source(text: str) -> None:
 
 def test_options_of_a_trace_reach_it_through_layers() -> None:
     text = "limited{source=agents{source=trace, per_agent_us=1}, fps=10}"
-    source = parse_latency(text, in_order=True, scale=2.0, seed=3)
+    source = with_draws(parse_latency(text), in_order=True, seed=3)
 
     assert source == parse_latency(
-        "limited{source=agents{source=trace{in_order=true, scale=2, seed=3},"
+        "limited{source=agents{source=trace{in_order=true, seed=3},"
         " per_agent_us=1}, fps=10}"
     )
     assert source.lacks_trace
@@ -272,7 +271,7 @@ def test_options_of_a_trace_reach_it_through_layers() -> None:
 
 def test_an_option_that_the_source_below_has_not_is_refused() -> None:
     with pytest.raises(EvaluationError, match="fps has no option 'in_order'"):
-        parse_latency("limited{source=fps:10, fps=5}", in_order=True)
+        with_draws(parse_latency("limited{source=fps:10, fps=5}"), in_order=True)
 
 
 def test_a_layer_on_a_measurement_is_measured() -> None:

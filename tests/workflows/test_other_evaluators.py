@@ -135,8 +135,7 @@ def test_wrong_words_are_one_line_and_leave_nothing(
     [
         (EvaluateOptions(evaluator="lanes", routes="3"), "--routes"),
         (EvaluateOptions(evaluator="lanes", latency="fps:3"), "--latency"),
-        (EvaluateOptions(evaluator="lanes", latency_model="fifo"), "--latency-model"),
-        (EvaluateOptions(evaluator="lanes", frame_limit_s=3.0), "--frame-limit"),
+        (EvaluateOptions(evaluator="lanes", module_map="m.toml"), "--map"),
         (EvaluateOptions(evaluator="lanes", render="a"), "--render"),
     ],
 )

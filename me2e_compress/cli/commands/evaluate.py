@@ -7,14 +7,13 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show, tell
-from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S
 from me2e_compress.runtime.providers import Provider, provider_named
 from me2e_compress.workflows import evaluate as workflow
 from me2e_compress.workflows.check_model import check_model
 
 Policy = Annotated[
     str | None,
-    typer.Argument(help="M.onnx, highway, expert, module:function; see list"),
+    typer.Argument(help="M.onnx, highway, expert, onnx{path=M.onnx,...}; see list"),
 ]
 Evaluator = Annotated[
     str, typer.Option(help="who drives it: highway, NAME{option=value}, or see list")
@@ -29,22 +28,10 @@ Check = Annotated[
 Latency = Annotated[
     str, typer.Option(help="none, fps:F, trace:FILE, measured, or see list")
 ]
-Scale = Annotated[float, typer.Option(help="factor on a trace or a measurement")]
-Model = Annotated[
-    str, typer.Option(help="drop decisions meanwhile, or fifo: delay every control")
-]
-InOrder = Annotated[
-    bool, typer.Option("--in-order", help="replay a trace in its order")
-]
-Step = Annotated[float, typer.Option(help="step of the world")]
-Stage = Annotated[
-    str, typer.Option(help="changes the plan on the host: collision-optimizer")
-]
 DriveOn = Annotated[
     bool, typer.Option("--drive-on", help="go on after a collision, as Bench2Drive")
 ]
 Weather = Annotated[str, typer.Option(help="fog_m=80,night=0.5 ...")]
-Limit = Annotated[float, typer.Option(help="seconds until a decision counts as hung")]
 Render = Annotated[str | None, typer.Option(help="draw this route as GIF and PNG")]
 
 
@@ -55,18 +42,12 @@ def evaluate(
     routes: given.Routes = "all",
     road: given.Road = None,
     latency: Latency = "none",
-    latency_scale: Scale = 1.0,
-    latency_model: Model = "drop",
-    in_order: InOrder = False,
     seed: given.Seed = 0,
     workers: given.Workers = 1,
-    dt_ms: Step = 50.0,
     adapter: given.Adapter = None,
     module_map: given.ModuleMap = None,
-    host_stage: Stage = "",
     weather: Weather = "",
     drive_on: DriveOn = False,
-    frame_limit: Limit = FRAME_LIMIT_S,
     engine: given.Engine = "local",
     render: Render = None,
     evaluator: Evaluator = "highway",
@@ -88,12 +69,9 @@ def evaluate(
         raise typer.BadParameter("driving needs -o RESULTS/", param_hint="-o")
     engine_name, address = given.engine_and_address(engine)
     options = workflow.EvaluateOptions(
-        routes=routes, road=road, latency=latency, latency_scale=latency_scale,
-        latency_model=latency_model, in_order=in_order, seed=seed, workers=workers,
-        dt_ms=dt_ms, adapter=adapter, module_map=module_map, host_stage=host_stage,
-        weather=weather, drive_on=drive_on,
-        frame_limit_s=frame_limit, engine=engine_name, address=address, render=render,
-        provider=runs, force=force,
+        routes=routes, road=road, latency=latency, seed=seed, workers=workers,
+        adapter=adapter, module_map=module_map, weather=weather, drive_on=drive_on,
+        engine=engine_name, address=address, render=render, provider=runs, force=force,
         evaluator=evaluator,
     )  # fmt: skip
     with listening() as listener:

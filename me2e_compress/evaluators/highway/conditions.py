@@ -54,7 +54,6 @@ class ConditionOptions:
     Attributes:
         latency_model: ``drop`` the decisions due meanwhile, or ``fifo``: delay every
             control.
-        in_order: replay a trace in its order, which keeps bursts.
         dt_ms: time step of the simulation, in milliseconds; results at different steps
             are not compared.
         weather: ``fog_m=80,night=0.5,dropped=BACK+FRONT``; empty is a clear day, or
@@ -64,7 +63,6 @@ class ConditionOptions:
     """
 
     latency_model: str = "drop"
-    in_order: bool = False
     dt_ms: float = 50.0
     weather: str = ""
     drive_on: bool = False

@@ -13,7 +13,7 @@ from me2e_compress.evaluators.highway.conditions import ConditionOptions
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine, RayEngine
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
-from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
+from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.extras import need_extra
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
@@ -126,11 +126,9 @@ class DrivingOptions(ConditionOptions):
         road: 1 or 2: whose set ``routes`` are from, and where those of a file lie.
         latency: what a decision costs: ``none``, ``fps:F``, ``trace:FILE``,
             ``measured``.
-        latency_scale: factor on a trace or a measurement.
         seed: seed of the draws from a trace.
         workers: routes at a time.
         adapter: TOML file that adapts the model to the policy contract.
-        frame_limit_s: seconds until a decision counts as hung.
         engine: ``local``, processes of this machine, or ``ray``, a cluster.
         address: address of a running Ray cluster; None starts one.
         provider: what runs the model; policies other than graphs ignore it.
@@ -139,11 +137,9 @@ class DrivingOptions(ConditionOptions):
     routes: str = "all"
     road: int | None = None
     latency: str = "none"
-    latency_scale: float = 1.0
     seed: int = 0
     workers: int = 1
     adapter: str | Path | None = None
-    frame_limit_s: float = FRAME_LIMIT_S
     engine: str = "local"
     address: str | None = None
     provider: Provider = CPU
@@ -164,12 +160,7 @@ class DrivingOptions(ConditionOptions):
         Raises:
             EvaluationError: There is no such source, or an option is invalid.
         """
-        return parse_latency(
-            self.latency,
-            in_order=self.in_order,
-            scale=self.latency_scale,
-            seed=self.seed,
-        )
+        return parse_latency(self.latency, seed=self.seed)
 
     def driven_by(
         self,
@@ -187,7 +178,7 @@ class DrivingOptions(ConditionOptions):
         conditions = replace(self.settings, latency=self.source)
         size = image_size_of(opened(driver))
         return HighwayEvaluator(
-            Job(driver, replace(conditions, image_size=size), self.frame_limit_s),
+            Job(driver, replace(conditions, image_size=size)),
             picked,
             folder,
             set_size,
