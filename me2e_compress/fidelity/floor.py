@@ -60,13 +60,10 @@ class Floor:
         sqnr_db: least SQNR of outputs, dB; not of discrete ones, of the plan
             only where its displacement was not measured.
         plan_m: most mean displacement of the waypoints, metres.
-        alive: least share of an output's standard deviation over frames; 0 does not
-            ask.
     """
 
     sqnr_db: float = SQNR_FLOOR_DB
     plan_m: float = PLAN_FLOOR_M
-    alive: float = ALIVE
 
     def shortfalls(
         self, found: Fidelity, unsteady: Collection[str] = ()

@@ -25,7 +25,7 @@ from me2e_compress.registry import documents
 from me2e_compress.registry.registry import fields_of, is_written
 from me2e_compress.registry.text import chosen_fields
 
-__all__ = ["adding_no_weights", "load", "parse", "shipped", "to_text", "to_toml"]
+__all__ = ["load", "parse", "shipped", "to_text", "to_toml"]
 
 
 def shipped() -> list[str]:
@@ -80,16 +80,6 @@ def parse(text: str) -> tuple[Pass, ...]:
         RecipeError: the text is not a pipeline, or names an unknown pass or option.
     """
     return PASSES.parse_all(text)
-
-
-def adding_no_weights(passes: Iterable[Pass]) -> tuple[Pass, ...]:
-    """Set the options that let passes add weights for fewer nodes or less work to 0."""
-    return tuple(
-        each.with_options({"bytes_per_node": 0})
-        if "bytes_per_node" in each.option_names()
-        else each
-        for each in passes
-    )
 
 
 def to_text(passes: Iterable[Pass]) -> str:

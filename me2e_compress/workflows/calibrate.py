@@ -102,7 +102,7 @@ def _ready(
     if frames is not None:
         recording = CalibrationSet(frames)
         recording.check(loaded)
-        part = draw(recording, options.count, options.seed)
+        part = draw(recording, options.count, 0)
     try_first(
         loaded,
         source.name,

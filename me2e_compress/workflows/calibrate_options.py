@@ -18,7 +18,6 @@ class CalibrateOptions:
         method: ``mse``, ``max-min`` or ``percentile:P``; None takes that of the
             recipe's int8, else ``mse``.
         count: number of frames, drawn in whole scenes.
-        seed: seed of that draw.
         module_map: preset or TOML file; None finds the preset.
         imported: a TensorRT cache or onnxruntime table, instead of frames; frames given
             too only judge its scales.
@@ -37,7 +36,6 @@ class CalibrateOptions:
     recipe: str | Path = "exact"
     method: str | None = None
     count: int = 256
-    seed: int = 0
     module_map: str | Path | None = None
     imported: str | Path | None = None
     tensorrt_cache: str | Path | None = None
@@ -50,7 +48,6 @@ class CalibrateOptions:
     def __post_init__(self) -> None:
         if self.method is not None:
             OBSERVERS.parse(self.method)
-        check_count("--seed", self.seed)
         check_count("--threads", self.threads, most=MOST_THREADS)
 
 

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError, RecipeError
-from me2e_compress.fidelity.floor import ALIVE, SQNR_FLOOR_DB, Floor
+from me2e_compress.fidelity.floor import SQNR_FLOOR_DB, Floor
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager import recipe as recipes
@@ -61,15 +61,12 @@ class CompressOptions:
         ranges: file of saved ranges, instead of frames.
         method: how ranges are read from frames, or were for ``ranges``.
         module_map: preset or TOML file; None finds the preset.
-        seed: seed of everything random.
         verify_frames: frames that exact passes are checked on; 0 checks none.
         unproven: write a graph that does not run here, its exact passes unchecked.
         measure_frames: most frames that are kept out of calibration, to measure lossy
             passes on; 0 measures nothing and calibrates on all.
         floor: SQNR in dB below which an output is warned of.
-        alive: share of an output's movement below which it is dead; 0 does not ask.
         allow_empty: write the graph although nothing in it became int8.
-        smaller: add no weights to remove nodes: fewer bytes instead of fewer nodes.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         adapter: TOML file whose plan and state become metadata of the graph.
         provider: what runs graphs, to calibrate, check and measure.
@@ -83,25 +80,20 @@ class CompressOptions:
     ranges: str | Path | None = None
     method: str | None = None
     module_map: str | Path | None = None
-    seed: int = 0
     verify_frames: int = 2
     unproven: bool = False
     measure_frames: int = 8
     floor: float = SQNR_FLOOR_DB
-    alive: float = ALIVE
     allow_empty: bool = False
-    smaller: bool = False
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
     adapter: str | Path | None = None
     provider: Provider = CPU
     force: bool = False
 
     def __post_init__(self) -> None:
-        check_count("--seed", self.seed)
         check_count("--verify-frames", self.verify_frames)
         check_count("--measure-frames", self.measure_frames)
         check_number("--floor", self.floor, zero=True)
-        check_number("--alive", self.alive, zero=True, most=1.0)
 
     def passes(self, recipe: Recipe | None) -> tuple[Pass, ...]:
         """Build the passes of a recipe, with these options' int8.
@@ -130,7 +122,6 @@ class CompressOptions:
             )
         if self.scheme is not None:
             passes = (*passes, QuantizeInt8(scheme=self.scheme))
-        passes = recipes.adding_no_weights(passes) if self.smaller else passes
         return self._with_int8(with_sizes(passes, self.dims))
 
     def _with_int8(self, passes: tuple[Pass, ...]) -> tuple[Pass, ...]:
@@ -224,7 +215,7 @@ class Compression:
         first = partial(try_first, listener=listener, count=count, provider=provider)
         answers = first(model, source.name, seen, file=source)
         # apply the passes, and refuse a result that is unproven or not int8
-        context = Context(modules, frames.calibration, options.seed, provider)
+        context = Context(modules, frames.calibration, provider=provider)
         checked, folder = options.verify_frames, self.output.parent
         manager = PassManager(passes, checked, folder, frames.samples, first, answers)
         report = manager.run(model, context, partial(listener.on_progress, "passes"))
@@ -234,7 +225,7 @@ class Compression:
         # measure what lossy passes cost, on the frames kept for it
         if report.lossy and frames.measured is not None:
             first(report.model, self.output.name)
-        floor = Floor(options.floor, alive=options.alive)
+        floor = Floor(options.floor)
         loss = measure_loss(report, provider, frames, floor, listener)
         linted = lint_written(report.model, passes, self.output, options.target)
         seconds = cpu_seconds() - start
@@ -259,6 +250,6 @@ def _refuse_empty(
         return
     if not options.allow_empty:
         raise PreconditionError(
-            f"{int8.empty}; nothing is written, --allow-empty writes it nevertheless"
+            f"{int8.empty}; nothing is written; -r exact writes a graph without int8"
         )
     listener.on_warning(int8.empty)

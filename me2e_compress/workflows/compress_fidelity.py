@@ -153,20 +153,19 @@ class _Measurement:
         A graph for onnxruntime is run by its int8 kernels, too.
         """
         session, model = self._session(self.report.model), self.report.model
-        alive = self.floor.alive
-        lively = LivenessTally(reference.session, session) if alive else None
+        lively = LivenessTally(reference.session, session)
         kernels = self._kernels(model)
 
         def watch(a: dict[str, Array], b: dict[str, Array], frame: Frame) -> None:
-            for tally in (lively, kernels):
-                if tally is not None:
-                    tally.add(a, b, frame)
+            lively.add(a, b, frame)
+            if kernels is not None:
+                kernels.add(a, b, frame)
 
         fidelity = reference.compare(session, watch=watch)
         return dataclasses.replace(
             found,
             fidelity=fidelity,
-            liveness=None if lively is None else lively.result(alive),
+            liveness=lively.result(),
             runtime=None if kernels is None else kernels.result(model, fidelity),
         )
 

@@ -172,11 +172,11 @@ def test_an_engine_is_written_once_and_not_over_a_file_of_the_users(
     monkeypatch.setattr(workflow, "build_engine", build_engine)
     (dense / "mine.engine").write_text("mine")
 
-    cli.document("build dense.onnx -o d.engine --precision fp16 --tactic-source CUBLAS")
+    cli.document("build dense.onnx -o d.engine --precision fp16")
     cli.refused("build dense.onnx -o mine.engine")
 
     assert (dense / "d.engine").read_bytes() == b"engine"
-    assert asked == [EngineSettings("fp16", ("CUBLAS",))]
+    assert asked == [EngineSettings("fp16")]
 
 
 def test_an_exported_stack_is_a_document(cli: Cli, tmp_path: Path) -> None:

@@ -30,9 +30,7 @@ def test_a_number_that_is_none(cli: Cli, dense: Path, line: str, value: str) -> 
 @pytest.mark.parametrize(
     "line",
     [
-        f"calibrate {F} -o out --seed -1",
         f"calibrate {F} -o out --threads -1",
-        "compress dense.onnx -r exact -o out --seed -1",
         "compress dense.onnx -r exact -o out --verify-frames -1",
         f"sensitivity {F} -o out --node-trials -1",
         f"search {F} --max-mb 1 -o out --threads -1",

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import me2e_compress as me2e
 from me2e_compress import graph
 from me2e_compress.quantization.plan import KeptFloat, load_plan, plan_of, save_plan
 from me2e_compress.registry.marks import IN_JSON
@@ -52,8 +53,12 @@ def test_overrides_are_told_against_the_model_and_reach_the_pass(
 
     said = cli.done(f"plan dense.onnx {MAP} --overrides o.toml --against dense.onnx")
     assert "/plan_head/MatMul: int8 (layer) -> float (override)" in said.out
-    more = "--overrides o.toml --rules paper --allow-empty"
-    step = cli.document(f"{MADE} {more}")["steps"][-1]
+    options = me2e.CompressOptions(
+        scheme="prediction", rules="paper", overrides="o.toml",
+        module_map="map.toml", allow_empty=True,
+    )  # fmt: skip
+    me2e.compress("dense.onnx", "out.onnx", None, "frames", options)
+    step = json.loads((dense / "out.report.json").read_text())["steps"][-1]
     assert 'rules="paper"' in step["text"]
     assert "0 of 2 nodes int8; by rule: override 1" in step["notes"]
 

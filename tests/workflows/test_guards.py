@@ -42,7 +42,6 @@ def test_no_workflow_writes_over_its_input(
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: me2e.CompressOptions(seed=-1), RecipeError, "--seed is -1"),
         (lambda: me2e.CompressOptions(verify_frames=-1), RecipeError, "-frames is -1"),
         (lambda: me2e.CalibrateOptions(threads=-2), RecipeError, "--threads is -2"),
         (lambda: me2e.CalibrateOptions(method="max"), RecipeError, "method 'max'"),

@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import me2e_compress as me2e
 from me2e_compress import graph
+from me2e_compress.workflows.listener import Listener
 from tests.command import Command
 from tests.frames import record
 from tests.nets import net
@@ -42,16 +44,18 @@ def test_nothing_int8_is_an_error_and_writes_nothing(
     said = capsys.readouterr().err
     assert "made nothing int8" in said
     assert "rule operator: LSTM is not a weighted layer" in said
-    assert "--allow-empty" in said
+    assert "-r exact writes a graph without int8" in said
     assert sorted(lstm.iterdir()) == before
 
 
 def test_nothing_int8_is_said_first_and_last_where_it_is_allowed(
-    command: Command, lstm: Path, capsys: pytest.CaptureFixture[str]
+    lstm: Path,
 ) -> None:
-    assert command(*EMPTY, "--allow-empty", "-o", "out.onnx") == 0
+    warned = list[str]()
+    options = me2e.CompressOptions(scheme="full", allow_empty=True)
+    listener = Listener(on_warning=warned.append)
+    found = me2e.compress("in.onnx", "out.onnx", None, "frames", options, listener)
 
-    said = capsys.readouterr()
-    assert "made nothing int8" in said.err.splitlines()[0]
-    assert "made nothing int8" in said.out.splitlines()[-1]
+    assert "made nothing int8" in warned[0]
+    assert "made nothing int8" in (*found.lines(), *found.alerts())[-1]
     assert (lstm / "out.onnx").is_file()

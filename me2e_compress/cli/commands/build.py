@@ -14,10 +14,6 @@ Output = Annotated[Path, typer.Option("-o", "--output", help="the engine")]
 Types = Annotated[
     Precision, typer.Option("--precision", help="graph: its own types; fp16: float too")
 ]
-TacticSource = Annotated[
-    list[str] | None,
-    typer.Option(help="take kernels from CUBLAS, ... alone; once for each"),
-]
 Plugins = Annotated[
     list[Path] | None, typer.Option(help="a library of TensorRT plugins; once for each")
 ]
@@ -27,14 +23,11 @@ def build(
     model: given.Model,
     output: Output,
     precision: Types = "graph",
-    tactic_source: TacticSource = None,
     plugins: Plugins = None,
     force: given.Force = False,
 ) -> None:
     """Build a TensorRT engine of a graph, for the GPU of this machine."""
-    settings = EngineSettings(
-        precision, tuple(tactic_source or ()), tuple(plugins or ())
-    )
+    settings = EngineSettings(precision, tuple(plugins or ()))
     with listening() as listener:
         options = workflow.BuildOptions(settings, force)
         found = workflow.build(model, output, options, listener)

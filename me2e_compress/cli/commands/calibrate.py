@@ -27,7 +27,6 @@ def calibrate(
     recipe: Recipe = "exact",
     method: given.Method = None,
     count: given.Count = 256,
-    seed: given.Seed = 0,
     module_map: given.ModuleMap = None,
     adapter: given.Adapter = None,
     imported: given.Import = None,
@@ -44,9 +43,8 @@ def calibrate(
     measured by --ranges.
     """
     options = CalibrateOptions(
-        recipe=recipe, method=method, count=count, seed=seed, module_map=module_map,
-        imported=imported, threads=threads,
-        force=force, adapter=adapter,
+        recipe=recipe, method=method, count=count, module_map=module_map,
+        imported=imported, threads=threads, force=force, adapter=adapter,
         tensorrt_cache=tensorrt_cache, onnxruntime_table=onnxruntime_table,
         provider=provider_named(provider),
     )  # fmt: skip

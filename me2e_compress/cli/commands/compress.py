@@ -8,7 +8,7 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.errors import RecipeError
-from me2e_compress.fidelity.floor import ALIVE, SQNR_FLOOR_DB
+from me2e_compress.fidelity.floor import SQNR_FLOOR_DB
 from me2e_compress.manager import recipe
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import compress as workflow
@@ -22,13 +22,6 @@ Unproven = Annotated[
 ]
 Measure = Annotated[int, typer.Option(min=0, help="most frames kept to measure on")]
 Floor = Annotated[float, typer.Option(help="warn of an output below this SQNR, in dB")]
-AllowEmpty = Annotated[
-    bool, typer.Option("--allow-empty", help="write it although nothing became int8")
-]
-
-Smaller = Annotated[
-    bool, typer.Option("--smaller", help="add no weights for fewer nodes or less work")
-]
 
 
 def compress(
@@ -44,14 +37,10 @@ def compress(
     ranges: given.SavedRanges = None,
     method: given.Method = None,
     module_map: given.ModuleMap = None,
-    seed: given.Seed = 0,
     verify_frames: Verify = 2,
     unproven: Unproven = False,
     measure_frames: Measure = 8,
     floor: Floor = SQNR_FLOOR_DB,
-    alive: given.Alive = ALIVE,
-    allow_empty: AllowEmpty = False,
-    smaller: Smaller = False,
     set_dim: given.SetDim = None,
     adapter: given.Adapter = None,
     provider: given.Provider = "cpu",
@@ -66,10 +55,9 @@ def compress(
     wanted = recipe_name if passes is None else recipe.parse(passes)
     options = workflow.CompressOptions(
         scheme=scheme, rules=rules, target=target, overrides=overrides, ranges=ranges,
-        method=method, module_map=module_map, seed=seed, verify_frames=verify_frames,
-        measure_frames=measure_frames, floor=floor, alive=alive, smaller=smaller,
-        force=force, dims=sizes(set_dim or ()),
-        adapter=adapter, unproven=unproven, allow_empty=allow_empty,
+        method=method, module_map=module_map, verify_frames=verify_frames,
+        measure_frames=measure_frames, floor=floor, force=force,
+        dims=sizes(set_dim or ()), adapter=adapter, unproven=unproven,
         provider=provider_named(provider),
     )  # fmt: skip
     with listening() as listener:

@@ -24,13 +24,10 @@ class EngineSettings:
     Attributes:
         precision: ``graph``: in the types of the graph, int8 pairs as int8; ``fp16``:
             float32 may also run in float16. TensorRT 11 supports only ``graph``.
-        tactic_sources: the only libraries to take kernels from, such as ``CUBLAS`` of
-            TensorRT 10; empty leaves the choice to TensorRT.
         plugins: libraries of TensorRT plugins that the graph needs.
     """
 
     precision: Precision = "graph"
-    tactic_sources: tuple[str, ...] = ()
     plugins: tuple[Path, ...] = ()
 
 
@@ -49,8 +46,8 @@ def build_engine(path: Path, settings: EngineSettings) -> TensorRTEngine:
 
     Raises:
         MissingPackageError: TensorRT is not installed.
-        PreconditionError: it lacks an option, or refuses the graph; the message names
-            the node.
+        PreconditionError: it lacks the precision, or refuses the graph; the message
+            names the node.
     """
     # Parse the graph with the user's plugins.
     trt, begun = _tensorrt(), time.perf_counter()
@@ -61,11 +58,9 @@ def build_engine(path: Path, settings: EngineSettings) -> TensorRTEngine:
     parser = trt.OnnxParser(network, log)
     if not parser.parse_from_file(str(path)):
         raise PreconditionError(f"{path}: {_refusal(trt, parser)}")
-    # Set the types and libraries, and build.
+    # Set the types, and build.
     config = builder.create_builder_config()
     _set_types(trt, config, graph.load(path), settings.precision)
-    if settings.tactic_sources:
-        config.set_tactic_sources(_sources(trt, settings.tactic_sources))
     built = builder.build_serialized_network(network, config)
     if built is None:
         reason = log.lines[-1] if log.lines else "it does not say why"
@@ -138,14 +133,3 @@ def _set_types(trt: Any, config: Any, model: ir.Model, precision: Precision) -> 
     halves = any(value.dtype == ir.DataType.FLOAT16 for value in weights)
     if precision == "fp16" or halves:
         config.set_flag(flags.FP16)
-
-
-def _sources(trt: Any, names: Sequence[str]) -> int:
-    """Return the bit mask of some tactic sources."""
-    known = getattr(getattr(trt, "TacticSource", None), "__members__", {})
-    if missing := [name for name in names if name.upper() not in known]:
-        raise PreconditionError(
-            f"TensorRT {trt.__version__} has no tactic source {missing[0]}; it has"
-            f" {', '.join(known) or 'none'}"
-        )
-    return sum(1 << int(known[name.upper()]) for name in dict.fromkeys(names))

@@ -20,8 +20,6 @@ INT8 = (
     f"{HEAD} <float s = {{0.5}}, int8 z = {{0}}>"
     " { q = QuantizeLinear(x, s, z) y = DequantizeLinear(q, s, z) }"
 )
-Sources10 = enum.IntEnum("Sources10", {"CUBLAS": 0, "CUDNN": 2, "JIT_CONVOLUTIONS": 4})
-Sources11 = enum.IntEnum("Sources11", {"JIT_CONVOLUTIONS": 4})
 
 
 class _Log:
@@ -49,11 +47,8 @@ class _Parser:
 
 class _Builder:
     def __init__(self, log: Any) -> None:
-        self.config = SimpleNamespace(flags=[], sources=None)
+        self.config = SimpleNamespace(flags=[])
         self.config.set_flag = self.config.flags.append
-        self.config.set_tactic_sources = lambda bits: vars(self.config).update(
-            sources=bits
-        )
 
     def create_network(self, flags: int) -> Any:
         return SimpleNamespace(num_layers=3)
@@ -62,7 +57,7 @@ class _Builder:
         return self.config
 
     def build_serialized_network(self, network: Any, config: Any) -> bytes:
-        return f"{sorted(config.flags)} {config.sources}".encode()
+        return f"{sorted(config.flags)}".encode()
 
 
 @pytest.fixture
@@ -78,7 +73,6 @@ def tensorrt(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) ->
         Builder=_Builder,
         OnnxParser=_Parser,
         BuilderFlag=SimpleNamespace(**flags),
-        TacticSource=Sources10 if version == 10 else Sources11,
         init_libnvinfer_plugins=lambda log, namespace: True,
         get_plugin_registry=lambda: SimpleNamespace(load_library=lambda path: None),
     )
@@ -106,33 +100,16 @@ def test_tensorrt_10_is_allowed_the_types_of_the_graph(
 ) -> None:
     found = build_engine(written(tmp_path, text), EngineSettings(precision))
 
-    assert found.content.decode() == f"{flags} None"
+    assert found.content.decode() == f"{flags}"
     assert (found.version, found.layers) == ("10.4.0", 3)
 
 
-@pytest.mark.usefixtures("tensorrt")
-def test_tactic_sources_are_these_alone(tmp_path: Path) -> None:
-    settings = EngineSettings(tactic_sources=("cublas", "CUDNN"))
-
-    assert build_engine(written(tmp_path), settings).content.endswith(b" 5")
-
-
 @pytest.mark.parametrize("tensorrt", [11], indirect=True)
-@pytest.mark.parametrize(
-    ("settings", "reason"),
-    [
-        (
-            EngineSettings(tactic_sources=("CUBLAS",)),
-            "11.4.0 has no tactic source CUBLAS; it has JIT_CONVOLUTIONS",
-        ),
-        (EngineSettings("fp16"), "11.4.0 takes the types of the graph"),
-    ],
-)
-def test_what_tensorrt_11_no_longer_has(
-    tensorrt: int, tmp_path: Path, settings: EngineSettings, reason: str
-) -> None:
-    with pytest.raises(PreconditionError, match=reason):
-        build_engine(written(tmp_path), settings)
+def test_what_tensorrt_11_no_longer_has(tensorrt: int, tmp_path: Path) -> None:
+    with pytest.raises(
+        PreconditionError, match=r"11\.4\.0 takes the types of the graph"
+    ):
+        build_engine(written(tmp_path), EngineSettings("fp16"))
 
 
 @pytest.mark.parametrize("tensorrt", [11], indirect=True)
