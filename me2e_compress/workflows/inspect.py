@@ -9,7 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.driving.adapter.stated import adapted
-from me2e_compress.errors import GraphError, RecipeError
+from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import Item, ModuleMap, assign, itemise
 from me2e_compress.graph.opset import lowered
@@ -21,7 +21,6 @@ from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
 from me2e_compress.workflows.inspect_result import InspectResult
-from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.module_costs import (
     trace_of,
     with_activations,
@@ -37,31 +36,22 @@ def inspect(
     module_map: str | Path | None = None,
     dims: Mapping[str, int] | None = None,
     trace: str | Path | None = None,
-    frames: str | Path | None = None,
-    listener: Listener = SILENT,
     adapter: str | Path | None = None,
 ) -> InspectResult:
     """Read a graph, and weigh its modules.
 
     `dims` are sizes that open dimensions of the inputs are given first. The time by
-    module comes from a trace that ``profile`` wrote, or is measured on recorded frames.
-    The adapter's TOML says which outputs are fed back.
+    module comes from a trace that ``profile`` wrote. The adapter's TOML says which
+    outputs are fed back.
 
     Raises:
         GraphError: The model does not exist.
         PreconditionError: No input has such a dimension.
         ModuleMapError: The map does not exist.
         EvaluationError: The trace is of another model, or not by module.
-        RecipeError: Both a trace and frames are given.
-        FramesError: A frame does not fit.
     """
-    if trace is not None and frames is not None:
-        raise RecipeError("--trace and --frames: the time is read, or measured")
-    # the time by module is read from a trace, or measured here
     path = model_path(model)
     taken = None if trace is None else trace_of(trace, path)
-    if frames is not None:
-        taken = _timed(path, module_map, frames, listener, adapter)
     loaded = graph.load(path)
     adapted(loaded, adapter, module_map)
     modules = load_map(module_map, loaded)
@@ -113,23 +103,6 @@ def inspected(
         weights=named_weights(loaded.metadata_props),
         latency_of="" if taken is None else taken.headline,
     )
-
-
-def _timed(
-    path: Path,
-    module_map: str | Path | None,
-    frames: str | Path,
-    listener: Listener,
-    adapter: str | Path | None,
-) -> LatencyTrace:
-    """Measure module by module, one inference per frame."""
-    from me2e_compress.workflows.profile import (  # opens sessions
-        ProfileOptions,
-        profile,
-    )
-
-    options = ProfileOptions(by_module=True, module_map=module_map, adapter=adapter)
-    return profile(path, frames, options=options, listener=listener).trace
 
 
 def _fed_back(model: ir.Model) -> tuple[dict[str, str], str]:

@@ -10,7 +10,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.adapter.stated import adapted
-from me2e_compress.errors import EvaluationError, MissingExtraError, RecipeError
+from me2e_compress.errors import EvaluationError, MissingExtraError
 from me2e_compress.graph.modules import assign
 from me2e_compress.metrics.deadlines import BUDGET_MS
 from me2e_compress.registry import drafts
@@ -57,7 +57,6 @@ class ProfileOptions:
         figure: draw modules over inferences as PNG, SVG or PDF; measures them.
         force: replace outputs that we did not write, too.
         energy: also measure joules by ``auto`` or a named counter; None does not.
-        energy_output: file of the joules; None is beside the trace, ``.energy.json``.
         schedule: how long energy is measured, and how often; None takes the defaults.
         budget_ms: milliseconds that a decision may take.
         adapter: TOML file that says which outputs are fed back.
@@ -72,14 +71,11 @@ class ProfileOptions:
     figure: str | Path | None = None
     force: bool = False
     energy: str | None = None
-    energy_output: str | Path | None = None
     schedule: EnergySchedule | None = None
     budget_ms: float = BUDGET_MS
     adapter: str | Path | None = None
 
     def __post_init__(self) -> None:
-        if self.energy is None and self.energy_output is not None:
-            raise RecipeError("--energy-out: there is no --energy to write")
         check_budget(self.budget_ms)
         check_count("--threads", self.threads, most=MOST_THREADS)
         check_count("--samples", self.samples or 0, most=MOST_SAMPLES)
@@ -154,8 +150,6 @@ def profile(
 
 
 def _energy_path(options: ProfileOptions, trace: Path | None) -> Path | None:
-    if options.energy_output is not None:
-        return Path(options.energy_output)
     if options.energy is None or trace is None:
         return None
     return trace.with_suffix(".energy.json")

@@ -138,8 +138,8 @@ def write_power(folder: Path, watts: float = 30.0) -> None:
 def test_joules_are_shown_and_written(cli: Cli, dense: Path) -> None:
     write_power(dense)
 
-    shown = cli.done(f"{JOULES} --energy-out j.json").words
-    found = EnergyResult.load(dense / "j.json")
+    shown = cli.done(JOULES).words
+    found = EnergyResult.load(dense / "trace.energy.json")
     assert found.j_per_frame == pytest.approx(3.0, rel=0.01)
     assert "energy: 3 J a frame (2.995 to 3.005)" in shown
     assert "recorded-power-integrated of Orin NX (VDD_IN)" in shown

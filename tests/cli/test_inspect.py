@@ -116,16 +116,6 @@ def test_shares_of_the_time_come_from_a_trace(cli: Cli, files: Path) -> None:
     assert "share of a frame's time: 2 inferences on a machine" in shown
 
 
-def test_shares_are_measured_on_frames(cli: Cli, files: Path) -> None:
-    found = modules(cli, f"{IN} --frames frames")
-
-    shares = [each["latency_share"] for each in found.values()]
-    measured = [share for share in shares if isinstance(share, float)]
-    assert len(measured) == len(shares) == 3
-    assert min(measured) > 0
-    assert sum(measured) <= 1
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -100,7 +100,6 @@ OTHERS = {
     "frames vad-huge -o out": "vad-huge: no such file; models that ship",
     "plan latin.json": r"latin\.json: not a plan",
     "plan dense.onnx --against none.onnx": "none.onnx: no such file; models",
-    "inspect dense.onnx --trace t.json --frames frames": "--trace and --frames",
     "inspect open.onnx --set-dim n": "write NAME=SIZE, e.g. batch=1",
     "inspect open.onnx --set-dim n=x": "write NAME=SIZE, e.g. batch=1",
     "inspect open.onnx --set-dim n=0": "n=0 must be 1 or more",
@@ -128,7 +127,6 @@ OTHERS = {
     f"{TIMED} --figure tail.gif": r"tail\.gif: a figure ends in \.png",
     f"{TIMED} --energy sun": "no energy counter 'sun'; there are nvml, recorded",
     f"{TIMED} --energy recorded:no.csv": r"no\.csv: No such file",
-    f"{TIMED} --energy-out j.json": "there is no --energy to write",
 }
 DRIVE = {
     "--routes nowhere": "no route 'nowhere'",

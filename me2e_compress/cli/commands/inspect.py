@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from me2e_compress.cli import arguments as given
-from me2e_compress.cli.console import listening, show
+from me2e_compress.cli.console import show
 from me2e_compress.workflows import inspect as workflow
 from me2e_compress.workflows.checks import sizes
 
@@ -18,16 +18,11 @@ def inspect(
     trace: Annotated[
         Path | None, typer.Option(help="latencies by module, of profile --by-module")
     ] = None,
-    frames: Annotated[Path | None, typer.Option(help="the recorded FRAMES")] = None,
     adapter: given.Adapter = None,
 ) -> None:
     """Show what a graph holds: interface, and nodes, parameters, MACs by module.
 
-    With --trace or --frames also each module's share of the time of a frame: as it was
-    measured, or measured now.
+    With --trace also each module's share of the time of a frame.
     """
     dims = sizes(set_dim or ())
-    with listening() as listener:
-        read = module_map, dims, trace, frames, listener, adapter
-        found = workflow.inspect(model, *read)
-    show(found)
+    show(workflow.inspect(model, module_map, dims, trace, adapter))

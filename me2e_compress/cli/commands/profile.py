@@ -33,9 +33,6 @@ def profile(
         str | None,
         typer.Option(help="joules too: auto, nvml, recorded:FILE"),
     ] = None,
-    energy_out: Annotated[
-        Path | None, typer.Option(help="joules as JSON; beside the trace if not named")
-    ] = None,
     budget_ms: given.Budget = BUDGET_MS,
     module_map: given.ModuleMap = None,
     adapter: given.Adapter = None,
@@ -57,7 +54,6 @@ def profile(
         figure=figure,
         force=force,
         energy=energy,
-        energy_output=energy_out,
         budget_ms=budget_ms,
         adapter=adapter,
     )
