@@ -9,7 +9,7 @@ from me2e_compress.runtime.energy.models import measure_energy
 from me2e_compress.runtime.energy.reader import Absent, Reader
 from me2e_compress.runtime.energy.schedule import EnergySchedule
 from me2e_compress.runtime.frames import Frames
-from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.providers import Provider
 from me2e_compress.workflows.checks import check_number
 
 
@@ -33,19 +33,14 @@ def need_counter() -> None:
         counter.close()
 
 
-def joules_of(
-    model: Path, frames: Frames, *, threads: int = 1, provider: Provider = CPU
-) -> float:
-    """Measure joules per frame over the fewest windows that give an interval.
-
-    `threads` is onnxruntime's, and 0 takes all.
-    """
+def joules_of(model: Path, frames: Frames, provider: Provider) -> float:
+    """Measure joules per frame over the fewest windows that give an interval."""
     schedule = EnergySchedule(windows=FEWEST_WINDOWS)
     found = measure_energy(
         {"model": model},
         frames,
         schedule=schedule,
-        threads=threads,
+        threads=0,
         provider=provider,
     )["model"]
     if found.j_per_frame is None:

@@ -15,7 +15,7 @@ from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows.budgets import check_budgets, joules_of, need_counter
-from me2e_compress.workflows.checks import MOST_THREADS, check_count, model_path
+from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.int8_trials import TrialFiles, TrialOptions
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, significant, table
@@ -27,19 +27,16 @@ class SearchOptions(TrialOptions):
 
     Attributes:
         max_mb: most MB of weights.
-        max_ms: most milliseconds per frame, on this CPU, so for its target alone.
+        max_ms: most milliseconds per frame, on all cores of this CPU, so for its target
+            alone.
         max_joules: most joules per frame, as a counter measures them.
-        threads: threads of onnxruntime that ms and joules are measured with; 0 takes
-            all.
     """
 
     max_mb: float | None = None
     max_ms: float | None = None
     max_joules: float | None = None
-    threads: int = 0
 
     def __post_init__(self) -> None:
-        check_count("--threads", self.threads, most=MOST_THREADS)
         check_budgets(self.max_mb, self.max_ms, self.max_joules)
         if self.max_ms is not None and self.target != DEFAULT_TARGET:
             raise RecipeError(
@@ -158,10 +155,10 @@ def _budgets(options: SearchOptions, trials: Trials) -> list[Budget]:
     if options.max_mb is not None:
         found.append(Budget(options.max_mb * 1e6, "bytes of weights", _weight_bytes))
     if options.max_ms is not None:
-        seconds = partial(_seconds, trials, options.threads)
+        seconds = partial(_seconds, trials)
         found.append(Budget(options.max_ms / 1e3, "s", seconds))
     if options.max_joules is not None:
-        joules = partial(_joules, trials, options.threads)
+        joules = partial(_joules, trials)
         found.append(Budget(options.max_joules, "J", joules))
     return found
 
@@ -170,21 +167,19 @@ def _weight_bytes(made: ir.Model) -> float:
     return float(graph.size(made).weight_bytes)
 
 
-def _joules(trials: Trials, threads: int, made: ir.Model) -> float:
+def _joules(trials: Trials, made: ir.Model) -> float:
     # energy is measured of a file
     reference = trials.reference
     with TemporaryDirectory() as folder:
         file = Path(folder) / "int8.onnx"
         graph.save(made, file)
         provider = reference.session.provider
-        return joules_of(file, reference.frames, threads=threads, provider=provider)
+        return joules_of(file, reference.frames, provider)
 
 
-def _seconds(trials: Trials, threads: int, made: ir.Model) -> float:
+def _seconds(trials: Trials, made: ir.Model) -> float:
     """Return the least wall time of a frame in 5 runs."""
     provider = trials.reference.session.provider
-    session = Session(
-        made, threads=threads, int8_kernels=True, release=True, provider=provider
-    )
+    session = Session(made, int8_kernels=True, release=True, provider=provider)
     first = next(iter(trials.reference.frames))
     return time_interleaved({"int8": session}, [first], 5)["int8"].best_wall_s

@@ -88,7 +88,7 @@ def test_options_are_not_for_a_plan_that_is_made(
 
 @pytest.mark.usefixtures("dense")
 def test_a_plan_is_shown_with_reasons(cli: Cli) -> None:
-    said = cli.done(f"plan dense.onnx --scheme feature-ext {MAP} --nodes").out
+    said = cli.done(f"plan dense.onnx --scheme feature-ext {MAP} -v").out
 
     assert "0 of 2 nodes int8; module 1" in said
     assert "/plan_head/MatMul" in said
@@ -106,7 +106,7 @@ def test_what_is_decided_together_is_listed(cli: Cli, tmp_path: Path) -> None:
         '[modules.head]\nrole = "prediction"\noptional = ["**"]\n'
     )
 
-    assert "shared-input" in cli.done(f"plan two.onnx {MAP} --nodes").out
+    assert "shared-input" in cli.done(f"plan two.onnx {MAP} -v").out
 
 
 def test_what_a_target_kept_and_what_is_close_is_told(cli: Cli, dense: Path) -> None:
@@ -120,7 +120,7 @@ def test_what_a_target_kept_and_what_is_close_is_told(cli: Cli, dense: Path) -> 
     changed = dataclasses.replace(made, kept_float=kept, decisions=close)
     save_plan(changed, dense / "kept.plan.json")
 
-    said = cli.done("plan kept.plan.json --nodes").words
+    said = cli.done("plan kept.plan.json -v").words
 
     assert "1 of them stay float on their target" in said
     assert "[8,8]" in said
@@ -129,7 +129,7 @@ def test_what_a_target_kept_and_what_is_close_is_told(cli: Cli, dense: Path) -> 
 
 
 @pytest.mark.usefixtures("dense")
-@pytest.mark.parametrize("words", ["", "-v", "--nodes", "--nodes -v"])
+@pytest.mark.parametrize("words", ["", "-v"])
 def test_nodes_are_listed_once_and_only_when_asked_for(cli: Cli, words: str) -> None:
     said = cli.done(f"plan dense.onnx {MAP} --scheme full {words}").out
 

@@ -31,7 +31,7 @@ OPENERS: Mapping[str, tuple[str, ...]] = {
     "inspect-mapped": (
         *("inspect", "bad.onnx", "--map", "../good/map.toml", "--json"),
     ),
-    "plan": ("plan", "bad.onnx", "--nodes"),
+    "plan": ("plan", "bad.onnx", "-v"),
     "lint": ("lint", "bad.onnx"),
     "unchecked": (
         *("compress", "bad.onnx", "-r", "exact", "-o", "out.onnx"),
@@ -87,7 +87,7 @@ def _json_words(good: Path) -> dict[str, tuple[str, tuple[str, ...]]]:
     given = ("--frames", FRAMES, "-o", "out.onnx")
     return {
         "plan": ("plan.json", ("plan", MODEL, "--against", "bad.json")),
-        "plan-alone": ("plan.json", ("plan", "bad.json", "--nodes")),
+        "plan-alone": ("plan.json", ("plan", "bad.json", "-v")),
         "ranges": (
             "ranges.json",
             ("compress", MODEL, "--scheme", "full", "--ranges", "bad.json", *given),

@@ -59,7 +59,7 @@ def test_the_paper_quantizes_weighted_layers_alone() -> None:
     found = decided(sampled(), "paper")
 
     assert (found.dtype, found.rule) == ("float", "fused-operator")
-    assert found.could_be_int8  # so that `plan --nodes` shows it
+    assert found.could_be_int8  # so that `plan -v` shows it
     assert decided(sampled(), "paper{without=[fused-operator]}").dtype == "int8"
     assert decided(sampled(), "paper", overrides=TO_INT8).rule == "override"
 

@@ -52,7 +52,6 @@ def test_no_workflow_writes_over_its_input(
         (lambda: me2e.ProfileOptions(warm_up=10**20), RecipeError, "--warm-up is 1"),
         (lambda: me2e.ProfileOptions(threads=10**9), RecipeError, "1,024 at most"),
         (lambda: me2e.CalibrateOptions(threads=10**9), RecipeError, "1,024 at most"),
-        (lambda: me2e.SearchOptions(threads=10**9), RecipeError, "1,024 at most"),
         (lambda: me2e.LintOptions("onnxruntime", trt_check=True), RecipeError, "trt"),
     ],
 )

@@ -16,7 +16,6 @@ Against = Annotated[
     Path | None, typer.Option(help="a plan or model: compare; float: no overrides")
 ]
 Output = Annotated[Path | None, typer.Option("-o", "--output", help="the plan as JSON")]
-Nodes = Annotated[bool, typer.Option("--nodes", help="a row a node that could be int8")]
 
 
 def plan(
@@ -28,10 +27,12 @@ def plan(
     module_map: given.ModuleMap = None,
     against: Against = None,
     output: Output = None,
-    nodes: Nodes = False,
     force: given.Force = False,
 ) -> None:
-    """Show which nodes become int8, which stay float, by which rule, and why."""
+    """Show which nodes become int8, which stay float, by which rule, and why.
+
+    With -v a row a node that could be int8.
+    """
     options = workflow.PlanOptions(scheme, rules, target, overrides, module_map, force)
     found = workflow.plan(model, output, against, options)
-    show(found, (*found.tables(), *found.details()) if nodes else None)
+    show(found)

@@ -32,7 +32,6 @@ def search(
     ranges: given.SavedRanges = None,
     module_map: given.ModuleMap = None,
     count: given.JudgedFrames = 4,
-    threads: given.Threads = 0,
     provider: given.Provider = "cpu",
     force: given.Force = False,
 ) -> None:
@@ -40,7 +39,7 @@ def search(
     options = workflow.SearchOptions(
         max_mb=max_mb, max_ms=max_ms, max_joules=max_joules, scheme=scheme, rules=rules,
         target=target, ranges=ranges, module_map=module_map, count=count,
-        threads=threads, force=force,
+        force=force,
         provider=provider_named(provider), adapter=adapter,
     )  # fmt: skip
     with listening() as listener:
