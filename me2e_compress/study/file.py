@@ -68,11 +68,9 @@ def load_study(
                 f"{path}: variant {each.name}: neither it nor the study names a policy"
             )
     # options of the caller take precedence, and need no trust
-    if provider is not None:
-        table.provider, libraries = provider, ()
-    else:
-        libraries = PROVIDERS.parse(table.provider).plugins
-    if not trust_code and (named := [*_code(table), *map(str, libraries)]):
+    theirs = not provider
+    table.provider = provider or table.provider
+    if not trust_code and (named := _code(table, their_provider=theirs)):
         raise StudyError(
             f"{path} runs code: {named[0]}; look at it first, then say --trust-code"
         )
@@ -162,11 +160,12 @@ def _complaint(error: ValidationError) -> str:
     return f"no key {where}; there are {', '.join(keys)}"
 
 
-def _code(table: _Study) -> list[str]:
+def _code(table: _Study, *, their_provider: bool) -> list[str]:
     """List the code that a study runs besides ours and installed packages'."""
     policies = [each.policy for each in table.variant if each.policy not in SHIPPED]
     made = [each for each in policies if isinstance(driver_named(each), PythonDriver)]
-    return [*made, *table.plugins]
+    libraries = PROVIDERS.parse(table.provider).plugins if their_provider else ()
+    return [*made, *table.plugins, *map(str, libraries)]
 
 
 class _Reader:

@@ -155,7 +155,6 @@ def _compressed(
     options = CompressOptions(
         force=True,  # what is in the workspace is its own affair
         module_map=variant.module_map,
-        seed=study.seed,
         provider=study.provider,
         measure_frames=0,
         allow_empty=True,
