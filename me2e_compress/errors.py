@@ -97,6 +97,10 @@ FORMER = {
         for name in ("control", "fusion", "beta-control", "beta-fusion")
     },
     "demo --stack": f"--stack {_NOW} python -m models.export",
+    **{
+        f"demo {option}": f"demo {option} {_NOW} compress, compare and a study"
+        for option in ("-r", "--recipe", "--routes", "--provider")
+    },
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""
 

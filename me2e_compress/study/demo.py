@@ -5,9 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.manager import recipe
 from me2e_compress.quantization.plan import plan_of
-from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
@@ -18,6 +16,7 @@ from me2e_compress.study.tables import differences, scoreboards
 from me2e_compress.study.verdict import before_and_after, road_verdict
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.study.write import StudyFiles, write_study
+from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.claims import check_ours
 from me2e_compress.workflows.compare import CompareResult, compare
@@ -31,7 +30,9 @@ from me2e_compress.workflows.result import Result, Table
 
 CALIBRATION_FRAMES, HELD_OUT_FRAMES = 64, 24
 LATENCY_SAMPLES = 100
-DRIVER, FLOAT = "highway", "float"
+DRIVER, FLOAT, RECIPE = "highway", "float", "full-fused"
+ROUTES = "5"
+"""What both drive: a number of routes, or their names."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -80,31 +81,21 @@ class DriverDemo:
 
     Attributes:
         out: The folder that everything is written to.
-        recipe_name: A shipped recipe, or a TOML file.
-        provider: What runs the graphs.
         force: Replace files that we did not write, too.
-        routes: Routes that both drive: a number or ``ID,ID``.
         workers: Number of concurrent routes.
 
     Raises:
-        RecipeError: There is no such recipe.
-        EvaluationError: There is no such route.
         GraphError: The output folder is a file, or a user's file would be overwritten.
     """
 
     out: Path
-    recipe_name: str = "full-fused"
-    provider: Provider = CPU
     force: bool = False
-    routes: str = "5"
     workers: int = 2
     _told: list[Section] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
-        """Check recipe, routes and outputs first: the work takes minutes."""
-        recipe.load(self.recipe_name)
+        """Check the outputs first: the work takes minutes."""
         check_folder(self.out, ())
-        pick_routes(load_routes(), self.routes)
         records = (beside(self._small, what) for what in ("report", "plan"))
         pages = (self.out / name for name in (JSON, MARKDOWN, HTML))
         check_ours(
@@ -143,7 +134,7 @@ class DriverDemo:
     def compare(self, listener: Listener) -> CompareResult:
         """Compare the compressed graph with the driver on other frames."""
         graphs = self._source, self._small
-        found = compare(*graphs, self._held_out, listener, provider=self.provider)
+        found = compare(*graphs, self._held_out, listener)
         self._told.append(Section("The outputs", found.tables()))
         return found
 
@@ -152,18 +143,17 @@ class DriverDemo:
         # a study of two variants under ideal conditions
         everything = load_routes()
         study = Study(
-            f"{DRIVER} before and after {self.recipe_name}",
+            f"{DRIVER} before and after {RECIPE}",
             (
                 Variant(FLOAT, str(self._source)),
-                Variant(self.recipe_name, str(self._small)),
+                Variant(RECIPE, str(self._small)),
             ),
             (Condition("ideal", "none"),),
             FLOAT,
-            pick_routes(everything, self.routes),
+            pick_routes(everything, ROUTES),
             len(everything),
             held_out=self._held_out,
             timing=Timing(LATENCY_SAMPLES),
-            provider=self.provider,
         )
         # run it, and write its report with the demo's own sections
         engine = LocalEngine(self.workers)
@@ -174,26 +164,23 @@ class DriverDemo:
             f"{self._small} is yours; {written.report} tells all of it.",
             *self._elsewhere(),
         )
-        return DriveResult(found, written, self.recipe_name, ending)
+        return DriveResult(found, written, RECIPE, ending)
 
     def _record(self, listener: Listener) -> None:
         """Record frames to calibrate on, and others to compare on, of the next seed."""
         folders = {self._frames: CALIBRATION_FRAMES, self._held_out: HELD_OUT_FRAMES}
         for seed, (folder, count) in enumerate(folders.items()):
-            asked = FramesOptions(count, seed, force=self.force, provider=self.provider)
+            asked = FramesOptions(count, seed, force=self.force)
             record_frames(self._source, folder, asked, listener)
 
     def _compressed(self, listener: Listener) -> CompressResult:
-        """Compress on the recorded frames, int8 in the form that the provider runs."""
-        passes = recipe.load(self.recipe_name)
-        quantizes = any(each.quantizes for each in passes)
+        """Compress on the recorded frames."""
         # fidelity is measured on frames of another seed, see `compare`
         options = CompressOptions(
-            target=self.provider.target if quantizes else None, measure_frames=0,
-            allow_empty=True, provider=self.provider, force=self.force,
-        )  # fmt: skip
+            target=DEFAULT_TARGET, measure_frames=0, allow_empty=True, force=self.force
+        )
         return compress(
-            self._source, self._small, passes, self._frames, options, listener
+            self._source, self._small, RECIPE, self._frames, options, listener
         )
 
     @property
@@ -202,7 +189,7 @@ class DriverDemo:
 
     @property
     def _small(self) -> Path:
-        return self.out / f"{DRIVER}.{self.recipe_name}.onnx"
+        return self.out / f"{DRIVER}.{RECIPE}.onnx"
 
     @property
     def _frames(self) -> Path:
@@ -228,19 +215,12 @@ class DriverDemo:
         return Section("Files", files=(*there, ("for programs", JSON)))
 
     def _words(self) -> tuple[str, ...]:
-        words = ("me2e-compress", "demo", "-o", str(self.out))
-        chosen = ["--routes", self.routes, "--recipe", self.recipe_name]
-        if self.provider != CPU:
-            chosen += ["--provider", PROVIDERS.text(self.provider)]
-        return (*words, *chosen)
+        return ("me2e-compress", "demo", "-o", str(self.out))
 
     def _elsewhere(self) -> tuple[str, ...]:
-        """Say how to compress for TensorRT if it does not run here."""
-        target = self.provider.target
-        if target == "tensorrt":
-            return ()
+        """Say how to compress for TensorRT."""
         return (
-            f"Its int8 is for {target}, which drives here. For TensorRT:",
-            f"  me2e-compress compress {DRIVER} -r {self.recipe_name} --target"
+            f"Its int8 is for {DEFAULT_TARGET}, which drives here. For TensorRT:",
+            f"  me2e-compress compress {DRIVER} -r {RECIPE} --target"
             f" tensorrt --frames {self._frames} -o {DRIVER}.trt.onnx",
         )

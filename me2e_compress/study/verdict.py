@@ -67,7 +67,7 @@ def _road(found: PairedDifference, outcome: StudyOutcome) -> str:
     limit = f"{routes} route{'s' * (routes > 1)} cannot show a difference below"
     said += f"; {limit} {found.smallest_shown:.0f} points"
     if routes < whole:
-        said += f", all {whole} (--routes all) none below {shown_by(whole):.1f}"
+        said += f", all {whole} none below {shown_by(whole):.1f}"
     return said
 
 

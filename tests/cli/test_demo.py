@@ -13,7 +13,7 @@ from tests.command import Cli
 from tests.stand_in import write_shipped
 from tests.study.conftest import Here
 
-DEMO = "demo --out out --routes ParkedObstacle_0 -r full"
+DEMO = "demo --out out"
 
 
 @pytest.fixture(autouse=True)
@@ -24,6 +24,8 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "CALIBRATION_FRAMES", 3)
     monkeypatch.setattr(demo, "HELD_OUT_FRAMES", 2)
     monkeypatch.setattr(demo, "LATENCY_SAMPLES", 5)
+    monkeypatch.setattr(demo, "ROUTES", "ParkedObstacle_0")
+    monkeypatch.setattr(demo, "RECIPE", "full")
     monkeypatch.setattr(demo, "LocalEngine", lambda workers: Here())
 
 
@@ -40,8 +42,7 @@ def test_the_demo_compresses_drives_and_reports(cli: Cli, tmp_path: Path) -> Non
     )
     assert "slow in onnxruntime's CPU" not in shown
     assert (
-        "1 route cannot show a difference below 25 points, all 220 (--routes all) n"
-        in shown
+        "1 route cannot show a difference below 25 points, all 220 none below" in shown
     )
     record = json.loads((out / "study.json").read_text())
     assert [each["name"] for each in record["schemes"]] == ["float", "full"]
@@ -67,7 +68,7 @@ def test_all_tables_are_shown_to_who_asks(cli: Cli) -> None:
     assert shown.count("Scoreboard") == 1
 
 
-@pytest.mark.parametrize("name", ["report.html", "highway.full-fused.onnx", "frames"])
+@pytest.mark.parametrize("name", ["report.html", "highway.full.onnx", "frames"])
 def test_what_is_there_is_refused_before_any_work(
     cli: Cli, tmp_path: Path, name: str
 ) -> None:

@@ -27,7 +27,6 @@ LINES = (
     "calibrate dense.onnx frames -o out.json",
     "compare dense.onnx dense.onnx frames",
     "compress dense.onnx -r full --frames frames -o s.onnx",
-    "demo -o out",
     "evaluate dense.onnx -o out.json",
     "frames dense.onnx -o out.json",
     "lint dense.onnx --target onnxruntime",

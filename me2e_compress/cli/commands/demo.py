@@ -10,23 +10,17 @@ from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, say, show
 from me2e_compress.cli.verbosity import is_json, is_verbose
 from me2e_compress.extras import need_extra
-from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows.demo_result import DemoResult, figure
 from me2e_compress.workflows.result import Result
 
 Output = Annotated[
     Path, typer.Option("-o", "--output", "--out", help="the folder to write")
 ]
-Recipe = Annotated[str, typer.Option("-r", "--recipe", "--scheme", help=given.RECIPE)]
-Routes = Annotated[str, typer.Option(help=given.ROUTES)]
 
 
 def demo(
     output: Output = Path("out"),
-    recipe: Recipe = "full-fused",
-    routes: Routes = "5",
     workers: given.Workers = 2,
-    provider: given.Provider = "cpu",
     force: given.Force = False,
 ) -> None:
     """Run the main job on what ships: compress, verify, compare, drive, report.
@@ -36,8 +30,7 @@ def demo(
     need_extra("highway", "driving in the demo")
     from me2e_compress.study.demo import DriverDemo
 
-    runs = provider_named(provider)
-    steps = DriverDemo(output, recipe, runs, force, routes, workers).steps
+    steps = DriverDemo(output, force, workers).steps
     # each step says what it found as soon as it is done
     output.mkdir(parents=True, exist_ok=True)
     found = dict[str, Result]()
