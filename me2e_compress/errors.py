@@ -101,6 +101,11 @@ FORMER = {
         f"demo {option}": f"demo {option} {_NOW} compress, compare and a study"
         for option in ("-r", "--recipe", "--routes", "--provider")
     },
+    "--road": "--road is gone since 0.3.0: there is one road, with traffic",
+    "study road": "the key road is gone since 0.3.0: there is one road, with traffic",
+    "study record.road": "the key road is gone since 0.3.0: there is one road",
+    "policy highway-2": f"highway-2 {_NOW} highway",
+    "model highway-2": f"highway-2 {_NOW} highway",
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""
 

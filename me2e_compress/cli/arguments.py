@@ -87,10 +87,6 @@ JudgedFrames = Annotated[
 ]
 ROUTES = "routes: all, a number, ID,ID"
 Routes = Annotated[str, typer.Option(help=f"{ROUTES}; or a file of routes")]
-Road = Annotated[
-    int | None,
-    typer.Option(help="1, or 2: traffic, signal plans, arrivals by chance"),
-]
 Budget = Annotated[
     float, typer.Option("--budget-ms", help="what a decision may take; 20 Hz: 50")
 ]

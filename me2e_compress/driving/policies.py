@@ -84,7 +84,6 @@ POLICIES: Registry[Driver] = Registry(
         "blind": f"{_HIGHWAY}:BlindDriver",
         "onnx": f"{_HIGHWAY}:OnnxDriver",
         "highway": f"{_SHIPPED}:ShippedDriver",
-        "highway-2": f"{_SHIPPED}:SecondRoadDriver",
         "python": "me2e_compress.driving.policies:PythonDriver",
     },
 )

@@ -14,7 +14,7 @@ from me2e_compress.shipped.model_files import write
 WEIGHTS = Path(__file__).with_name("weights")
 """One ``NAME.onnx``, ``NAME.json`` and ``NAME-frames`` per model."""
 
-SHIPPED = ("highway", "highway-2")
+SHIPPED = ("highway",)
 """Names of the models."""
 
 

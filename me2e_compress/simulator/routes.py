@@ -21,18 +21,16 @@ SHIPPED = Path(__file__).with_name("routes_220.json")
 """The routes that ship: 44 scenario types, 5 variants each."""
 
 
-ROADS = (1, 2)
-"""Generations of roads. On the first, actors wait for the ego and nobody else is about;
-on the second, arrivals and signals follow plans that are drawn before the route begins,
-and there is traffic on every road."""
-SETS = {1: SHIPPED, 2: SHIPPED.with_name("routes_2_220.json")}
-"""The set of each road that ships, as large."""
+GENERATION = {"road": 2}
+"""What every route says in a file, and what its digest counts. Those of the first road
+did not; its routes, drives and driver are in the history, at the tag ``road-1``."""
+FIRST_ROAD = "is of the first road, which is no more: tag road-1 of the repository"
+"""What is said of its routes and drives."""
 DIGEST = "set_sha256"
-"""Key of a set of the second road, in its first record: what its routes were when they
-were admitted."""
+"""Key of a set, in its first record: what its routes were when they were admitted."""
 VERSION, ROAD_VERSION = "road_version", 1
-"""What makes roads and traffic of a route of the second road, in the first record of a
-set and in the manifest of its drives: another version makes another route of it."""
+"""What makes roads and traffic of a route, in the first record of a set and in the
+manifest of its drives: another version makes another route of it."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,6 @@ class Route:
         seed: Decides every parameter that is not given.
         parameters: Values by name; what is given here is not drawn from the seed, so
             editing one changes that one and nothing else.
-        road: Which of `ROADS` it lies on.
     """
 
     id: str
@@ -54,14 +51,8 @@ class Route:
     ability: str
     seed: int
     parameters: dict[str, Parameter] = field(default_factory=dict)
-    road: int = 1
 
     def __post_init__(self) -> None:
-        if self.road not in ROADS:
-            raise EvaluationError(
-                f"route {self.id}: road {self.road}: there are"
-                f" {' and '.join(map(str, ROADS))}"
-            )
         if not is_route_id(self.id):
             raise EvaluationError(
                 f"route id {self.id!r}: only letters, digits, '_' and '-' are allowed"
@@ -84,18 +75,8 @@ class Route:
         return SCENARIO_ABILITIES[self.scenario]
 
     def record(self) -> dict[str, Any]:
-        """Return it as files and digests hold it: those of the first road name none."""
-        record = asdict(self)
-        if self.road == 1:
-            del record["road"]
-        return record
-
-
-def check_road(road: int) -> None:
-    """Raise EvaluationError if there is no such road."""
-    if road not in ROADS:
-        there = " and ".join(map(str, ROADS))
-        raise EvaluationError(f"--road {road}: there are {there}")
+        """Return it as files and digests hold it."""
+        return asdict(self) | GENERATION
 
 
 def is_route_id(text: str) -> bool:
@@ -109,38 +90,28 @@ _MANIFEST = TypeAdapter(list[Route])
 _FIRST = TypeAdapter(list[dict[str, Any]])
 
 
-def load_routes(path: Path = SHIPPED, road: int | None = None) -> tuple[Route, ...]:
-    """Read a manifest; with ``road``, only one of that road.
+def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
+    """Read a manifest.
 
     Raises:
         EvaluationError: The file is missing, not a manifest, or repeats an id; its
-            routes lie on several roads, or on another than was asked for; or it is of
-            the second road and was changed after it was made, or made by another
-            version of its generator.
+            routes are of the first road; or it was changed after it was made, or made
+            by another version of the generator.
     """
     with documents.reading(path, EvaluationError, "not routes"):
         content = documents.content(path)
         routes = _MANIFEST.validate_json(content, strict=True)
         records = _FIRST.validate_json(content)
-    # one road, and a set of the second one as it was admitted
-    roads = sorted({route.road for route in routes})
-    if len(roads) > 1:
-        first = next(route for route in routes if route.road != routes[0].road)
-        raise EvaluationError(
-            f"{path}: mixes roads: {first.id} lies on road {first.road},"
-            f" {routes[0].id} on road {routes[0].road}"
-        )
-    if road is not None and roads != [road]:
-        found = roads[0] if roads else "none"
-        raise EvaluationError(
-            f"{path}: its routes lie on road {found}; road {road} was asked for"
-        )
-    if roads == [2]:
+    # a set of this road, as it was admitted
+    for record in records:
+        if record.get("road") != GENERATION["road"]:
+            raise EvaluationError(f"{path}: route {record['id']} {FIRST_ROAD}")
+    if routes:
         check_version(path, records[0].get(VERSION))
-    if roads == [2] and records[0].get(DIGEST) != digest_of(routes):
+    if routes and records[0].get(DIGEST) != digest_of(routes):
         raise EvaluationError(
             f"{path}: was changed after its routes were admitted (its {DIGEST} does not"
-            " fit them); make a set with: me2e-compress routes --road 2"
+            " fit them); make a set with: me2e-compress routes"
         )
     # ids are unique
     seen: dict[str, int] = {}
@@ -154,14 +125,16 @@ def load_routes(path: Path = SHIPPED, road: int | None = None) -> tuple[Route, .
 
 
 def check_version(path: Path, version: object) -> None:
-    """Refuse what another version of the second road's generator made.
+    """Refuse what another version of the generator made, or the first road's.
 
     Raises:
         EvaluationError: It did.
     """
+    if version is None:
+        raise EvaluationError(f"{path}: {FIRST_ROAD}")
     if version != ROAD_VERSION:
         raise EvaluationError(
-            f"{path}: is of version {version} of the second road's generator; this is"
+            f"{path}: is of version {version} of the generator of routes; this is"
             f" version {ROAD_VERSION}, which makes other roads and traffic of it"
         )
 
@@ -175,9 +148,8 @@ def digest_of(routes: Sequence[Route]) -> str:
 def save_routes(routes: Sequence[Route], path: Path) -> None:
     """Write a manifest atomically, one route a line."""
     records = [route.record() for route in routes]
-    mark: dict[str, Any] = dict(IN_JSON)
-    if routes and routes[0].road == 2:
-        mark |= {VERSION: ROAD_VERSION, DIGEST: digest_of(routes)}
+    made = {VERSION: ROAD_VERSION, DIGEST: digest_of(routes)}
+    mark: dict[str, Any] = IN_JSON | made
     records[:1] = [mark | each for each in records[:1]]  # a list has no other place
     lines = ",\n".join(map(json.dumps, records))
     with drafts.written(path, EvaluationError):

@@ -63,7 +63,7 @@ CLEAR = Weather()
 
 
 DRAWN = ("clear",) * 8 + ("rain", "night", "fog", "dirt")
-"""Weather of the second road: a third of its routes have some."""
+"""Weather of routes: a third of them have some."""
 
 
 def drawn_weather(kind: str, strength: float, seed: int) -> Weather:

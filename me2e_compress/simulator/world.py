@@ -27,7 +27,6 @@ from me2e_compress.simulator.traffic.bodies import StaticObject, Walker
 from me2e_compress.simulator.traffic.cars import Car
 from me2e_compress.simulator.traffic.contacts import Contacts
 from me2e_compress.simulator.traffic.right_of_way import RightOfWay
-from me2e_compress.simulator.traffic.schedule import Schedule
 from me2e_compress.simulator.traffic.traffic_road import TrafficRoad
 
 DT_US = 50_000
@@ -58,7 +57,8 @@ class World:
         route: What to stage.
         dt_us: Frame length in microseconds. A finer one takes controls more often;
             actors still decide every 0.1 s.
-        builder: Sets the stage instead of the registered scenario type: for new types.
+        builder: Sets the stage, traffic included, instead of the registered scenario
+            type: for new types.
         drive_on: Go on after a collision, as CARLA does: both bodies stand, and neither
             moves farther into the other.
 
@@ -71,7 +71,7 @@ class World:
         reason: Why the world has ended; None before that.
         collided: Scenes of the ego's collisions, by time in microseconds.
         first_collision: When the ego first collided, and its two distances then.
-        weather: What the route says; a clear day on the first road.
+        weather: What the route says.
     """
 
     def __init__(
@@ -96,7 +96,8 @@ class World:
             tuple(stage.crosswalks),
         )
         # traffic, and the state of the checks
-        self._road = TrafficRoad(stage.network)
+        rules = RightOfWay(stage.network, stage.schedule.lines, stage.ego_lanes)
+        self._road = TrafficRoad(stage.network, rules)
         self._road.vehicles = [stage.ego]
         self.outside_m, self.outside_distance_m = 0.0, 0.0
         self.lateral_m, self._furthest_m = 0.0, 0.0
@@ -109,22 +110,18 @@ class World:
         self.first_collision: tuple[int, float, float] | None = None
         self._drive_on, self._contacts = drive_on, Contacts()
         self.weather = stage.weather
-        if stage.schedule is not None:
-            self._set_rules(stage.schedule)
+        self._set_signs(rules)
+        stage.schedule.show(0)
         self._take_stage()
         self._road.refresh()
 
-    def _set_rules(self, schedule: Schedule) -> None:
-        """Let lights and right of way decide, for others and at the ego's signs."""
-        stage = self._stage
-        rules = RightOfWay(stage.network, schedule.lines, stage.ego_lanes)
-        self._road.rules = rules
+    def _set_signs(self, rules: RightOfWay) -> None:
+        """Let right of way decide at the ego's signs."""
         meets = [begin for begin, _ in rules.priority_over_ego()]
-        for sign in stage.regulators:
+        for sign in self._stage.regulators:
             if sign.kind is SignalKind.GIVE_WAY and sign.line_s is not None:
                 sign.nearest_s = rules.soonest_s
                 sign.conflict_s = min(meets, default=math.inf)
-        schedule.show(0)
 
     @property
     def time_us(self) -> int:
@@ -190,9 +187,8 @@ class World:
         if stage.time_us >= self._next_decision_us:
             self._next_decision_us += DECISION_US
             stage.scripts = [s for s in stage.scripts if next(s, stage) is not stage]
-            if stage.schedule is not None:
-                here = [stage.ego, *stage.bodies, *stage.static_objects]
-                stage.bodies += stage.schedule.due(stage.time_us, here)
+            here = [stage.ego, *stage.bodies, *stage.static_objects]
+            stage.bodies += stage.schedule.due(stage.time_us, here)
             self._take_stage()
             self._road.ego_s = stage.ego_s
             self._road.act()
@@ -200,8 +196,7 @@ class World:
         self._contacts.before(stage.ego)
         self._road.step(self.dt_us / 1e6)
         stage.time_us += self.dt_us
-        if stage.schedule is not None:
-            stage.schedule.show(stage.time_us)
+        stage.schedule.show(stage.time_us)
         self._follow_route()
         self._check_lanes()
         self._check_signals()

@@ -120,7 +120,6 @@ class _Study(_Table):
     """Of the variants that name none."""
     evaluator: str = HIGHWAY
     routes: str | int | None = None
-    road: int | None = None
     seed: int = 0
     frames: str | None = None
     held_out: str | None = None
@@ -248,7 +247,7 @@ class _Reader:
     ) -> tuple[tuple[Route, ...], int]:
         if which is None and not is_highway(table.evaluator):
             return (), 0
-        return routes_named(which or "all", self.path.parent, table.road)
+        return routes_named(which or "all", self.path.parent)
 
     def _file(self, name: str | None) -> Path | None:
         return None if name is None else self._beside(name)

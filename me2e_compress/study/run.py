@@ -92,9 +92,7 @@ def _recorded(study: Study, workspace: Workspace, listener: Listener) -> Study:
         folder = workspace.folder / name
         if not (folder / "scenes.json").is_file():
             folder.parent.mkdir(parents=True, exist_ok=True)
-            options = FramesOptions(
-                count, seed, provider=study.provider, road=asked.road
-            )
+            options = FramesOptions(count, seed, provider=study.provider)
             record_frames(model, folder, options, listener)
         folders.append(folder)
     frames, held_out = folders

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from me2e_compress.errors import StudyError
-from me2e_compress.simulator.routes import check_road
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
 
@@ -68,20 +67,16 @@ class FramesToRecord:
         frames: Number of frames to calibrate on.
         held_out: Number of frames to measure fidelity and latency on, of the next seed.
         seed: Seed of the routes.
-        road: Generation of the road that they are recorded on.
 
     Raises:
         StudyError: There are none at all, or the seed is negative.
-        EvaluationError: There is no such road.
     """
 
     frames: int
     held_out: int
     seed: int = 0
-    road: int = 1
 
     def __post_init__(self) -> None:
-        check_road(self.road)
         if min(self.frames, self.held_out) < 1:
             raise StudyError(
                 f"record: {self.frames} frames and {self.held_out} held out: both must"

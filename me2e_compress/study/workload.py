@@ -27,9 +27,8 @@ FRAME_S, DECISION_S = 0.0024, 0.021
 """CPU seconds of a frame of the world, and of a decision: six pictures and one
 inference of the driver that ships on one core of a Xeon (two routes, at every frame
 and at every eighth)."""
-SECOND_ROAD_LONGER = 1.5
-"""Frames of a route there, by those of its type on the first road (608 and 411 with
-the expert; `benchmarks/bench_closed_loop.py`, parts slow-2 and slow)."""
+LONGER = 1.5
+"""Frames of a route, by those of its type in `EXPERT_S`, which knows no traffic."""
 ENOUGH = 20
 """Fewest logged routes from which the machine's speed is fitted."""
 
@@ -143,8 +142,7 @@ def _left(
 
 
 def _expected_s(route: Route) -> float:
-    longer = SECOND_ROAD_LONGER if route.road == 2 else 1.0
-    return EXPERT_S[route.scenario] * longer
+    return EXPERT_S[route.scenario] * LONGER
 
 
 def held_frames(study: Study, condition: Condition) -> int:

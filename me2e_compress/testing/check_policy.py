@@ -20,7 +20,7 @@ from me2e_compress.errors import VerificationError
 from me2e_compress.extras import need_extra
 from me2e_compress.testing.form import check_form
 
-ROUTE = "HighwayExit_0"
+ROUTE = "HighwayExit_R2_0"
 DECISIONS = 8
 
 Answers: TypeAlias = tuple[Trajectory | PedalsAndWheel, ...]

@@ -38,7 +38,8 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
     if str(text) in SHIPPED:
         return shipped(str(text))
     line = f"{text}: no such file; models that ship: {', '.join(SHIPPED)}"
-    raise GraphError(FORMER.get(f"stack {text}", line))
+    gone = FORMER.get(f"model {text}", FORMER.get(f"stack {text}", line))
+    raise GraphError(gone)
 
 
 def read_graph(

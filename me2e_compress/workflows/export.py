@@ -34,7 +34,7 @@ class ExportResult(Result):
 def export_stack(
     stack: str, output: str | Path, *, force: bool = False
 ) -> ExportResult:
-    """Write a copy of a trained model that ships: ``highway`` or ``highway-2``.
+    """Write a copy of a trained model that ships: ``highway``.
 
     The folder of the output is made if needed. ``force`` replaces a file that we did
     not write, too.

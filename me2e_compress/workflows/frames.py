@@ -21,7 +21,6 @@ from me2e_compress.extras import need_extra
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.simulator.routes import check_road
 from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
 from me2e_compress.workflows.claims import writing
@@ -47,7 +46,6 @@ class FramesOptions:
         log: recorded driving that they are made from; None lets the expert drive.
         adapter: TOML file that adapts an ONNX file to the policy contract, or the name
             of one that ships: the frames are in the model's own form.
-        road: generation of the road that the expert drives; None is 1.
     """
 
     count: int = 256
@@ -57,12 +55,9 @@ class FramesOptions:
     provider: Provider = CPU
     log: DriveLog | None = None
     adapter: Path | None = None
-    road: int | None = None
 
     def __post_init__(self) -> None:
         check_count("--seed", self.seed)
-        if self.road is not None:
-            check_road(self.road)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -119,9 +114,9 @@ def record_frames(
     Raises:
         GraphError: The file is missing or altered, or the folder is the input.
         FramesError: The count is below 1, the folder holds something else, the log
-            cannot feed the model, or a road is named that nobody would drive on.
-        EvaluationError: The file does not keep the policy contract, the adapter
-            adapts nothing, or there is no such road.
+            cannot feed the model.
+        EvaluationError: The file does not keep the policy contract, or the adapter
+            adapts nothing.
         ProviderError: The provider is not available.
         MissingExtraError: Driving needs the extra ``highway``.
     """
@@ -138,14 +133,11 @@ def _recorded(
 ) -> Path:
     pixels: Mapping[str, PixelInput] = {}
     about: dict[str, str | int] = {"stack": str(source), "seed": options.seed}
-    if options.road is not None and options.log:
-        raise FramesError(f"--road {options.road}: nobody drives for these frames")
     # frames come from a log, or from the expert's driving
     if options.log is not None:
         make, of, pixels = _logged(source, options.log, options)
         about = {"stack": str(source), "log": LOGS.text(options.log)}
     else:
-        about |= {"road": 2} if options.road == 2 else {}
         model = model_path(source)
         try_file(model, listener, options.provider)
         make, of = _driven(model, options), sha256_of(model)
@@ -199,5 +191,4 @@ def _driven(model: Path, options: FramesOptions) -> Source:
         scene_length=DRIVEN_SCENE_LENGTH if length is None else length,
         done=begin.frame,
         first=begin.place,
-        road=options.road or 1,
     )

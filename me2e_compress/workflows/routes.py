@@ -16,7 +16,6 @@ from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.simulator.routes import (
     ROAD_VERSION,
-    check_road,
     load_routes,
     pick_routes,
     save_routes,
@@ -42,8 +41,6 @@ class RoutesOptions:
         scenarios: ``all``, or ``NAME,NAME``.
         workers: scenario types at a time.
         force: replace outputs that we did not write, too.
-        road: 1, or 2: longer routes with traffic, whose arrivals and signals were drawn
-            before they begin.
     """
 
     seed: int = 0
@@ -51,11 +48,9 @@ class RoutesOptions:
     scenarios: str = "all"
     workers: int = 1
     force: bool = False
-    road: int = 1
 
     def __post_init__(self) -> None:
         check_count("--seed", self.seed)
-        check_road(self.road)
         for name in self.names:
             if name not in SCENARIO_ABILITIES:
                 there = ", ".join(sorted(SCENARIO_ABILITIES))
@@ -157,9 +152,7 @@ def _made(output: Path, options: RoutesOptions, listener: Listener) -> RoutesRes
     found = {one.scenario: one for one in begun}
     names = [name for name in options.names if name not in found]
     # keep and report each scenario type as soon as its routes are admitted
-    made = generate(
-        options.seed, names, options.variants, options.workers, options.road
-    )
+    made = generate(options.seed, names, options.variants, options.workers)
     for harvest in made:
         found[harvest.scenario] = harvest
         done = [dataclasses.asdict(one) for one in found.values()]
@@ -176,10 +169,9 @@ def _made(output: Path, options: RoutesOptions, listener: Listener) -> RoutesRes
 def _deciding(options: RoutesOptions) -> dict[str, object]:
     """Return what decides the routes of a type."""
     return {
-        "version": f"{__version__}, road {ROAD_VERSION}",
+        "version": f"{__version__}, road version {ROAD_VERSION}",
         "seed": options.seed,
         "variants": options.variants,
-        "road": options.road,
     }
 
 
@@ -260,17 +252,13 @@ def examine_routes(
     manifest: str | Path,
     pick: str = "all",
     listener: Listener = SILENT,
-    road: int | None = None,
 ) -> ExaminationResult:
-    """Examine a set of routes again; `pick` is ``all``, a number or ``ID,ID``.
-
-    With ``road``, a set of another road is refused.
-    """
+    """Examine a set of routes again; `pick` is ``all``, a number or ``ID,ID``."""
     need_extra("highway", "examining routes")
     from me2e_compress.evaluators.highway.generate import examine
 
     manifest, verdicts = Path(manifest), []
-    picked = pick_routes(load_routes(manifest, road), pick)
+    picked = pick_routes(load_routes(manifest), pick)
     for route in picked:
         verdicts.append(examine(route))
         listener.on_progress("examining", len(verdicts), len(picked), route.id)

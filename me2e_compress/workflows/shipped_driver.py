@@ -1,4 +1,4 @@
-"""The drivers that ship, as policies by their names."""
+"""The driver that ships, as a policy by its name."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -33,10 +33,3 @@ class ShippedDriver(Driver):
     def fingerprint(self) -> str:
         """Return the digest of the file: results under either name are the same."""
         return self.resolved().fingerprint()
-
-
-@dataclass(frozen=True)
-class SecondRoadDriver(ShippedDriver):
-    """The driver that comes with the package and was trained on the second road."""
-
-    name: ClassVar[str] = "highway-2"

@@ -121,7 +121,6 @@ class _CourseRun:
             scenarios=each.scenarios,
             expert_share=each.expert_share,
             student=None if student is None else sha256_of(student),
-            road=self.course.road,
         )
         on_done = self._progress(f"{label}: driving")
         collect(folder, what, student, self.workers, on_done)
@@ -146,7 +145,7 @@ class _CourseRun:
     def _evaluate(self, driver: Path, folder: Path, label: str) -> Scores:
         what, path = self.course.trial, self.folder / "trial.json"
         on_done = self._progress("finding routes for the trial")
-        routes = trial.routes_of(what, path, self.workers, on_done, self.course.road)
+        routes = trial.routes_of(what, path, self.workers, on_done)
         on_done = self._progress(f"{label}: driving the trial")
         return trial.drive(driver, routes, folder, self.workers, on_done, self.latency)
 

@@ -63,7 +63,6 @@ class Course:
         rounds: in order.
         trial: what the driver drives after every round, for the log.
         config: sizes of the model.
-        road: generation of the road that is driven.
 
     Raises:
         TrainingError: no driver for a round, a round without training, or a trial on
@@ -73,7 +72,6 @@ class Course:
     rounds: tuple[Round, ...]
     trial: Trial = field(default_factory=Trial)
     config: HighwayConfig = field(default_factory=HighwayConfig)
-    road: int = 1
 
     def __post_init__(self) -> None:
         """Check the rounds."""

@@ -1,6 +1,6 @@
 """Train the driver from nothing.
 
-    python -m models.driver.train -o FOLDER [--road 2] [--seed N] [--overlook SHARE]
+    python -m models.driver.train -o FOLDER [--seed N] [--overlook SHARE]
                            [--workers N] [--small]
 
 The same command again goes on where it was interrupted.
@@ -25,7 +25,6 @@ Small = Annotated[
     bool, typer.Option("--small", help="every part, a minute, learns nothing")
 ]
 
-Road = Annotated[int, typer.Option(help="the generation of the road: 1 or 2")]
 Seed = Annotated[int, typer.Option(help="of the first weights, not of the routes")]
 Overlook = Annotated[
     float | None,
@@ -41,7 +40,6 @@ def command(
     output: Output,
     workers: given.Workers = 4,
     small: Small = False,
-    road: Road = 1,
     seed: Seed = 0,
     overlook: Overlook = None,
     json: given.Json = False,
@@ -56,7 +54,6 @@ def command(
             workers,
             listener,
             small=small,
-            road=road,
             seed=seed,
             overlook=overlook,
         )

@@ -23,18 +23,17 @@ OnDone = Callable[[int, int], None]
 
 
 def routes_of(
-    what: Trial, path: Path, workers: int, on_done: OnDone, road: int = 1
+    what: Trial, path: Path, workers: int, on_done: OnDone
 ) -> tuple[Route, ...]:
     """Return the routes of a trial, from its file once they were found.
 
-    An interrupted search goes on where it was: on the second road it takes hours.
+    An interrupted search goes on where it was: it takes hours.
 
     Args:
         what: the trial.
         path: their manifest; written if it is not there.
         workers: processes.
         on_done: called with the types done and their total.
-        road: generation of their road.
 
     Raises:
         TrainingError: one of them is a route that ships: those are for evaluation.
@@ -43,11 +42,9 @@ def routes_of(
     if not path.exists():
         types = what.scenarios or tuple(SCENARIO_ABILITIES)
         variants = -(-what.routes // len(types))
-        options = RoutesOptions(
-            what.seed, variants, ",".join(types), workers, road=road
-        )
+        options = RoutesOptions(what.seed, variants, ",".join(types), workers)
         make_routes(path, options, Listener(lambda _, *told: on_done(*told[:2])))
-    found = load_routes(path, road)
+    found = load_routes(path)
     refuse_shipped("trial", what.seed, [(e.scenario, e.seed) for e in found])
     return pick_routes(found, str(what.routes))
 

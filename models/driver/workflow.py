@@ -4,7 +4,6 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.simulator.routes import check_road
 from me2e_compress.workflows.checks import check_count, check_folder
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.listener import SILENT, Listener
@@ -70,7 +69,6 @@ def train(
     listener: Listener = SILENT,
     *,
     small: bool = False,
-    road: int = 1,
     seed: int = 0,
     overlook: float | None = None,
 ) -> TrainResult:
@@ -81,7 +79,6 @@ def train(
         workers: processes.
         listener: is called with progress and warnings.
         small: go through every part in a minute, and learn nothing.
-        road: generation of the road that is driven.
         seed: of the first weights and of the samples' order, not of the routes.
         overlook: share of agents that the planner is not told of, see
             `models.driver.step.without_rivals`; None tells it all, but drops occupancy.
@@ -89,15 +86,13 @@ def train(
     Raises:
         TrainingError: the folder is of another course, the share is none, or a part
             failed.
-        EvaluationError: there is no such road.
         GraphError: the folder is a file.
     """
     output = Path(output)
     check_folder(output, ())
-    check_road(road)
     check_count("--seed", seed)
     course, latency = (SMALL, SMALL_LATENCY) if small else (FULL, FULL_LATENCY)
-    course = dataclasses.replace(course.seeded(seed), road=road)
+    course = course.seeded(seed)
     if overlook is not None:
         course = course.overlooking(overlook)
     with writing(folders=[output]):

@@ -1,7 +1,6 @@
 """``evaluate``, ``score``, ``profile`` and ``routes``: the closed loop."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -169,7 +168,7 @@ def test_a_fresh_set_is_made_admitted_and_reported(cli: Cli, tmp_path: Path) -> 
     assert report["admitted"] == 2
     assert report["tried"] == 2 + len(report["scenarios"][0]["refusals"])
     made = load_routes(tmp_path / "one.json")
-    assert [route.id for route in made] == [f"{STOP}_0", f"{STOP}_1"]
+    assert [route.id for route in made] == [f"{STOP}_R2_0", f"{STOP}_R2_1"]
 
 
 def test_a_set_is_put_through_the_gate_again(cli: Cli, tmp_path: Path) -> None:
@@ -179,33 +178,29 @@ def test_a_set_is_put_through_the_gate_again(cli: Cli, tmp_path: Path) -> None:
 
     assert "1 of 1 route admitted" in cli.done("routes --examine good.json").out
     said = cli.refused("routes --examine easy.json")
-    assert "test: the blind driver commits no infraction at 4 m/s" in said
+    assert "test: the blind driver commits no infraction at" in said
     found = cli.document("routes --examine easy.json", code=1)
     assert found["status"] == "refused"
     assert list(found["refused"]) == ["test"]
 
 
-def test_sets_of_the_wrong_road_are_one_line(cli: Cli, tmp_path: Path) -> None:
-    save_routes([route_of(STOP, 1)], tmp_path / "old.json")
-    new = replace(route_of(STOP, 1), road=2)
-    save_routes([new], tmp_path / "new.json")
+def test_what_is_of_the_first_road_is_one_line(cli: Cli, tmp_path: Path) -> None:
+    save_routes([route_of(STOP, 1)], tmp_path / "new.json")
     text = (tmp_path / "new.json").read_text()
     (tmp_path / "edited.json").write_text(text.replace('"seed": 1', '"seed": 2'))
+    (tmp_path / "old.json").write_text(text.replace(', "road": 2', ""))
 
     for line, words in (
-        ("routes --examine old.json --road 2", "lie on road 1; road 2 was asked for"),
-        ("routes --examine new.json --road 1", "lie on road 2; road 1 was asked for"),
-        ("routes -o x.json --road 3", "--road 3: there are 1 and 2"),
-        ("evaluate blind:8 -o out --road 3", "--road 3: there are 1 and 2"),
-        ("evaluate blind:8 -o out --routes old.json --road 2", "lie on road 1; road 2"),
+        ("routes --examine old.json", "route test is of the first road"),
+        ("evaluate blind:8 -o out --routes old.json", "route test is of the first"),
         ("evaluate blind:8 -o out --routes edited.json", "edited.json: was changed"),
     ):
         assert words in cli.refused(line)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_route_of_the_second_road_is_driven_on(cli: Cli, tmp_path: Path) -> None:
-    save_routes([replace(route_of(STOP, 1), road=2)], tmp_path / "new.json")
+def test_drives_of_another_road_are_refused(cli: Cli, tmp_path: Path) -> None:
+    save_routes([route_of(STOP, 1)], tmp_path / "new.json")
 
     report = cli.document("evaluate blind:12 -o out --routes new.json --drive-on")
 
@@ -214,7 +209,10 @@ def test_a_route_of_the_second_road_is_driven_on(cli: Cli, tmp_path: Path) -> No
     assert manifest["drive_on"] is True
     old = json.dumps(manifest | {"road_version": 0})
     (tmp_path / "out" / "evaluation.json").write_text(old)
-    assert "out: is of version 0 of the second road's" in cli.refused("score out")
+    assert "out: is of version 0 of the generator" in cli.refused("score out")
+    del manifest["road_version"]
+    (tmp_path / "out" / "evaluation.json").write_text(json.dumps(manifest))
+    assert "out: is of the first road, which is no more" in cli.refused("score out")
 
 
 def test_a_set_goes_on_where_it_was_killed(
@@ -222,7 +220,7 @@ def test_a_set_goes_on_where_it_was_killed(
 ) -> None:
     from me2e_compress.evaluators.highway import generate as room
 
-    asked = "routes -o set.json --seed 3 --variants 1 --road 2 --scenarios"
+    asked = "routes -o set.json --seed 3 --variants 1 --scenarios"
     admitted, made = room.admitted_routes, list[str]()
 
     def killed(scenario: str, **options: int) -> room.ScenarioRoutes:

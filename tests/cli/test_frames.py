@@ -84,8 +84,6 @@ def test_the_text_of_a_log_makes_it_again() -> None:
         ("m.onnx --from nuscenes:log", "nuscenes is gone since 0.3.0: use examples"),
         ("m.onnx --from bench2drive:log", "bench2drive is gone since 0.3.0: use"),
         ("nothing --from rides:log", "nothing: no such file; models that ship"),
-        ("m.onnx --from rides:log --road 2", "--road 2: nobody drives for these"),
-        ("highway --road 3", "--road 3: there are 1 and 2"),
     ],
 )
 def test_what_does_not_fit_is_one_line(cli: Cli, words: str, message: str) -> None:

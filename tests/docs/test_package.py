@@ -28,7 +28,7 @@ def test_the_project_says_who_and_for_whom() -> None:
 
 
 @pytest.mark.xdist_group("installed")
-def test_the_wheel_is_small_and_holds_what_ships(site: Path) -> None:
+def test_the_wheel_is_small_and_brings_the_driver(site: Path) -> None:
     weights = {file.name for file in (site / "me2e_compress/shipped/weights").iterdir()}
     forms = (".json", ".onnx", "-frames")
     assert weights == {f"{name}{form}" for name in SHIPPED for form in forms}

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.errors import StudyError
-from me2e_compress.simulator.routes import SETS, load_routes
 from me2e_compress.study import Condition, Study, run_study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
@@ -47,18 +46,6 @@ def test_the_blocks_of_a_study_can_be_chosen() -> None:
     assert [each.name for each in part.conditions] == ["ideal", "slow"]
     with pytest.raises(StudyError, match=r"^no block 4; there are table-2, table-3$"):
         ASKED.of_blocks(["4"])
-
-
-def test_a_route_of_the_second_road_is_expected_to_take_longer(tmp_path: Path) -> None:
-    there = load_routes(SETS[2])[:2]
-    here = tuple(replace(each, road=1) for each in there)
-
-    hours = [
-        workload(replace(ASKED, routes=routes), tmp_path).hours
-        for routes in (here, there)
-    ]
-
-    assert hours[1] == pytest.approx(1.5 * hours[0])
 
 
 def test_what_a_block_or_a_recording_cannot_be() -> None:

@@ -163,9 +163,9 @@ def test_the_provider_of_the_command_line_wins(models: Path) -> None:
 
 
 def test_routes_of_the_command_line_win(models: Path) -> None:
-    study = load_study(write(models, GOOD), routes="ParkedObstacle_0")
+    study = load_study(write(models, GOOD), routes="ParkedObstacle_R2_0")
 
-    assert [route.id for route in study.routes] == ["ParkedObstacle_0"]
+    assert [route.id for route in study.routes] == ["ParkedObstacle_R2_0"]
 
 
 @pytest.mark.parametrize(

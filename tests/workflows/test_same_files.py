@@ -112,11 +112,11 @@ CASES: dict[str, tuple[str, Call]] = {
         lambda: me2e.record_frames("highway", "made", me2e.FramesOptions(1, 3)),
     ),
     "evaluate": (
-        "evaluate blind -o results --routes ParkedObstacle_0 --latency fps:4",
+        "evaluate blind -o results --routes ParkedObstacle_R2_0 --latency fps:4",
         lambda: me2e.evaluate(
             "blind",
             "results",
-            me2e.EvaluateOptions(routes="ParkedObstacle_0", latency="fps:4"),
+            me2e.EvaluateOptions(routes="ParkedObstacle_R2_0", latency="fps:4"),
         ),
     ),
     "make_routes": (
@@ -168,7 +168,7 @@ def test_a_profile_is_silent_and_its_trace_may_be_charged(
 def test_results_that_are_there_are_scored_silently(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    asked = me2e.EvaluateOptions(routes="ParkedObstacle_0")
+    asked = me2e.EvaluateOptions(routes="ParkedObstacle_R2_0")
     driven = me2e.evaluate("blind", tmp_path / "results", asked)
 
     found = me2e.score(tmp_path / "results")

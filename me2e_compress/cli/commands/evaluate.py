@@ -40,7 +40,6 @@ def evaluate(
     output: Output = None,
     check: Check = False,
     routes: given.Routes = "all",
-    road: given.Road = None,
     latency: Latency = "none",
     seed: given.Seed = 0,
     workers: given.Workers = 1,
@@ -69,7 +68,7 @@ def evaluate(
         raise typer.BadParameter("driving needs -o RESULTS/", param_hint="-o")
     engine_name, address = given.engine_and_address(engine)
     options = workflow.EvaluateOptions(
-        routes=routes, road=road, latency=latency, seed=seed, workers=workers,
+        routes=routes, latency=latency, seed=seed, workers=workers,
         adapter=adapter, module_map=module_map, weather=weather, drive_on=drive_on,
         engine=engine_name, address=address, render=render, provider=runs, force=force,
         evaluator=evaluator,

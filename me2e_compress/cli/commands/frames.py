@@ -26,14 +26,13 @@ Log = Annotated[
 def frames(
     stack: Annotated[
         str,
-        typer.Argument(help="highway, highway-2, or M.onnx"),
+        typer.Argument(help="highway, or M.onnx"),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="the folder")],
     count: given.Count = 256,
     scene_length: Length = None,
     log: Log = None,
     adapter: given.Adapter = None,
-    road: given.Road = None,
     seed: given.Seed = 0,
     provider: given.Provider = "cpu",
     force: given.Force = False,
@@ -52,7 +51,6 @@ def frames(
         provider_named(provider),
         None if log is None else LOGS.parse(log),
         adapter,
-        road,
     )
     with listening() as listener:
         workflow.record_frames(stack, output, options, listener)

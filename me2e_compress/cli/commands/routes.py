@@ -30,7 +30,6 @@ def routes(
     ] = VARIANTS,
     scenarios: Scenarios = "all",
     workers: given.Workers = 1,
-    road: given.Road = None,
     examine: Examine = None,
     picked: Picked = "all",
     force: given.Force = False,
@@ -38,15 +37,13 @@ def routes(
     """Make a fresh set of admitted routes, or examine an existing set again."""
     if examine is not None:
         with listening() as listener:
-            examined = workflow.examine_routes(examine, picked, listener, road)
+            examined = workflow.examine_routes(examine, picked, listener)
         show(examined)
         examined.check()
         return
     if output is None:
         raise typer.BadParameter("a new set needs -o ROUTES.json", param_hint="-o")
-    options = workflow.RoutesOptions(
-        seed, variants, scenarios, workers, force, road or 1
-    )
+    options = workflow.RoutesOptions(seed, variants, scenarios, workers, force)
     with listening() as listener:
         made = workflow.make_routes(output, options, listener)
     show(made)

@@ -56,8 +56,8 @@ class ConditionOptions:
             control.
         dt_ms: time step of the simulation, in milliseconds; results at different steps
             are not compared.
-        weather: ``fog_m=80,night=0.5,dropped=BACK+FRONT``; empty is a clear day, or
-            what a route of the second road says.
+        weather: ``fog_m=80,night=0.5,dropped=BACK+FRONT``; empty is what each route
+            says.
         drive_on: go on after a collision, as Bench2Drive does; every collision then
             multiplies the score.
     """

@@ -16,7 +16,7 @@ from me2e_compress.evaluators.highway.observe import ObservationBuilder
 from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
-from me2e_compress.simulator.routes import SETS, Route, check_road, load_routes
+from me2e_compress.simulator.routes import Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import EXPERT_S
 from me2e_compress.simulator.world import World
 
@@ -34,24 +34,21 @@ def driven_frames(
     scene_length: int = 16,
     done: int = 0,
     first: int = 0,
-    road: int = 1,
 ) -> Iterator[Frame]:
     """Yield what a model sees on fresh routes, every half second.
 
-    A scene is a random stretch of one route of a road, driven by the expert without
-    latency, on the second road by what the cameras show; fewer frames than
-    ``scene_length`` if the route ends before. Its clock, its CAN bus and (since they
-    are left out) its recurrent inputs start anew. Scenario types alternate; none of the
-    routes is one of the 220 that ship. Frames are keyed by the graph's input names,
-    without the recurrent inputs; the policy defines image size, normalisation, names
-    and types.
+    A scene is a random stretch of one route, driven by the expert without latency by
+    what the cameras show; fewer frames than ``scene_length`` if the route ends before.
+    Its clock, its CAN bus and (since they are left out) its recurrent inputs start
+    anew. Scenario types alternate; none of the routes is one of the 220 that ship.
+    Frames are keyed by the graph's input names, without the recurrent inputs; the
+    policy defines image size, normalisation, names and types.
 
     To resume, ``done`` is the number of frames that exist, in whole scenes, and
     ``first`` the index of the route of the first missing scene.
 
     Raises:
         FramesError: A count is below 1, or the seed below 0.
-        EvaluationError: There is no such road.
     """
     if count < 1 or scene_length < 1:
         raise FramesError(
@@ -59,9 +56,8 @@ def driven_frames(
         )
     if seed < 0:
         raise FramesError(f"seed {seed}: must be 0 or more")
-    check_road(road)
     # one scene per route, from a random moment on
-    routes = islice(fresh_routes(seed, road), first, None)
+    routes = islice(fresh_routes(seed), first, None)
     for place, route in enumerate(routes, first):
         random = np.random.default_rng([SEED_OFFSET + seed, place])
         spare_us = EXPERT_S[route.scenario] * 1_000_000 - scene_length * STEP_US
@@ -75,19 +71,19 @@ def driven_frames(
             return
 
 
-def fresh_routes(seed: int, road: int = 1) -> Iterator[Route]:
+def fresh_routes(seed: int) -> Iterator[Route]:
     """Yield proposed routes endlessly, cycling through the types in random order.
 
-    The 220 of the road that ship are skipped; the admission gate is not applied.
+    The 220 that ship are skipped; the admission gate is not applied.
     """
-    judged = {(route.scenario, route.seed) for route in load_routes(SETS[road])}
+    judged = {(route.scenario, route.seed) for route in load_routes()}
     types = np.random.default_rng(SEED_OFFSET + seed).permutation(sorted(EXPERT_S))
     attempt = 0
     while True:
         for scenario in map(str, types):
             drawn = seed_of(SEED_OFFSET + seed, scenario, attempt)
             if (scenario, drawn) not in judged:
-                yield propose(scenario, drawn, f"{scenario}_{attempt}", road)
+                yield propose(scenario, drawn, f"{scenario}_{attempt}")
         attempt += 1
 
 
@@ -97,7 +93,7 @@ def _look(
     """Yield the model's feeds from a moment on, until enough or the route ends."""
     world, expert, rules = (
         World(route),
-        Expert(cameras_only=route.road == 2),
+        Expert(cameras_only=True),
         EndingRules(),
     )
     # the expert drives, the model looks on

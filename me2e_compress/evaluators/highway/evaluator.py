@@ -19,9 +19,7 @@ from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.simulator.routes import (
-    SETS,
     Route,
-    check_road,
     load_routes,
     pick_routes,
 )
@@ -123,7 +121,6 @@ class DrivingOptions(ConditionOptions):
 
     Attributes:
         routes: ``all``, a number, ``ID,ID`` or a file of routes.
-        road: 1 or 2: whose set ``routes`` are from, and where those of a file lie.
         latency: what a decision costs: ``none``, ``fps:F``, ``trace:FILE``,
             ``measured``.
         seed: seed of the draws from a trace.
@@ -135,7 +132,6 @@ class DrivingOptions(ConditionOptions):
     """
 
     routes: str = "all"
-    road: int | None = None
     latency: str = "none"
     seed: int = 0
     workers: int = 1
@@ -151,7 +147,7 @@ class DrivingOptions(ConditionOptions):
         Raises:
             EvaluationError: There is no such route, or no file of routes.
         """
-        return routes_named(self.routes, road=self.road)
+        return routes_named(self.routes)
 
     @functools.cached_property
     def source(self) -> LatencySource:
@@ -223,23 +219,18 @@ class HighwayEvaluation(DrivingOptions):
         return self.driven_by(driver, self.folder)
 
 
-def routes_named(
-    text: str, beside: Path = Path(), road: int | None = None
-) -> tuple[tuple[Route, ...], int]:
+def routes_named(text: str, beside: Path = Path()) -> tuple[tuple[Route, ...], int]:
     """Return the routes asked for, and the size of the set they are from.
 
-    A file of routes is looked up in the folder ``beside``. Without ``road``, a file may
-    be of any, and all else is of the first.
+    A file of routes is looked up in the folder ``beside``.
 
     Raises:
         EvaluationError: There is no such route, or no file of routes.
     """
     if text.endswith(".json"):
-        routes = load_routes(beside / text, road)
+        routes = load_routes(beside / text)
         return routes, len(routes)
-    if road is not None:
-        check_road(road)
-    shipped = load_routes(SETS[road or 1], road)
+    shipped = load_routes()
     return pick_routes(shipped, text), len(shipped)
 
 

@@ -1,14 +1,11 @@
 """Generate routes: proposed by scenario types, admitted by the gate.
 
-A route is admitted if the privileged expert solves it and the blind driver, who keeps
-one speed on the route's centre, commits an infraction at every one of
-`blind.SPEEDS_MPS`. Timing out, standing blocked and leaving the route do not count.
-
-On the second road whom the ego meets is a matter of chance: there the expert, who knows
-only what the cameras show, must solve the route twice within `MOST_S`, with its own
-traffic and with other, and the blind driver must fail at two of the three speeds. Both
-decide ten times a second there, and a drive ends with its first fault: that halves the
-time of an examination.
+Whom the ego meets is a matter of chance. A route is admitted if the expert, who knows
+only what the cameras show, solves it twice within `MOST_S`, with its own traffic and
+with other, and the blind driver, who keeps one speed on the route's centre, commits an
+infraction at two of the three `blind.SPEEDS_MPS`. Timing out, standing blocked and
+leaving the route do not count. Both decide ten times a second, and a drive ends with
+its first fault: that halves the time of an examination.
 """
 
 import zlib
@@ -65,20 +62,24 @@ class DryRun:
 
 
 MOST_S = 80.0
-"""On the second road nobody drives for longer; two cycles of a light."""
+"""Nobody drives for longer; two cycles of a light."""
 TEN_A_SECOND = Conditions(FixedLatency(100_000))
+MOST_BLIND = 1
+"""At how many speeds a blind driver may solve a route."""
+BLIND_MPS = (SPEEDS_MPS[2], SPEEDS_MPS[1], SPEEDS_MPS[0])
+"""The speeds of the blind drives, the ones that tell most first."""
 FAULTS = INFRACTIONS | {EventKind.ACTOR_COLLISION}
 
 
 def dry_run(route: Route, policy: Policy) -> DryRun:
-    """Drive a route once; on the first road with a decision at every frame."""
-    worlds, first = list[World](), route.road == 1
+    """Drive a route once."""
+    worlds = list[World]()
     episode = drive(
         route,
         policy,
-        Conditions() if first else TEN_A_SECOND,
+        TEN_A_SECOND,
         Listeners(on_query=worlds.append),
-        None if first else _decided,
+        _decided,
     )
     kinds = [event.kind for event in worlds[-1].events]
     faults = [found.kind for found in episode.infractions]
@@ -102,7 +103,7 @@ def _decided(world: World) -> bool:
 class Admission:
     """The gate's verdict on one route; without experts if blind drives solved it.
 
-    ``again`` is the expert's drive with other traffic, on the second road only.
+    ``again`` is the expert's drive with other traffic.
     """
 
     route: Route
@@ -114,12 +115,12 @@ class Admission:
     def refusal(self) -> str | None:
         """Why the route is not admitted, None if it is."""
         solved = list[float]()
-        for speed, attempt in zip(blind_speeds(self.route), self.blind, strict=False):
+        for speed, attempt in zip(BLIND_MPS, self.blind, strict=False):
             if not attempt.infractions:
                 solved.append(speed)
             if attempt.actors_crashed:
                 return f"two actors collide while the ego drives at {speed:g} m/s"
-            if len(solved) > most_blind(self.route):
+            if len(solved) > MOST_BLIND:
                 speeds = " and ".join(f"{each:g}" for each in sorted(solved))
                 return f"the blind driver commits no infraction at {speeds} m/s"
         if self.expert is None:
@@ -134,8 +135,6 @@ class Admission:
     @property
     def _met(self) -> bool:
         """Whether the event happened: to the expert, or by chance to anybody."""
-        if self.route.road == 1:
-            return self.expert is not None and self.expert.triggered
         drives = (self.expert, self.again, *self.blind)
         return any(each is not None and each.triggered for each in drives)
 
@@ -143,17 +142,6 @@ class Admission:
     def admitted(self) -> bool:
         """Whether the route may be used."""
         return self.refusal is None
-
-
-def most_blind(route: Route) -> int:
-    """Return at how many speeds a blind driver may solve a route."""
-    return 0 if route.road == 1 else 1
-
-
-def blind_speeds(route: Route) -> tuple[float, ...]:
-    """Return the speeds of the blind drives, the ones that tell most first."""
-    slow, usual, fast = SPEEDS_MPS
-    return SPEEDS_MPS if route.road == 1 else (fast, usual, slow)
 
 
 def _solves(drives: Sequence[DryRun]) -> int:
@@ -175,15 +163,13 @@ def _unsolved(drive: DryRun) -> str | None:
 def examine(route: Route) -> Admission:
     """Check one route; the cheap blind drives come first."""
     drives = list[DryRun]()
-    for speed in blind_speeds(route):
+    for speed in BLIND_MPS:
         drives.append(dry_run(route, Blind(speed)))
-        if drives[-1].actors_crashed or _solves(drives) > most_blind(route):
+        if drives[-1].actors_crashed or _solves(drives) > MOST_BLIND:
             return Admission(route, None, tuple(drives))
-        if len(drives) - _solves(drives) == len(SPEEDS_MPS) - most_blind(route):
+        if len(drives) - _solves(drives) == len(SPEEDS_MPS) - MOST_BLIND:
             break
     blind = tuple(drives)
-    if route.road == 1:
-        return Admission(route, dry_run(route, Expert()), blind)
     # with its own traffic and with other
     first = Admission(route, dry_run(route, Expert(cameras_only=True)), blind)
     if first.expert is not None and _unsolved(first.expert) is not None:
@@ -193,7 +179,7 @@ def examine(route: Route) -> Admission:
 
 
 def with_other_traffic(route: Route) -> Route:
-    """Return a route of the second road with other arrivals, all else the same."""
+    """Return a route with other arrivals, all else the same."""
     return replace(route, parameters={**route.parameters, TRAFFIC: OTHER_TRAFFIC})
 
 
@@ -219,13 +205,13 @@ class ScenarioRoutes:
         return len(self.routes) + len(self.refusals)
 
 
-def propose(scenario: str, seed: int, name: str, road: int = 1) -> Route:
+def propose(scenario: str, seed: int, name: str) -> Route:
     """Return a route of one of the 44 types, with every parameter written out."""
     known = SCENARIO_ABILITIES.get(scenario)
     if known is None:
         there = ", ".join(sorted(SCENARIO_ABILITIES))
         raise EvaluationError(f"no scenario {scenario!r}; there are {there}")
-    route = Route(name, scenario, known[0], seed, road=road)
+    route = Route(name, scenario, known[0], seed)
     return replace(route, parameters=dict(stage_of(route).parameters))
 
 
@@ -236,14 +222,14 @@ def seed_of(seed: int, scenario: str, attempt: int) -> int:
 
 
 def admitted_routes(
-    scenario: str, seed: int, variants: int = VARIANTS, road: int = 1
+    scenario: str, seed: int, variants: int = VARIANTS
 ) -> ScenarioRoutes:
     """Propose routes of a type until enough are admitted."""
     routes, refusals = list[Route](), list[str]()
     for attempt in range(MOST_TRIES * variants):
-        name = f"{scenario}_{'' if road == 1 else 'R2_'}{len(routes)}"
+        name = f"{scenario}_R2_{len(routes)}"
         drawn = seed_of(seed, scenario, attempt)
-        verdict = examine(propose(scenario, drawn, name, road))
+        verdict = examine(propose(scenario, drawn, name))
         if verdict.refusal is None:
             routes.append(verdict.route)
         else:
@@ -261,10 +247,9 @@ def generate(
     scenarios: Sequence[str] = tuple(SCENARIO_ABILITIES),
     variants: int = VARIANTS,
     workers: int = 1,
-    road: int = 1,
 ) -> Iterator[ScenarioRoutes]:
     """Generate routes of several types, in order, whatever the number of workers."""
-    of_type = partial(admitted_routes, seed=seed, variants=variants, road=road)
+    of_type = partial(admitted_routes, seed=seed, variants=variants)
     if workers == 1:
         yield from map(of_type, scenarios)
         return

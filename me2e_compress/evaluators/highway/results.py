@@ -39,10 +39,9 @@ LARGEST_SET = 1_000_000
 def fingerprint(job: Job, routes: Sequence[Route], set_size: int) -> dict[str, Any]:
     """Return everything that decides the bytes of the results."""
     more: dict[str, Any] = {"drive_on": True} if job.conditions.drive_on else {}
-    if routes and routes[0].road == 2:
-        more[VERSION] = ROAD_VERSION
     return {
         **more,
+        VERSION: ROAD_VERSION,
         "version": __version__,
         "policy": job.driver.fingerprint(),
         "latency": job.conditions.latency.to_json(),
@@ -200,12 +199,11 @@ def log_beside(folder: Path) -> Path:
 def _check_manifest(path: Path, made_by: object) -> None:
     """Check the parts that are read: routes, which are file names, and set size.
 
-    Drives of another version of the second road are compared with none of this one.
+    Drives of the first road, or of another version, are compared with none of this.
     """
     if not isinstance(made_by, dict) or not isinstance(made_by.get("routes"), list):
         raise EvaluationError(f"{path}: {MANIFEST} does not name its routes")
-    if VERSION in made_by:
-        check_version(path, made_by[VERSION])
+    check_version(path, made_by.get(VERSION))
     routes = made_by["routes"]
     for route in routes:
         if not isinstance(route, str) or not is_route_id(route):

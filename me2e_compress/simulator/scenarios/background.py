@@ -1,4 +1,4 @@
-"""Background of the second road: traffic on every lane, people beside it."""
+"""Background of a route: traffic on every lane, people beside it."""
 
 import math
 from collections.abc import Iterator
@@ -33,8 +33,6 @@ OFF_M, END_M = 0.5, 10
 def populate(stage: Stage) -> None:
     """Put traffic on every lane that no script uses, and people beside the roads."""
     network, schedule = stage.network, stage.schedule
-    if schedule is None:
-        return
     calm, fast = (
         stage.uniform("gap_s", *GAP_S),
         stage.uniform("fast_gap_s", *FAST_GAP_S),
@@ -48,7 +46,6 @@ def populate(stage: Stage) -> None:
             name = f"{entry[0]}>{entry[1]}:{entry[2]}"
             stream(stage, name, chains, Traffic(fast if quick else calm))
     _people(stage)
-    schedule.close()
 
 
 def entries(network: Network) -> list[LaneIndex]:

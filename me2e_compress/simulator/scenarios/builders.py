@@ -65,19 +65,15 @@ SIDE_ROAD = partial(GIVING_WAY, arms=("left", "back", "right"))
 
 BUILDERS: dict[str, Builder] = {
     # something stands or crawls in the lane: go round it
-    "Accident": scenario(multilane, obstacles.crashed_cars, obstacles.neighbours),
+    "Accident": scenario(multilane, obstacles.crashed_cars),
     "AccidentTwoWays": scenario(
         two_way, obstacles.crashed_cars, obstacles.oncoming_cars
     ),
-    "ConstructionObstacle": scenario(
-        multilane, obstacles.construction, obstacles.neighbours
-    ),
+    "ConstructionObstacle": scenario(multilane, obstacles.construction),
     "ConstructionObstacleTwoWays": scenario(
         two_way, obstacles.construction, obstacles.oncoming_cars
     ),
-    "HazardAtSideLane": scenario(
-        multilane, obstacles.slow_cyclists, obstacles.neighbours
-    ),
+    "HazardAtSideLane": scenario(multilane, obstacles.slow_cyclists),
     "HazardAtSideLaneTwoWays": scenario(
         two_way, obstacles.slow_cyclists, obstacles.oncoming_cars
     ),
@@ -176,12 +172,18 @@ BUILDERS: dict[str, Builder] = {
 def stage_of(route: Route, builder: Builder | None = None) -> Stage:
     """Set up a route: its roads, its actors and their scripts.
 
+    A ``builder`` of one's own brings its traffic, too.
+
     Raises:
         EvaluationError: A parameter of the route is wrong, or not one of its
             scenario's.
     """
     stage = Stage(route)
-    (builder or BUILDERS[route.scenario])(stage)
-    populate(stage)
+    if builder is None:
+        BUILDERS[route.scenario](stage)
+        populate(stage)
+    else:
+        builder(stage)
+    stage.schedule.close()
     stage.complete()
     return stage

@@ -1,4 +1,4 @@
-"""What is drawn before a route of the second road begins: arrivals and signals.
+"""What is drawn before a route begins: arrivals and signals.
 
 Nothing here looks at the ego, except that who would appear on top of somebody stays
 away.

@@ -26,7 +26,6 @@ class Regulator:
         nearest_s: For a give-way sign: seconds until the next vehicle with priority
             reaches the conflict, infinity if there is none.
         conflict_s: For a give-way sign: arc length of the conflict on the route.
-        tail_alone: Whether the tail alone decides that a red light is run.
     """
 
     id: int
@@ -37,11 +36,8 @@ class Regulator:
     width_m: float = LANE_WIDTH_M
     nearest_s: Callable[[], float] = field(default=lambda: float("inf"), repr=False)
     conflict_s: float = float("inf")
-    tail_alone: bool = False
     _conflict_passed: bool = False
-    _front_passed: bool = False
     _tail_passed: bool = False
-    _entered_on_red: bool = False
     _stopped: bool = False
 
     def snapshot(self) -> Signal:
@@ -57,11 +53,11 @@ class Regulator:
     def check(self, front_s: float, tail_s: float, speed: float) -> EventKind | None:
         """Return which rule the ego breaks now, between two arc lengths of its route.
 
-        A red light is run if both the front and the tail of the ego cross the line
-        on red. With ``tail_alone``, as in CARLA, the tail decides, which also blames a
-        car that entered too late on yellow. A stop sign is run if the ego did not come
-        to rest before it; a give-way sign if the front enters the conflict less than
-        `YIELD_GAP_S` before a vehicle with priority. Each is reported once.
+        A red light is run if the tail of the ego crosses the line on red, as in CARLA,
+        which also blames a car that entered too late on yellow. A stop sign is run if
+        the ego did not come to rest before it; a give-way sign if the front enters the
+        conflict less than `YIELD_GAP_S` before a vehicle with priority. Each is
+        reported once.
         """
         # give way
         if front_s >= self.conflict_s and not self._conflict_passed:
@@ -74,17 +70,13 @@ class Regulator:
         low, high = STOP_ZONE_M
         if low <= self.line_s - front_s <= high and speed < STOPPED_MPS:
             self._stopped = True
-        if front_s >= self.line_s and not self._front_passed:
-            self._front_passed = True
-            self._entered_on_red = self.state is SignalState.RED
         if tail_s < self.line_s:
             return None
         # judged once the tail is over the line
         self._tail_passed = True
         if self.kind is SignalKind.STOP_SIGN and not self._stopped:
             return EventKind.STOP_SIGN
-        ran = self._entered_on_red or self.tail_alone
-        if ran and self.state is SignalState.RED:
+        if self.state is SignalState.RED:
             return EventKind.RED_LIGHT
         return None
 

@@ -13,7 +13,6 @@ from me2e_compress.simulator.scene import (
     Event,
     EventKind,
     SignalKind,
-    SignalState,
 )
 from me2e_compress.simulator.traffic.bodies import (
     EgoVehicle,
@@ -31,18 +30,16 @@ from me2e_compress.simulator.traffic.network import (
 )
 from me2e_compress.simulator.traffic.schedule import Schedule
 from me2e_compress.simulator.traffic.signals import Regulator
-from me2e_compress.simulator.weather import CLEAR, DRAWN, drawn_weather
+from me2e_compress.simulator.weather import DRAWN, drawn_weather
 
 Script = Iterator[None]
 """One actor script: resumed at every decision, it yields until the next one."""
 GOAL_M = 150.0
-"""Length of a route; on the second road, without what is drawn before and after."""
+"""Length of a route without what is drawn before and after."""
 LEAD_M, AFTER_M = (25.0, 60.0), (25.0, 190.0)
-"""Metres of the second road before the places of a scenario, and after them."""
+"""Metres before the places of a scenario, and after them."""
 TRAFFIC = "traffic"
-"""The parameter that, with the seed, decides all arrivals of the second road."""
-SLOWEST_MPS = 1.0
-"""Below this speed, the ego's arrival is estimated with this speed."""
+"""The parameter that, with the seed, decides all arrivals."""
 
 
 class Stage(Draws):
@@ -51,8 +48,7 @@ class Stage(Draws):
     Layouts lay out the network and the route, scripts put actors on it; both do so
     before the first frame. Afterwards scripts are resumed at every decision.
 
-    On the second road there is a schedule: what the first road's scripts let depend on
-    the ego is drawn before the route begins, and routes are longer.
+    Arrivals, signal plans and weather are drawn before the route begins.
     """
 
     def __init__(self, route: Route) -> None:
@@ -72,26 +68,23 @@ class Stage(Draws):
         self._path: RoutePath | None = None
         self._ego: EgoVehicle | None = None
         self._next_id = 1
-        # the second road
+        # traffic and weather
         self.ego_lanes: list[tuple[LaneIndex, float]] = []
         self.clear: dict[LaneIndex, tuple[float, float]] = {}
         """Lanes into the map on which nobody begins between two stations."""
-        self.schedule: Schedule | None = None
+        self.schedule = Schedule()
         self.light_across_m = (0.0, 0.0)
         """Where people who cross at a light begin and end, metres left of the route."""
-        self.weather = CLEAR
-        self.goal_m = GOAL_M
-        if route.road == 2:
-            self.schedule = Schedule()
-            self.lead_m = self.uniform("lead_m", *LEAD_M)
-            low, high = AFTER_M
-            spread = self.uniform("after_share", 0.0, 1.0)
-            self.goal_m += self.lead_m + round(low + (high - low) * spread**4, 3)
-            self._traffic = self.integer(TRAFFIC, 0, 2**31 - 1)
-            kind, strength = self.choice("weather", DRAWN), 0.0
-            if kind != "clear":
-                strength = self.uniform("weather_strength", 0.2, 1.0)
-            self.weather = drawn_weather(kind, strength, route.seed % 2**31)
+        self.lead_m = self.uniform("lead_m", *LEAD_M)
+        low, high = AFTER_M
+        spread = self.uniform("after_share", 0.0, 1.0)
+        after_m = round(low + (high - low) * spread**4, 3)
+        self.goal_m = GOAL_M + (self.lead_m + after_m)
+        self._traffic = self.integer(TRAFFIC, 0, 2**31 - 1)
+        kind, strength = self.choice("weather", DRAWN), 0.0
+        if kind != "clear":
+            strength = self.uniform("weather_strength", 0.2, 1.0)
+        self.weather = drawn_weather(kind, strength, route.seed % 2**31)
 
     @property
     def path(self) -> RoutePath:
@@ -114,7 +107,7 @@ class Stage(Draws):
 
     @property
     def more_m(self) -> float:
-        """How much longer than the first road's the route is."""
+        """Metres of the route that are drawn, before and after the scenario."""
         return self.goal_m - GOAL_M
 
     def play(self, script: Script) -> None:
@@ -192,7 +185,6 @@ class Stage(Draws):
         self,
         kind: SignalKind,
         line: Pose,
-        state: SignalState | None = None,
         width_m: float = LANE_WIDTH_M,
     ) -> Regulator:
         """Put a light or a sign at a stop line, given by its middle and width."""
@@ -201,8 +193,7 @@ class Stage(Draws):
         on_route = abs(lateral) < width_m / 2 and way > 0.5
         number = len(self.regulators) + 1
         line_s = s if on_route else None
-        regulator = Regulator(number, kind, line, line_s, state, width_m=width_m)
-        regulator.tail_alone = self.schedule is not None
+        regulator = Regulator(number, kind, line, line_s, width_m=width_m)
         self.regulators.append(regulator)
         return regulator
 
@@ -225,11 +216,6 @@ class Stage(Draws):
         pose = car.pose
         s, _ = self.path.project(pose.x, pose.y)
         return float(s - self.ego_s - (self.ego.LENGTH + car.LENGTH) / 2)
-
-    def arrival_s(self, s_m: float) -> float:
-        """Return the seconds until the ego's front arrives at its present speed."""
-        left = self.ahead_m(s_m) - self.ego.LENGTH / 2
-        return float(left / max(self.ego.speed, SLOWEST_MPS))
 
     def fire(self, script: str, body: RoadObject | None = None) -> None:
         """Record that a script's event happens now."""

@@ -31,7 +31,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
     predicted one a crash, and says neither who nor what was hit.
     """
 
-    def __init__(self, network: Network) -> None:
+    def __init__(self, network: Network, rules: RightOfWay) -> None:
         super().__init__(network.graph, neighbour_vehicles_connected_lanes=True)
         self.table = LaneTable(network.graph)
         self._bodies = list[RoadObject]()
@@ -41,7 +41,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         self._half = list[float]()
         self._ego = list[bool]()
         self._lanes: dict[int, list[tuple[float, float, int]]] = {}
-        self.rules: RightOfWay | None = None
+        self.rules = rules
         self.ego_s = 0.0
 
     def refresh(self) -> None:
@@ -49,13 +49,11 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         self._bodies = [*self.vehicles, *self.objects]
         self._lanes = {}
         points = np.array([body.position for body in self._bodies])
-        if self.rules is not None:
-            points = self._with_crossers(points)
+        points = self._with_crossers(points)
         self._row = {id(body): i for i, body in enumerate(self.vehicles)}
         self._s, self._r = self.table.coordinates(points)
         self._half = [body.WIDTH / 2 for body in self._bodies]
-        if self.rules is not None:
-            self._turn_objects()
+        self._turn_objects()
         self._ego = [body.id == 0 for body in self._bodies]
 
     def _turn_objects(self) -> None:
@@ -118,11 +116,10 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
     def _leads(self, car: Car, aside_m: float) -> bool:
         """Return whether the ego drives in a lane in a car's direction, well inside.
 
-        On the second road even who does not mind the ego keeps the distance then.
+        Even who does not mind the ego keeps the distance then.
         """
         turn = math.remainder(self.vehicles[0].heading - car.heading, math.tau)
-        inside = abs(aside_m) < INSIDE_M and abs(turn) < ALONG_RAD
-        return self.rules is not None and inside
+        return abs(aside_m) < INSIDE_M and abs(turn) < ALONG_RAD
 
     def _on_lane(self, column: int) -> list[tuple[float, float, int]]:
         """Return (arc length, right offset, row) of the bodies along a lane."""
@@ -154,10 +151,8 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
     def ruled(self, car: Car, lane_s: float, wanted_mps2: float) -> float:
         """Return the acceleration that rules make of the one that a car wants.
 
-        The car may change lanes then. Without rules nothing changes.
+        The car may change lanes then.
         """
-        if self.rules is None:
-            return wanted_mps2
         stop_m = self.rules.stop_m(car, lane_s)
         if stop_m < math.inf:
             wanted_mps2 = min(wanted_mps2, car.idm_stop(stop_m))
@@ -166,9 +161,8 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
     def act(self) -> None:
         """Let every car decide on the same positions."""
         self.refresh()
-        if self.rules is not None:
-            cars = [body for body in self.vehicles if isinstance(body, Car)]
-            self.rules.refresh(cars, self.vehicles[0], self.ego_s)
+        cars = [body for body in self.vehicles if isinstance(body, Car)]
+        self.rules.refresh(cars, self.vehicles[0], self.ego_s)
         super().act()
 
     def step(self, dt: float) -> None:
@@ -193,7 +187,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         for i, j in zip(first, second, strict=True):
             people = [isinstance(each, Walker) for each in (bodies[i], bodies[j])]
             aside = all(people) or (any(people) and bodies[j] in self.objects)
-            if self.rules is not None and aside:
+            if aside:
                 continue  # people step aside for each other, and round things
             if overlap(bodies[i], bodies[j]):
                 pairs.append((bodies[i], bodies[j]))

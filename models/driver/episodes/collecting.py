@@ -160,7 +160,6 @@ def episode_of(
         student,
         what.every,
         CameraRig(*what.image_size),
-        cameras_only=what.road == 2,
     )
     route = task.route()
     episode = drive(route, recording, Conditions())

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from me2e_compress.evaluators.highway.generate import propose, seed_of
-from me2e_compress.simulator.routes import SETS, Route, load_routes
+from me2e_compress.simulator.routes import Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from models.driver.errors import TrainingError
 
@@ -27,8 +27,6 @@ class Collection:
             the others; 1 without a student.
         student: sha256 of the student's file, None without one.
         scenarios: The types; empty for all 44.
-        road: Generation of the road; on the second the expert knows what the cameras
-            show, and no more.
 
     Raises:
         TrainingError: A value is out of range.
@@ -42,7 +40,6 @@ class Collection:
     expert_share: float = 1.0
     student: str | None = None
     scenarios: tuple[str, ...] = ()
-    road: int = 1
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -77,17 +74,15 @@ class Task:
         scenario: Its type.
         seed: Of its parameters.
         name: Its id, and the name of its file.
-        road: Generation of the road.
     """
 
     scenario: str
     seed: int
     name: str
-    road: int = 1
 
     def route(self) -> Route:
         """Propose the route."""
-        return propose(self.scenario, self.seed, self.name, self.road)
+        return propose(self.scenario, self.seed, self.name)
 
 
 def tasks_of(what: Collection) -> tuple[Task, ...]:
@@ -97,7 +92,7 @@ def tasks_of(what: Collection) -> tuple[Task, ...]:
         TrainingError: One of them is a route that ships: those are for judging.
     """
     tasks = tuple(
-        Task(scenario, seed, f"{scenario}_{what.seed}_{variant:03d}", what.road)
+        Task(scenario, seed, f"{scenario}_{what.seed}_{variant:03d}")
         for variant in range(what.variants)
         for scenario in what.scenarios or SCENARIO_ABILITIES
         for seed in (seed_of(what.seed, scenario, variant),)
@@ -112,11 +107,7 @@ def refuse_shipped(what: str, seed: int, routes: Iterable[tuple[str, int]]) -> N
     Raises:
         TrainingError: one of them is such a route: those are for evaluation.
     """
-    shipped = {
-        (route.scenario, route.seed): route.id
-        for path in SETS.values()
-        for route in load_routes(path)
-    }
+    shipped = {(route.scenario, route.seed): route.id for route in load_routes()}
     for each in routes:
         if each in shipped:
             raise TrainingError(

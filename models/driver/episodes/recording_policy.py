@@ -193,7 +193,6 @@ class RecordingPolicy:
         student: Who drives in the others; None if the expert always does.
         every: Frames between two stored samples.
         rig: The student's cameras.
-        cameras_only: Whether the expert knows only what the cameras show.
 
     Attributes:
         frames: Of the present route.
@@ -206,7 +205,6 @@ class RecordingPolicy:
     student: Policy | None = None
     every: int = 1
     rig: CameraRig = field(default_factory=CameraRig)
-    cameras_only: bool = False
     needs_images: bool = field(default=False, init=False)
     privileged: bool = field(default=True, init=False)
     frames: list[LabelledFrame] = field(default_factory=list, init=False)
@@ -233,7 +231,7 @@ class RecordingPolicy:
         if self.world is None:
             self._begin(world)
         memory = self.frames[-1].decision.memory if self.frames else Memory()
-        shown = seen(scene) if self.cameras_only else scene
+        shown = seen(scene)
         known = world.privileged([actor.id for actor in shown.actors])
         decision = decide(shown, known, world.path, self.top, memory)
         self.frames.append(

@@ -19,7 +19,7 @@ import pytest
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.generate import seed_of
 from me2e_compress.graph import sha256_of
-from me2e_compress.simulator.routes import SETS, Route, load_routes
+from me2e_compress.simulator.routes import Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from models.driver.episodes import (
     Collection,
@@ -80,7 +80,7 @@ def test_a_file_a_route_and_what_they_are(folder: Path) -> None:
     assert told == {
         **{"format": 2, "seed": 3, "variants": 1, "every": 40, "noise": 1.0},
         **{"image_size": [16, 24], "expert_share": 1.0, "student": None},
-        **{"scenarios": [], "road": 1},
+        "scenarios": [],
     }
 
 
@@ -116,17 +116,14 @@ def test_no_route_for_evaluation_is_trained_on(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     judged = Route("judged", "T_Junction", "Traffic_Signs", seed_of(3, "T_Junction", 0))
-    monkeypatch.setattr(room, "load_routes", lambda path: (*load_routes(path), judged))
+    monkeypatch.setattr(room, "load_routes", lambda: (*load_routes(), judged))
 
     with pytest.raises(TrainingError, match="seed 3 gives route judged"):
         collect(tmp_path, WHAT, None, 1, nobody)
 
 
-@pytest.mark.parametrize("road", SETS)
-def test_the_shipped_routes_are_such_proposals(
-    monkeypatch: pytest.MonkeyPatch, road: int
-) -> None:
-    shipped = load_routes(SETS[road])[0]
+def test_the_shipped_routes_are_such_proposals(monkeypatch: pytest.MonkeyPatch) -> None:
+    shipped = load_routes()[0]
     monkeypatch.setattr(room, "seed_of", lambda *words: shipped.seed)
 
     with pytest.raises(TrainingError, match=f"gives route {shipped.id},"):

@@ -251,7 +251,7 @@ def test_every_route_is_its_own_noise(noisy: Arrays) -> None:
 
 
 def test_a_recorded_picture_shows_the_weather() -> None:
-    tasks = tasks_of(replace(CALM, scenarios=("HighwayExit",), variants=12, road=2))
+    tasks = tasks_of(replace(CALM, scenarios=("HighwayExit",), variants=12))
     dark = next(e for e in tasks if World(e.route()).weather.night > 0.5)
     policy = RecordingPolicy(seed=3)
     drive(dark.route(), policy, Conditions(), enough=lambda w: w.time_us >= 100_000)

@@ -23,21 +23,21 @@ class Gate:
         self.asked, self.dies_before = list[str](), dies_before
 
     def __call__(
-        self, seed: int, types: Sequence[str], variants: int, workers: int, road: int
+        self, seed: int, types: Sequence[str], variants: int, workers: int
     ) -> Iterator[ScenarioRoutes]:
         for name in types:
             if name == self.dies_before:
                 raise KeyboardInterrupt
             self.asked.append(name)
             routes = [
-                propose(name, seed + number, f"{name}_{number}", road)
+                propose(name, seed + number, f"{name}_{number}")
                 for number in range(variants)
             ]
             yield ScenarioRoutes(name, tuple(routes), ())
 
 
 def found(path: Path) -> tuple[Route, ...]:
-    return trial.routes_of(WHAT, path, 1, lambda done, total: None, road=2)
+    return trial.routes_of(WHAT, path, 1, lambda done, total: None)
 
 
 def test_a_search_that_was_killed_goes_on(
@@ -50,11 +50,7 @@ def test_a_search_that_was_killed_goes_on(
     monkeypatch.setattr(gate, "generate", second := Gate())
     routes = found(path)
     assert second.asked == [TYPES[1]]
-    assert [(each.scenario, each.road) for each in routes] == [
-        (TYPES[0], 2),
-        (TYPES[0], 2),
-        (TYPES[1], 2),
-    ]
+    assert [each.scenario for each in routes] == [TYPES[0], TYPES[0], TYPES[1]]
     monkeypatch.setattr(gate, "generate", None)  # nobody is asked again
     assert found(path) == routes
 

@@ -39,14 +39,12 @@ def test_what_ships_is_admitted(route: object) -> None:
     verdict = examine(next(one for one in SAMPLE if one is route))
 
     assert verdict.refusal is None
-    assert len(verdict.blind) == 3
+    assert len(verdict.blind) >= 2
 
 
 @pytest.mark.parametrize(
     ("expert", "blind", "words"),
     [
-        (None, (SOLVED,), "no infraction at 4 m/s"),
-        (None, (FAILED, FAILED, LATE), "no infraction at 12 m/s"),
         (FAILED, (FAILED,) * 3, "the expert commits: collisions_vehicle"),
         (LATE, (FAILED,) * 3, "ends after 75 s: blocked"),
         (BROKEN, (FAILED,) * 3, "ends after 1 s: ValueError: no"),
@@ -69,8 +67,7 @@ def test_an_empty_street_is_refused_at_once() -> None:
     verdict = examine(route)
 
     assert verdict.expert is None
-    assert len(verdict.blind) == 1
-    assert "no infraction at 4 m/s" in str(verdict.refusal)
+    assert "the blind driver commits no infraction at" in str(verdict.refusal)
 
 
 def test_a_proposal_writes_out_every_parameter() -> None:
@@ -90,7 +87,7 @@ def test_a_harvest_is_the_same_each_time_and_for_any_workers() -> None:
     once = [admitted_routes(name, 3, 1) for name in names]
 
     assert list(generate(3, names, 1, workers=2)) == once
-    assert once[0].routes[0].id == "DynamicObjectCrossing_0"
+    assert once[0].routes[0].id == "DynamicObjectCrossing_R2_0"
     assert once[0].tried == 1 + len(once[0].refusals)
 
 
@@ -99,10 +96,6 @@ def test_every_type_and_attempt_has_a_seed_of_its_own() -> None:
 
     assert len(seeds) == 4
     assert seed_of(1, "Accident", 0) not in seeds
-
-
-def second() -> Route:
-    return Route("test", "Accident", "Overtaking", 0, road=2)
 
 
 @pytest.mark.parametrize(
@@ -117,19 +110,19 @@ def second() -> Route:
         (None, (replace(FAILED, actors_crashed=True),), None, "two actors collide"),
     ],
 )
-def test_why_a_route_of_the_second_road_is_refused(
+def test_what_traffic_makes_of_a_verdict(
     expert: DryRun | None,
     blind: tuple[DryRun, ...],
     again: DryRun | None,
     words: str | None,
 ) -> None:
-    verdict = Admission(second(), expert, blind, again)
+    verdict = Admission(route_of(), expert, blind, again)
 
     assert verdict.admitted == (words is None)
     assert str(words) in str(verdict.refusal)
 
 
-def test_the_gate_of_the_second_road_drives_as_little_as_it_must(
+def test_the_gate_drives_as_little_as_it_must(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     driven = list[tuple[str, object]]()
@@ -142,15 +135,7 @@ def test_the_gate_of_the_second_road_drives_as_little_as_it_must(
 
     monkeypatch.setattr(room, "dry_run", drive)
 
-    assert "blind" in str(examine(second()).refusal)
-    assert "with other traffic" in str(examine(second()).refusal)
+    assert "blind" in str(examine(route_of()).refusal)
+    assert "with other traffic" in str(examine(route_of()).refusal)
     assert [name for name, _ in driven] == ["Blind"] * 5 + ["Expert"] * 2
     assert driven[-1][1] != driven[-2][1]
-
-
-@pytest.mark.slow
-def test_a_harvest_of_the_second_road_is_the_same_for_any_workers() -> None:
-    once = list(generate(3, ("Accident",), 1, road=2))
-
-    assert list(generate(3, ("Accident",), 1, workers=2, road=2)) == once
-    assert once[0].routes[0].road == 2

@@ -12,8 +12,6 @@ from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import replay
 from me2e_compress.simulator.cameras import CameraRig
-from me2e_compress.simulator.routes import ROADS, SETS, Route
-from me2e_compress.simulator.world import World
 from tests.evaluators.highway.drivers import straight_on
 from tests.stand_in import write_model
 
@@ -122,39 +120,28 @@ def test_the_types_take_turns() -> None:
     assert types[:44] == types[44:]
 
 
-@pytest.mark.parametrize("road", ROADS)
 def test_no_route_is_one_that_drivers_are_judged_on(
-    monkeypatch: pytest.MonkeyPatch, road: int
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A route that the road's set has is passed over."""
-    first, second = itertools.islice(fresh_routes(0, road), 2)
-    sets = {SETS[road]: (first,)}
-    monkeypatch.setattr(room, "load_routes", lambda path: sets[path])
+    """A route that the set has is passed over."""
+    first, second = itertools.islice(fresh_routes(0), 2)
+    monkeypatch.setattr(room, "load_routes", lambda: (first,))
 
-    assert next(fresh_routes(0, road)) == second
+    assert next(fresh_routes(0)) == second
 
 
-@pytest.mark.parametrize("road", ROADS)
-def test_a_recording_keeps_to_its_road(
-    policy: OnnxPolicy, monkeypatch: pytest.MonkeyPatch, road: int
+def test_the_expert_drives_by_what_the_cameras_show(
+    policy: OnnxPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On the second the expert drives by what the cameras show."""
-    driven = list[Route]()
     experts = list[bool]()
-
-    def world(route: Route) -> World:
-        driven.append(route)
-        return World(route)
 
     def expert(*, cameras_only: bool) -> Expert:
         experts.append(cameras_only)
         return Expert(cameras_only=cameras_only)
 
-    monkeypatch.setattr(room, "World", world)
     monkeypatch.setattr(room, "Expert", expert)
-    assert len(list(driven_frames(policy, 2, seed=0, scene_length=1, road=road))) == 2
-    assert {route.road for route in driven} == {road}
-    assert set(experts) == {road == 2}
+    assert len(list(driven_frames(policy, 2, seed=0, scene_length=1))) == 2
+    assert set(experts) == {True}
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ def test_the_shipped_driver_passes_a_parked_car() -> None:
 
     So says benchmarks/driver/baselines/routes.csv.
     """
-    (route,) = pick_routes(load_routes(), "ParkedObstacle_0")
+    (route,) = pick_routes(load_routes(), "ParkedObstacle_R2_0")
     policy = OnnxDriver(shipped("highway")).open()
 
     episode = drive(route, policy, Conditions(image_size=image_size_of(policy)))

@@ -16,6 +16,7 @@ from me2e_compress.simulator.traffic.bodies import (
 )
 from me2e_compress.simulator.traffic.cars import Behaviour, Car
 from me2e_compress.simulator.traffic.network import Network, Pose, Section
+from me2e_compress.simulator.traffic.right_of_way import RightOfWay
 from me2e_compress.simulator.traffic.traffic_road import TrafficRoad, overlap
 
 
@@ -65,10 +66,14 @@ def test_tyres_hold_no_more_than_their_grip(speed: float, wheel: float) -> None:
     assert abs(ego.lateral_acceleration_mps2) <= DRY_GRIP_MPS2 * 1.001
 
 
+def road_on(network: Network) -> TrafficRoad:
+    return TrafficRoad(network, RightOfWay(network, {}, []))
+
+
 def one_lane(length: float = 300.0) -> tuple[Network, TrafficRoad]:
     network = Network()
     network.straight("a", "b", Pose(0.0, 0.0, 0.0), length, Section(limit_mps=20.0))
-    return network, TrafficRoad(network)
+    return network, road_on(network)
 
 
 def put(road: TrafficRoad, *cars: Car | StaticObject) -> None:
@@ -108,7 +113,7 @@ def test_a_car_stops_behind_what_stands_around_the_corner() -> None:
     pose = network.straight("a", "b", Pose(0.0, 0.0, 0.0), 40.0, Section())
     pose = network.arc("b", "c", pose, 15.0, math.pi / 2, Section())
     network.straight("c", "d", pose, 60.0, Section())
-    road = TrafficRoad(network)
+    road = road_on(network)
     car = Car(1, network, [("a", "b", 0), ("b", "c", 0), ("c", "d", 0)], 5.0, 8.0)
     parked = StaticObject(2, ActorKind.PARKED, network.pose(("c", "d", 0), 8.0))
     put(road, car, parked)
@@ -125,7 +130,7 @@ def test_a_car_keeps_to_its_lane_through_a_bend() -> None:
     pose = network.straight("a", "b", Pose(0.0, 0.0, 1.0), 30.0, Section())
     pose = network.arc("b", "c", pose, 12.0, -math.pi / 2, Section())
     network.straight("c", "d", pose, 60.0, Section())
-    road = TrafficRoad(network)
+    road = road_on(network)
     car = Car(1, network, [("a", "b", 0), ("b", "c", 0), ("c", "d", 0)], 5.0, 8.0)
     put(road, car)
 

@@ -36,12 +36,12 @@ def test_only_red_is_run(state: SignalState, found: list[EventKind]) -> None:
     assert drive(regulator(SignalKind.TRAFFIC_LIGHT, state)) == found
 
 
-def test_who_enters_on_yellow_may_clear_the_line_on_red() -> None:
+def test_the_tail_alone_decides_as_in_carla() -> None:
     light = regulator(SignalKind.TRAFFIC_LIGHT, SignalState.YELLOW)
     drive(light, 40.0, 48.0)
     light.state = SignalState.RED
 
-    assert drive(light, 48.0, 60.0) == []
+    assert drive(light, 48.0, 60.0) == [EventKind.RED_LIGHT]
 
 
 def test_who_waits_with_the_nose_over_the_line_may_go_on_green() -> None:

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.episode import Ending
-from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.simulator.plane_geometry import resample
 from me2e_compress.simulator.scenarios.layouts.streets import two_way
 from me2e_compress.simulator.scene import ActorKind, Control, EventKind
@@ -16,7 +14,6 @@ from me2e_compress.simulator.traffic.stage import Script, Stage
 from me2e_compress.simulator.world import EndReason, World
 from tests.simulator.world.driving import (
     coast,
-    drive_blind,
     empty_road,
     route_of,
     trace,
@@ -113,7 +110,7 @@ def test_the_goal_ends_a_route() -> None:
     coast(world, 600, Control(1.0, 0.0))
 
     assert world.reason is EndReason.GOAL
-    assert world.progress_m == world.path.goal_m == 150.0
+    assert world.progress_m == world.path.goal_m > 200.0
     with pytest.raises(EvaluationError, match="has ended: goal"):
         world.step(Control(0.0, 0.0))
 
@@ -230,7 +227,7 @@ def test_phases_are_those_on_the_route() -> None:
 
     assert len(world.scene().signals) == 4
     assert phase.state == "red"
-    assert 40 < phase.line_s < 80
+    assert 70 < phase.line_s < 130
 
 
 def test_a_slick_patch_takes_grip_away() -> None:
@@ -249,7 +246,8 @@ def test_a_slick_patch_takes_grip_away() -> None:
 
 
 def test_running_a_red_light_does_not_end_a_route() -> None:
-    drive = drive_blind(route_of("VanillaSignalizedTurnEncounterRedLight", 1), 8.0)
+    world = World(route_of(offset_s=10.0), builder=empty_road)
+    coast(world, 900)
 
-    assert drive.infractions == (InfractionKind.RED_LIGHT,)
-    assert drive.ending is Ending.COMPLETED
+    assert [event.kind for event in world.events] == [EventKind.RED_LIGHT]
+    assert world.reason is EndReason.GOAL

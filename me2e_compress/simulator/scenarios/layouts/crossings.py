@@ -92,9 +92,9 @@ def junction(
     """Lay a junction; ``sign`` stands on the ego's arm.
 
     The ego's move is drawn if there are several ``moves``. Without a sign, traffic from
-    its sides gives way. On the second road there may be ``lights``.
+    its sides gives way. With ``lights`` it has these instead.
     """
-    if lights and stage.schedule is not None:
+    if lights:
         return signal_junction(stage, moves, None)
     move = moves[0] if len(moves) == 1 else stage.choice("move", moves)
     minor = ("left", "right") if sign is None else ("back", "ahead")
@@ -111,22 +111,16 @@ def signal_junction(
     moves: Sequence[str],
     ego_light: SignalState | None = SignalState.GREEN,
 ) -> Crossing:
-    """Lay a junction with lights; cross traffic has red where the ego has green.
+    """Lay a junction with lights that follow a plan.
 
-    On the second road a plan decides, and ``ego_light`` is what a driver of
-    `USUAL_MPS` finds; None for any.
+    ``ego_light`` is what a driver of `USUAL_MPS` finds; None for any.
     """
     move = moves[0] if len(moves) == 1 else stage.choice("move", moves)
     crossing = _crossing(stage, move, ARMS, 1, 13.0, ())
-    green = ego_light is SignalState.GREEN
-    cross = SignalState.RED if green else SignalState.GREEN
     for arm in ARMS:
-        state = ego_light if arm in ("back", "ahead") else cross
-        crossing.signals[arm] = stage.regulate(
-            SignalKind.TRAFFIC_LIGHT, _stop_line(crossing, arm), state
-        )
-    if stage.schedule is not None:
-        _planned(stage, crossing, ego_light)
+        line = _stop_line(crossing, arm)
+        crossing.signals[arm] = stage.regulate(SignalKind.TRAFFIC_LIGHT, line)
+    _planned(stage, crossing, ego_light)
     return crossing
 
 
@@ -140,8 +134,6 @@ FOUND_S = {SignalState.GREEN: (1.0, 6.0), SignalState.RED: (-9.0, -3.0)}
 def _planned(stage: Stage, crossing: Crossing, found: SignalState | None) -> None:
     """Draw the plan of a junction's lights."""
     lights, schedule = crossing.signals, stage.schedule
-    if schedule is None:
-        return
     green = (stage.uniform("green_s", *GREEN_S), stage.uniform("cross_s", *GREEN_S))
     groups = (lights["back"], lights["ahead"]), (lights["left"], lights["right"])
     plan = SignalPlan(groups, green, 0.0)

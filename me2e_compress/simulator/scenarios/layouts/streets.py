@@ -96,15 +96,10 @@ def parking_bay(stage: Stage) -> Street:
 
 
 def zebra_street(stage: Stage) -> Street:
-    """Lay a two-way street with a marked crosswalk; see `Stage.crosswalks`."""
+    """Lay a two-way street with a crosswalk, and lights at it."""
     street = _street(stage, Section(limit_mps=13.0), 0.6, oncoming=1)
     s = stage.place("crosswalk_m", 55.0, 80.0)
-    if stage.schedule is not None:
-        return with_light(stage, street, 0.6, s)
-    left, right = 1.5 * LANE_WIDTH_M, -0.5 * LANE_WIDTH_M
-    places = ((-2.0, left), (2.0, left), (2.0, right), (-2.0, right))
-    stage.add_crosswalk([stage.route_pose(s + along, at) for along, at in places])
-    return street
+    return with_light(stage, street, 0.6, s)
 
 
 GREEN_S, WALK_S = (14.0, 24.0), 8.0
@@ -116,12 +111,10 @@ LIGHT_M = 125.0
 def with_light(
     stage: Stage, street: Street, shoulder_m: float, s_m: float | None = None
 ) -> Street:
-    """Put a light for people on foot at a straight road, on the second road only.
+    """Put a light for people on foot at a straight road.
 
     It is near the goal unless ``s_m`` says where.
     """
-    if stage.schedule is None:
-        return street
     at = s_m or stage.uniform("light_m", stage.lead_m + LIGHT_M, stage.goal_m - 18.0)
     stage.parameters.setdefault("light_m", at)
     # the crosswalk, and where people begin and end

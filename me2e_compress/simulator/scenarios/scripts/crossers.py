@@ -24,7 +24,7 @@ def walker_behind_van(stage: Stage, _: Street) -> Script:
     van = stage.route_pose(s - 5.0, -(HALF_LANE_M + 1.1))
     stage.static_object(ActorKind.VAN, van)
     walker = _across_route(stage, s, speed, -(HALF_LANE_M + 2.2), 6.5)
-    yield from steps_out(stage, walker, s, HALF_LANE_M + 2.2)
+    yield from steps_out(stage, walker, s)
     stage.fire("walker_behind_van", walker)
 
 
@@ -36,28 +36,14 @@ def walker_between_cars(stage: Stage, _: Street) -> Script:
         pose = stage.route_pose(s + aside, -(HALF_LANE_M + 1.3))
         stage.static_object(ActorKind.PARKED, pose)
     walker = _across_route(stage, s, speed, -(HALF_LANE_M + 2.4), 7.0)
-    yield from steps_out(stage, walker, s, HALF_LANE_M + 2.4)
+    yield from steps_out(stage, walker, s)
     stage.fire("walker_between_cars", walker)
 
 
 def walkers_on_zebra(stage: Stage, _: Street) -> Script:
-    """Send two to four people over the crosswalk from both sides."""
+    """Let people cross at the light, from both sides."""
     s = float(stage.parameters["crosswalk_m"])
-    if stage.schedule is not None:
-        yield from encounter(stage, walkers_at_light(stage), s, "walkers_on_zebra")
-        return
-    count = stage.integer("walkers", 2, 4)
-    walkers = list[Walker]()
-    for k in range(count):
-        speed = stage.uniform(f"walk_{k}_mps", 1.2, 1.7)
-        near = k % 2 == 0
-        start = -(HALF_LANE_M + 1.6) if near else HALF_LANE_M + LANE_WIDTH_M + 1.2
-        end = HALF_LANE_M + LANE_WIDTH_M + 2.0 if near else -(HALF_LANE_M + 2.0)
-        walkers.append(_across_route(stage, s + 0.7 * (k - 1), speed, start, end))
-    yield from steps_out(stage, walkers[0], s, HALF_LANE_M + 1.6)
-    for walker in walkers:
-        walker.going = True
-    stage.fire("walkers_on_zebra", walkers[0])
+    yield from encounter(stage, walkers_at_light(stage), s, "walkers_on_zebra")
 
 
 WALKERS_A_CYCLE = 2.0
@@ -70,8 +56,6 @@ def walkers_at_light(stage: Stage) -> list[Walker]:
     """Draw people who cross while a light holds back the traffic."""
     random, schedule = stage.random("at_light"), stage.schedule
     s, found = float(stage.parameters["light_m"]), list[Walker]()
-    if schedule is None:
-        return found
     plan, across = schedule.plans[-1], stage.light_across_m
     start = plan.begins_s(1)
     while start < HORIZON_S:
@@ -118,12 +102,10 @@ def bicycle_stream(stage: Stage, crossing: Crossing) -> Script:
 class Row:
     """People behind each other, the first one first.
 
-    ``reach_m`` is how far each walks to the middle of the ego's lane, ``route_s`` the
-    arc length of that place on the route.
+    ``route_s`` is the arc length of the route where they cross it.
     """
 
     people: list[Walker]
-    reach_m: list[float]
     route_s: float
 
 
@@ -141,7 +123,7 @@ def _row(
     out_m = 2.0 if kind is ActorKind.PEDESTRIAN else 3.0
     target = crossing.arm(crossing.move, out_m, -HALF_LANE_M)
     s, _ = stage.path.project(target.x, target.y)
-    row = Row([], [], s)
+    row = Row([], s)
     for k in range(count):
         start = start_m + spacing_m * k
         end = LANE_WIDTH_M + 3.0 + spacing_m * (count - k)
@@ -149,14 +131,13 @@ def _row(
         stop = crossing.arm(crossing.move, out_m, -side * end)
         line = np.array([[begin.x, begin.y], [stop.x, stop.y]])
         row.people.append(stage.walker(kind, line, speed))
-        row.reach_m.append(start + side * HALF_LANE_M)
     return row
 
 
 def _set_off(stage: Stage, row: Row, name: str) -> Script:
-    """Send a row off so that the second of them meets the ego."""
+    """Send a row off; the second of them counts."""
     who = row.people[1]
-    yield from steps_out(stage, who, row.route_s, row.reach_m[1])
+    yield from steps_out(stage, who, row.route_s)
     for walker in row.people:
         walker.going = True
     stage.fire(name, who)

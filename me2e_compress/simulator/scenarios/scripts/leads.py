@@ -12,10 +12,8 @@ from me2e_compress.simulator.scenarios.scripts.streams import (
     stream,
 )
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
-    approach,
     hold,
     keep_clear,
-    patience,
     release,
     stand,
 )
@@ -28,36 +26,18 @@ from me2e_compress.simulator.traffic.network import (
 )
 from me2e_compress.simulator.traffic.stage import Script, Stage
 
-CRAWL_S = 14.0
-"""How long a car that cut in crawls: a driver at 4 m/s can reach it meanwhile."""
 AWAY_MPS = 10.0
 
 
 def hard_brake(stage: Stage, street: Street) -> Script:
-    """Keep the car ahead at its distance, then brake it to a stop and wait."""
+    """Brake the car ahead to a stop, where it stands for a while."""
     gap = stage.uniform("gap_m", 13.0, 18.0)
     where = stage.place("brake_m", 35.0, 60.0)
     hardest = stage.uniform("brake_mps2", 5.0, 7.0)
     speed = float(stage.ego.speed)
     car = stage.car(street.ahead(), BEFORE_M + gap + 5.0, speed)
     keep_clear(stage, street.ahead(), where + 30.0)
-    if stage.schedule is not None:
-        yield from _brake_at(stage, car, where, hardest)
-        return
-    # keep the distance until the place of braking
-    while stage.ahead_m(where) > 0:
-        error = stage.gap_m(car) - gap
-        wanted = max(stage.ego.speed - 0.5 * error, 0.0)
-        car.forced_mps2 = min(max((wanted - car.speed) / 0.5, -5.0), 4.0)
-        yield
-    # brake, and wait until the ego stands or has passed
-    stage.fire("hard_brake", car)
-    car.forced_mps2 = -hardest
-    waited = 0.0
-    while waited < 1.5:
-        yield
-        waited = waited + 0.1 if stage.ego.speed < 0.5 or stage.gap_m(car) < -9 else 0.0
-    release(car, AWAY_MPS)
+    yield from _brake_at(stage, car, where, hardest)
 
 
 def _brake_at(stage: Stage, car: Car, route_s: float, hardest: float) -> Script:
@@ -74,19 +54,19 @@ def _brake_at(stage: Stage, car: Car, route_s: float, hardest: float) -> Script:
 def pull_out(stage: Stage, street: Street) -> Script:
     """Move a parked car out in front of the ego, at a crawl."""
     s = stage.place("pull_out_m", 55.0, 75.0)
-    lead_s = _lead_s(stage)
+    _draw_crawl(stage)
     for aside in (-13.0, -6.5, 14.0, 20.5):
         _park(stage, s + aside)
     car = stage.car(street.shoulder(), BEFORE_M + s, 0.0)
     stand(car)
-    yield from approach(stage, s - 2.0, lead_s)
+    yield from near(stage, s - 2.0)
     yield from _cut_in(stage, car, street.ahead(), 1, "pull_out", 2.2)
 
 
 def queue_cut_in(stage: Stage, street: Street) -> Script:
     """Move a car out of a standing queue in the next lane."""
     s = stage.place("cut_in_m", 55.0, 75.0)
-    lead_s = _lead_s(stage)
+    _draw_crawl(stage)
     lane = street.other_lane()
     chain = street.ahead(lane)
     # a standing queue with room ahead of the car that leaves it
@@ -97,76 +77,27 @@ def queue_cut_in(stage: Stage, street: Street) -> Script:
         car = stage.car(chain, BEFORE_M + s + aside, 0.0)
         stand(car)
         cutter = car if aside == 0.0 else cutter
-    # leave when the ego is near in time
-    yield from approach(stage, s - 2.0, lead_s)
+    # leave when the ego is near
+    yield from near(stage, s - 2.0)
     if cutter is not None:
         side = 1 if street.lane < lane else -1
         yield from _cut_in(stage, cutter, street.ahead(), side, "queue_cut_in", 2.2)
 
 
 def ramp_cut_in(stage: Stage, ramp: Ramp) -> Script:
-    """Merge a car from the on-ramp right in front of the ego, at a crawl."""
-    if stage.schedule is not None:
-        gap, slow = (
-            stage.uniform("ramp_gap_s", 3.0, 5.5),
-            stage.uniform("ramp_mps", 5, 8),
-        )
-        traffic = Traffic(
-            gap,
-            (slow, slow + 1.0),
-            joins=tuple(ramp.main.ahead()),
-            blind_to_ego=0.5,
-        )
-        cars = stream(stage, "ramp_cut_in", [ramp.ramp], traffic)
-        joint = stage.network.pose(ramp.ramp[-1], 30.0)
-        s, _ = stage.path.project(joint.x, joint.y)
-        yield from encounter(stage, cars, s, "ramp_cut_in")
-        return
-    gap = stage.uniform("gap_m", 9.0, 13.0)
-    car = stage.car(ramp.ramp, 75.0, float(stage.ego.speed))
-    stand_off = 0.0
-    while car.leg < 3 or not 4.0 < stand_off < gap + 3.0:
-        stand_off = stage.gap_m(car)
-        wanted = max(stage.ego.speed + 0.6 * (gap - stand_off), 0.0)
-        late = car.leg == 3 and car.lane_s > 40.0
-        wanted = 0.0 if late and stand_off < 0 else wanted
-        car.forced_mps2 = min(max((wanted - car.speed) / 0.4, -6.0), 4.0)
-        yield
-    car.forced_mps2 = None
-    yield from _cut_in(stage, car, ramp.main.ahead(), 1, "ramp_cut_in", 2.0)
+    """Merge slow cars from the on-ramp into the ego's lane."""
+    gap = stage.uniform("ramp_gap_s", 3.0, 5.5)
+    slow = stage.uniform("ramp_mps", 5, 8)
+    joins = tuple(ramp.main.ahead())
+    traffic = Traffic(gap, (slow, slow + 1.0), joins=joins, blind_to_ego=0.5)
+    cars = stream(stage, "ramp_cut_in", [ramp.ramp], traffic)
+    joint = stage.network.pose(ramp.ramp[-1], 30.0)
+    s, _ = stage.path.project(joint.x, joint.y)
+    yield from encounter(stage, cars, s, "ramp_cut_in")
 
 
 def slow_queue(stage: Stage, ramp: Ramp) -> Script:
-    """Fill the lane that the ego must enter with crawling cars.
-
-    They speed up a while after the ego has come in among or behind them; on the second
-    road at a time that is drawn.
-    """
-    if stage.schedule is not None:
-        yield from _slow_stream(stage, ramp)
-        return
-    speed = stage.uniform("queue_mps", 1.6, 2.2)
-    spacing = stage.uniform("queue_spacing_m", 8.5, 10.0)
-    first = BEFORE_M + ramp.merge_s + 30.0
-    # a crawling row
-    for k in range(10):
-        s = first - spacing * k
-        if s > 0:
-            stage.car(ramp.main.ahead(), s, speed, speed)
-    queue = [body for body in stage.bodies if isinstance(body, Car)]
-    # speed up a while after the ego has come close and slowed down
-    while min(abs(stage.gap_m(car)) for car in queue) > 15.0:
-        yield
-    stage.fire("slow_queue", queue[-1])
-    while stage.ego.speed > 3.0:
-        yield
-    yield from hold(stage, 8.0)
-    for car in queue:
-        car.target_speed = 7.0
-
-
-def _slow_stream(stage: Stage, ramp: Ramp) -> Script:
-    """Drive dense, slow traffic that speeds up at some time."""
+    """Drive dense, slow traffic where the ego must enter; at some time it speeds up."""
     slow = stage.uniform("slow_mps", 3.0, 4.5)
     gap = stage.uniform("slow_gap_s", 3.4, 4.6)
     until = stage.uniform("slow_until_s", 25.0, 50.0)
@@ -184,50 +115,33 @@ def _speed_up(stage: Stage, cars: Sequence[Car], until_s: float) -> Script:
 
 
 def queue_at_light(stage: Stage, crossing: Crossing) -> Script:
-    """Hold a queue ahead of the ego at a light that has turned green.
-
-    On the second road the light itself holds it.
-    """
+    """Put a queue ahead of the ego that the light holds until it turns green."""
     line = crossing.signals["back"].line_s or crossing.approach_m
     count = stage.integer("queue", 1, 3)
     chain = crossing.way("back", crossing.move)
     begin = stage.network.length(chain[0]) - crossing.approach_m
-    moving = None if stage.schedule is None else AWAY_MPS
     queue = [
-        stage.car(chain, begin + line - 3.5 - 7.0 * k, 0.0, moving)
+        stage.car(chain, begin + line - 3.5 - 7.0 * k, 0.0, AWAY_MPS)
         for k in range(count)
     ]
-    for car in queue if stage.schedule is None else ():
-        stand(car)
     tail = line - 3.5 - 7.0 * (count - 1) - 2.5
     while stage.ahead_m(tail) > 35.0:
         yield
     stage.fire("queue_at_light", queue[-1])
-    if stage.schedule is not None:
-        return
-    yield from patience(stage, tail, 12.0, 0.5)
-    for car in queue:
-        release(car, AWAY_MPS)
-        yield from hold(stage, 0.8)
 
 
 def blocked_exit(stage: Stage, crossing: Crossing) -> Script:
-    """Block the ego's way out of the junction with a truck."""
+    """Block the ego's way out of the junction with a truck, for some time."""
     chain = crossing.way("back", crossing.move)
     into = stage.uniform("into_m", 1.0, 5.0)
     truck = stage.car(chain[2:], into + 2.0, 0.0, kind=ActorKind.TRUCK)
     stand(truck)
-    if stage.schedule is not None:
-        stage.play(_leave(stage, truck, stage.uniform("leaves_s", 18.0, 40.0)))
+    stage.play(_leave(stage, truck, stage.uniform("leaves_s", 18.0, 40.0)))
     pose = truck.pose
     s, _ = stage.path.project(pose.x, pose.y)
     while stage.ahead_m(s) > 40.0:
         yield
     stage.fire("blocked_exit", truck)
-    if stage.schedule is not None:
-        return
-    yield from patience(stage, s - truck.LENGTH / 2, 30.0, 1.5)
-    release(truck, AWAY_MPS)
 
 
 def _leave(stage: Stage, car: Car, at_s: float) -> Script:
@@ -236,45 +150,28 @@ def _leave(stage: Stage, car: Car, at_s: float) -> Script:
     release(car, AWAY_MPS)
 
 
-def _lead_s(stage: Stage) -> float:
-    """Draw how long before the ego's arrival a car sets off, where that decides.
-
-    On the second road, how long it crawls afterwards.
-    """
-    if stage.schedule is None:
-        return stage.uniform("lead_s", 3.0, 3.6)
+def _draw_crawl(stage: Stage) -> None:
+    """Draw how long a car crawls after it has cut in."""
     stage.uniform("crawl_s", 4.0, 9.0)
-    return 0.0
 
 
 def _cut_in(
     stage: Stage, car: Car, lanes: list[LaneIndex], side: int, name: str, crawl: float
 ) -> Script:
-    """Move into the ego's lane, crawl there, drive off.
-
-    How long it crawls depends on the ego, or is drawn on the second road.
-    """
-    crawl_s = CRAWL_S
-    if stage.schedule is not None:
-        crawl_s = float(stage.parameters["crawl_s"])
+    """Move into the ego's lane, crawl there, drive off."""
+    crawl_s = float(stage.parameters["crawl_s"])
     stage.fire(name, car)
     # change lanes at a crawl
     target, _ = stage.network.rest(lanes, _s_along(stage, lanes, car.pose))
     car.change_lane(target, side)
     release(car, crawl)
     until = stage.time_s + crawl_s
-    waited = 0.0
-    # crawl until the ego has followed for a while, or passed
-    while waited < 2.0 and stage.time_s < until:
+    while stage.time_s < until:
         yield
         if car.speed > crawl + 1.0:
             car.forced_mps2 = -5.0
         else:
             car.forced_mps2 = None
-        if stage.schedule is not None:
-            continue
-        close = 0 < stage.gap_m(car) < 12.0 and stage.ego.speed < crawl + 0.7
-        waited = waited + 0.1 if close or stage.gap_m(car) < -9 else 0.0
     car.indicator = 0
     release(car, AWAY_MPS)
 

@@ -1,10 +1,9 @@
 """Things in the way: accidents, road works, parked cars, doors, slow cyclists."""
 
 from me2e_compress.simulator.scenarios.layouts.road import BEFORE_M, Street
-from me2e_compress.simulator.scenarios.scripts.streams import Traffic, stream
+from me2e_compress.simulator.scenarios.scripts.streams import Traffic, near, stream
 from me2e_compress.simulator.scenarios.scripts.synchronise import (
     NEAR_M,
-    approach,
     keep_clear,
     met,
 )
@@ -61,7 +60,7 @@ def parked_car(stage: Stage, street: Street) -> Script:
 
 
 TOGETHER = Behaviour(headway_s=0.4, jam_gap_m=1.5)
-"""Cyclists of the second road stay a row that is as short as it begins."""
+"""Cyclists stay a row that is as short as it begins."""
 
 
 def slow_cyclists(stage: Stage, street: Street) -> Script:
@@ -71,11 +70,10 @@ def slow_cyclists(stage: Stage, street: Street) -> Script:
     first = stage.uniform("cyclist_gap_m", 26.0, 34.0)
     last: Car | None = None
     keep_clear(stage, street.ahead(), first + 60.0)
-    mind = None if stage.schedule is None else TOGETHER
     for k in range(count):
         s = BEFORE_M + first + 4.5 * k
         rider = stage.car(
-            street.ahead(), s, speed, speed, ActorKind.BICYCLE, behaviour=mind
+            street.ahead(), s, speed, speed, ActorKind.BICYCLE, behaviour=TOGETHER
         )
         rider.offset_m = -0.8
         right = rider.pose.moved(0.0, -0.8)
@@ -93,10 +91,7 @@ def opening_door(stage: Stage, street: Street) -> Script:
     side = -(LANE_WIDTH_M / 2 + 1.05)
     for k in range(-2, 3):
         stage.static_object(ActorKind.PARKED, stage.route_pose(s + 6.5 * k, side))
-    lead_s = 0.0
-    if stage.schedule is None:
-        lead_s = stage.uniform("door_lead_s", 2.8, 3.4)
-    yield from approach(stage, s, lead_s)
+    yield from near(stage, s)
     hinge = side + 1.95 / 2
     door = stage.static_object(
         ActorKind.DOOR, stage.route_pose(s + 0.6, hinge + 0.6), (0.2, 1.2, 1.2)
@@ -127,41 +122,12 @@ def spun_car(stage: Stage, street: Street) -> Script:
     stage.ego.grip_mps2 = dry
 
 
-def neighbours(stage: Stage, street: Street) -> Script:
-    """Drive a car ahead and one well behind in the lane beside the ego's.
-
-    The second road has traffic without it.
-    """
-    if stage.schedule is not None:
-        return
-    chain = street.ahead(street.other_lane())
-    for name, low, high in (("ahead", 35.0, 50.0), ("behind", -45.0, -30.0)):
-        s = BEFORE_M + stage.uniform(f"{name}_m", low, high)
-        speed = stage.uniform(f"{name}_mps", 8.0, 10.0)
-        stage.car(chain, s, speed)
-    yield
-
-
 ONCOMING_S = (16.0, 24.0)
-"""Mean gap of the oncoming traffic of the second road where one must overtake."""
+"""Mean gap of the oncoming traffic where one must overtake."""
 
 
 def oncoming_cars(stage: Stage, street: Street) -> Script:
-    """Drive a few cars in the other direction, and then none.
-
-    On the second road they come all the time, with gaps in which one can overtake.
-    """
-    if stage.schedule is not None:
-        traffic = Traffic(stage.uniform("oncoming_gap_s", *ONCOMING_S), platoons=0.6)
-        stream(stage, "oncoming", [street.oncoming()], traffic)
-        return
-    count = stage.integer("oncoming", 1, 3)
-    chain = street.oncoming()
-    total = sum(stage.network.length(index) for index in chain)
-    away = stage.uniform("oncoming_m", 80.0, 120.0)
-    speed = stage.uniform("oncoming_mps", 8.0, 10.0)
-    for k in range(count):
-        gap = k * stage.uniform(f"oncoming_gap_{k}_m", 16.0, 24.0)
-        s = total - BEFORE_M - away - gap
-        stage.car(chain, max(s, 0.0), speed)
-    yield
+    """Drive oncoming traffic, with gaps in which one can overtake."""
+    traffic = Traffic(stage.uniform("oncoming_gap_s", *ONCOMING_S), platoons=0.6)
+    stream(stage, "oncoming", [street.oncoming()], traffic)
+    return iter(())

@@ -1,4 +1,4 @@
-"""Traffic of the second road: drawn before the route begins, whatever the ego does."""
+"""Traffic, drawn before the route begins, whatever the ego does."""
 
 import math
 from collections.abc import Sequence
@@ -60,8 +60,6 @@ def stream(
     """
     random, network, entry = stage.random(name), stage.network, chains[0][0]
     schedule = stage.schedule
-    if schedule is None:
-        return []
     schedule.claimed.append(entry)
     low, high = traffic.speed or (0.0, 0.0)
     usual = (low + high) / 2 or 0.85 * float(network.lane(entry).speed_limit)
