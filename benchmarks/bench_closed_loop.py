@@ -4,8 +4,7 @@
 
 Parts: drivers (expert and blind per ability), latency (expert at several latencies),
 bytes (the same bytes whatever the workers), throughput (frames per second and core,
-memory), slow (220 routes with a policy that takes 10 ms; slow-2: 22 routes of the
-second road), resume (killed and gone on).
+memory), slow (22 routes with a policy that takes 10 ms), resume (killed and gone on).
 Results stay in OUT, so a run that was stopped goes on.
 """
 
@@ -37,7 +36,7 @@ from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.abilities import ABILITIES
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores, score
-from me2e_compress.simulator.routes import SETS, Route, load_routes, pick_routes
+from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 
 LATENCIES_S = (0.0, 0.05, 0.15, 0.25, 0.45, 0.85)
 MODEL_MS = 10.0
@@ -223,14 +222,7 @@ def bench_throughput(out: Path, _: int) -> None:
 
 
 def bench_slow(out: Path, workers: int) -> None:
-    _slow(out / "slow", workers, load_routes())
-
-
-def bench_slow_2(out: Path, workers: int) -> None:
-    _slow(out / "slow-2", workers, pick_routes(load_routes(SETS[2]), "22"))
-
-
-def _slow(folder: Path, workers: int, routes: tuple[Route, ...]) -> None:
+    folder, routes = out / "slow", pick_routes(load_routes(), "22")
     path = slow_model(folder.parent, MODEL_MS)
     shutil.rmtree(folder, ignore_errors=True)
     folder.with_name(f"{folder.name}.log").unlink(missing_ok=True)
@@ -273,7 +265,6 @@ PARTS = {
     "bytes": bench_bytes,
     "throughput": bench_throughput,
     "slow": bench_slow,
-    "slow-2": bench_slow_2,
     "resume": bench_resume,
 }
 

@@ -4,7 +4,7 @@
 within a type, and prints how often each 95 % interval holds the mean of those types,
 and that of all types.
 
-    python -m benchmarks.bench_intervals benchmarks/driver/schemes/routes.csv
+    python -m benchmarks.bench_intervals benchmarks/road_2/trained/four/routes.csv
     python -m benchmarks.bench_intervals ROUTES.csv ... --minus minus-track.ideal
 
 prints of kept drives, ``SCHEME.CONDITION``, the driving score and the success with both
@@ -44,7 +44,7 @@ class KeptDrive:
 
     @property
     def types(self) -> list[str]:
-        """Scenario type of each route; one of the second road has _R2 behind it."""
+        """Scenario type of each route: ``Accident_R2_0`` is of ``Accident``."""
         return [route.rpartition("_")[0].removesuffix("_R2") for route in self.scores]
 
     def mean(self, column: int = 0) -> Estimate:

@@ -1,7 +1,7 @@
-"""Which method reads int8 ranges best: what ``observers/README.md`` asks of frames.
+"""Which method reads int8 ranges best, and how far recordings differ.
 
     python -m benchmarks.bench_observers outliers OUT
-    python -m benchmarks.bench_observers scenes benchmarks/observers
+    python -m benchmarks.bench_observers scenes RECORDINGS
 
 ``outliers`` gives TCP and VAD-tiny of models/, whose weights are random, outliers of
 trained size, and prints the SQNR of every output on held-out frames under each method.

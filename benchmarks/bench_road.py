@@ -1,11 +1,11 @@
 """How much a set of routes lets happen, and how well it tells drivers apart.
 
-    python -m benchmarks.bench_road --road 2 --workers 2
+    python -m benchmarks.bench_road --workers 2
     python -m benchmarks.bench_road --routes routes.json
     python -m benchmarks.bench_road --fresh 1 --types Accident,T_Junction
     python -m benchmarks.bench_road --admission admission.json
-    python -m benchmarks.bench_road --compare benchmarks/road_2/study/*/routes.csv
-        [--drives float.ideal,full.ideal]
+    python -m benchmarks.bench_road --compare benchmarks/road_2/trained/*/routes.csv
+        [--drives trained.four,minus-occ.four]
 
 The first three look at the set that ships, another, or so many proposals of each type:
 how many actors move within 80 m of the ego as a route begins (the median over routes),
@@ -39,7 +39,7 @@ from me2e_compress.metrics.intervals import mean_estimate
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.runtime.children import pool
-from me2e_compress.simulator.routes import SETS, Route, load_routes
+from me2e_compress.simulator.routes import SHIPPED, Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from me2e_compress.simulator.scene import EventKind, Scene, SignalKind, SignalState
 from me2e_compress.simulator.world import World
@@ -256,7 +256,7 @@ def compare(files: Sequence[Path], chosen: Sequence[str]) -> None:
 
 
 def type_of(route: str) -> str:
-    """Return the type of a route of either road: ``Accident_0``, ``Accident_R2_0``."""
+    """Return the type of a route: ``Accident_R2_0``."""
     return route.rpartition("_")[0].removesuffix("_R2")
 
 
@@ -264,7 +264,6 @@ def main() -> None:
     """Read what is looked at."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--routes", type=Path, help="another set than what ships")
-    parser.add_argument("--road", type=int, default=2)
     parser.add_argument("--fresh", type=int, help="proposals of each type, no set")
     parser.add_argument("--types", default=",".join(SCENARIO_ABILITIES))
     parser.add_argument("--speeds", default="4,6,8,10,12", help="of blind drivers")
@@ -284,13 +283,13 @@ def main() -> None:
         admission(given.admission)
     elif given.fresh:
         proposals = [
-            propose(name, seed_of(given.seed, name, k), f"{name}_{k}", given.road)
+            propose(name, seed_of(given.seed, name, k), f"{name}_{k}")
             for name in given.types.split(",")
             for k in range(given.fresh)
         ]
         show(proposals, speeds, given.variants, given.workers)
     else:
-        there = load_routes(given.routes or SETS[given.road])
+        there = load_routes(given.routes or SHIPPED)
         types = given.types.split(",")
         picked = [each for each in there if each.scenario in types]
         show(picked, speeds, given.variants, given.workers)

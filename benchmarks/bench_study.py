@@ -1,8 +1,7 @@
 """A study over all routes: what benchmarks/ keeps of it.
 
     python -m benchmarks.bench_study benchmarks/shifts.toml OUT [--tables A,B]
-    python -m benchmarks.bench_study benchmarks/observers/seed-10.toml OUT
-    python -m benchmarks.bench_study benchmarks/road_2/study.toml OUT --so-far
+    python -m benchmarks.bench_study benchmarks/road_2/trained.toml OUT --so-far
 
 Drives what OUT lacks, as ``me2e-compress study FILE -o OUT`` does: hours, and it goes
 on where it was ended. OUT/NAME gets its report; the folder beside the file that has its
@@ -13,18 +12,33 @@ line of every route that OUT has.
 
 import argparse
 import sys
+import time
 from pathlib import Path
 
-from benchmarks.bench_driver import told
 from benchmarks.driver_records import routes_csv
 from me2e_compress.errors import Me2eError
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.results import ResultsFolder
 from me2e_compress.runtime.atomic import write_bytes
-from me2e_compress.study import Study, load_study, run_study
+from me2e_compress.study import Listener, Study, load_study, run_study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.study.write import write_study
+
+
+def told() -> Listener:
+    """Say every half minute how far a study is."""
+    begun, last = time.monotonic(), -60.0
+
+    def on_progress(stage: str, done: int, total: int, words: str) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last > 30.0 or done == total:
+            minutes = (now - begun) / 60
+            print(f"{minutes:6.1f} min  {stage}: {done}/{total}  {words}", flush=True)
+            last = now
+
+    return Listener(on_progress, lambda line: print(f"warning: {line}", flush=True))
 
 
 def keep(name: str, part: str, study: Study, out: Path, workers: int) -> None:

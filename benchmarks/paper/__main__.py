@@ -6,9 +6,8 @@
     python -m benchmarks.paper                    # writes paper.md of what is kept
 
 Nothing is driven but the last seconds of one accident. What is kept,
-``benchmarks/paper/``, is a line a route, and the latencies that were charged
-(``traces/``). With ``--road 2`` it is ``benchmarks/road_2/paper/``, of the study
-``benchmarks/road_2/paper.toml``.
+``benchmarks/road_2/paper/``, is a line a route, and the latencies that were charged
+(``traces/``).
 """
 
 import argparse
@@ -19,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.bench_driver import told
+from benchmarks.bench_study import told
 from benchmarks.paper.drives import FILE
 from benchmarks.paper.findings import Verdict
 from benchmarks.paper.questions import SHIPPED
@@ -49,15 +48,6 @@ Energy is measured where the machine has a counter; what is modelled from MACs a
     for scheme in prediction feature-ext full; do
       me2e-compress compress vad-tiny.onnx -r $scheme --frames vad-frames -o vad-tiny/$scheme.onnx
     done
-
-"""  # noqa: E501 - a paragraph of the page is one line
-HEAD_2 = """\
-# The paper, re-tested on the second road
-
-    me2e-compress study benchmarks/road_2/paper.toml -o paper-2 --workers 2
-    python -m benchmarks.paper paper-2 --road 2 -o page.html
-
-ask the [same questions](questions.toml) of `highway-2` on the 220 routes of [the second road](../../docs/closed-loop.md#the-second-road), where others come and go without minding it: how a finding is put, tested and read is told in [paper.md](paper.md).
 
 """  # noqa: E501 - a paragraph of the page is one line
 NOTHING = "Not driven yet. Its answers will stand here.\n"
@@ -126,23 +116,13 @@ def committed(path: Path) -> str:
     return found.stdout.strip()
 
 
-PAGES = {
-    1: Page(
-        PAPER / "paper.toml",
-        PAPER,
-        PAPER / "paper.md",
-        HEAD,
-        "python -m benchmarks.paper",
-    ),
-    2: Page(
-        ROOT / "benchmarks" / "road_2" / "paper.toml",
-        ROOT / "benchmarks" / "road_2" / "paper",
-        PAPER / "paper-2.md",
-        HEAD_2,
-        "python -m benchmarks.paper --road 2",
-    ),
-}
-"""By road."""
+PAGE = Page(
+    PAPER / "paper.toml",
+    ROOT / "benchmarks" / "road_2" / "paper",
+    PAPER / "paper.md",
+    HEAD,
+    "python -m benchmarks.paper",
+)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -154,12 +134,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path, nargs="?", help="folder of the study")
     parser.add_argument("-o", dest="html", type=Path, help="draw the page, as HTML")
     parser.add_argument("--keep", action="store_true", help="keep its records here")
-    parser.add_argument("--road", type=int, default=1, choices=PAGES)
     parser.add_argument(
         "--stack", type=Path, action="append", default=[], help="with OUT: for table 4"
     )
     given = parser.parse_args(argv)
-    page = PAGES[given.road]
+    page = PAGE
     try:
         records = page.kept
         if given.out is not None:

@@ -30,9 +30,10 @@ one collision decides."""
 FEWEST_RUNS = 5
 """Separated runs of which the medians are compared."""
 NOISE = 0.035
-"""Share by which the medians of two runs of one file differ: float and optimizer, 430.1
-and 415.2 ms in ``benchmarks/paper/variants.json``. Samples of one run tell nothing of
-it: their lag-1 autocorrelation is 0.8."""
+"""Share by which the medians of two runs of one file differ, as written down before the
+drives (430.1 and 415.2 ms, tag ``road-1``); float and optimizer have 430.2 and 414.6 ms
+in ``benchmarks/road_2/paper/variants.json``. Samples of one run tell nothing of it:
+their lag-1 autocorrelation is 0.8."""
 
 
 @dataclass(frozen=True)

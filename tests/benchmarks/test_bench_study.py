@@ -1,7 +1,6 @@
 import csv
 import re
 from collections import defaultdict
-from pathlib import Path
 from statistics import mean
 
 import pytest
@@ -10,25 +9,8 @@ from me2e_compress.study import load_study
 
 KEPT = Path(__file__).parents[2] / "benchmarks"
 STUDIES = sorted(
-    str(each.parent.relative_to(KEPT))
-    for each in KEPT.glob("**/tables.md")
-    if each.parent.parent.name != "driver"
+    str(each.parent.relative_to(KEPT)) for each in KEPT.glob("**/tables.md")
 )
-PAGE = Path(__file__).parents[2] / "docs" / "study.md"
-NUMBER = re.compile(r"[\N{MINUS SIGN}+]?\d+\.\d")
-
-
-def numbers(text: str) -> list[float]:
-    return [float(each.replace("\N{MINUS SIGN}", "-")) for each in NUMBER.findall(text)]
-
-
-def rows(text: str) -> dict[tuple[str, ...], list[float]]:
-    """Cells by the names at the head of their rows."""
-    cells = (line.split(" | ") for line in text.splitlines() if line.startswith("| "))
-    return {
-        tuple(each.strip("| ") for each in row[:2]): numbers(" ".join(row[1:]))
-        for row in cells
-    }
 
 
 @pytest.mark.parametrize("name", STUDIES)
@@ -57,18 +39,3 @@ def test_a_study_of_the_repository_is_whole(name: str) -> None:
     study = load_study(KEPT / f"{name}.toml", "2")
 
     assert study.pairs or any(each.against for each in study.conditions)
-
-
-def test_the_page_says_what_the_tables_of_shifts_say() -> None:
-    tables = rows((KEPT / "shifts" / "tables.md").read_text("utf-8"))
-    more = {
-        change: [-each for each in tables[f"full.{change}", "full.fps-4"][-6:]]
-        for change in ("fps-2", "night", "noise")
-    }
-
-    text = PAGE.read_text("utf-8").split("int8 loses no driving score more")[1]
-    said = numbers(text.partition(" points, each")[0])
-
-    # its interval, of types drawn anew, is held against the kept routes elsewhere
-    assert said[0] == more["fps-2"][0]
-    assert said[3:] == [each[3] for each in more.values()]

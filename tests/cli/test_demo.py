@@ -42,7 +42,7 @@ def test_the_demo_compresses_drives_and_reports(cli: Cli, tmp_path: Path) -> Non
     )
     assert "slow in onnxruntime's CPU" not in shown
     assert (
-        "1 route cannot show a difference below 25 points, all 220 none below" in shown
+        "1 route cannot show a difference below 51 points, all 220 none below" in shown
     )
     record = json.loads((out / "study.json").read_text())
     assert [each["name"] for each in record["schemes"]] == ["float", "full"]

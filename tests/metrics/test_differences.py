@@ -125,10 +125,10 @@ def paired(
 @pytest.mark.parametrize(
     ("routes", "low", "high", "least"),
     [
-        (220, -1.0, 1.0, 1.7),
-        (5, 0.0, 0.0, 11.4),  # all alike: five routes show little nevertheless
-        (5, -0.3, 40.6, 20.45),
-        (1, None, None, 25.5),
+        (220, -1.0, 1.0, 3.4),
+        (5, 0.0, 0.0, 22.8),  # all alike: five routes show little nevertheless
+        (5, -0.3, 60.6, 30.45),
+        (1, None, None, 51.0),
     ],
 )
 def test_few_routes_show_only_large_differences(
@@ -142,11 +142,11 @@ def test_few_routes_show_only_large_differences(
     [
         (220, 0.7, 6.7, 3.7, "better"),
         (220, -6.7, -0.7, -3.7, "worse"),
-        (220, -0.9, 5.6, 2.3, "no difference shown"),
-        (220, 0.2, 1.8, 1.0, "too few routes"),  # below the 1.7 that 220 show
+        (220, -0.9, 9.6, 4.3, "no difference shown"),
+        (220, 0.2, 1.8, 1.0, "too few routes"),  # below the 3.4 that 220 show
         (4, 1.0, 20.0, 11.0, "too few routes"),
         (1, None, None, 60.0, "too few routes"),
-        (220, 0.04, 4.0, 2.0, "no difference shown"),  # shown as 0.0
+        (220, 0.04, 8.0, 4.0, "no difference shown"),  # shown as 0.0
     ],
 )
 def test_a_verdict_asks_for_the_interval_and_for_enough_routes(

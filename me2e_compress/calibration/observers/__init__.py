@@ -18,7 +18,7 @@ _HERE = "me2e_compress.calibration.observers"
 
 DEFAULT_METHOD = "mse"
 """It drives no worse than max-min, and the plan moves less, from each of three
-recordings, by a rule that was written down before the drives (benchmarks/observers)."""
+recordings, by a rule that was written down before the drives (tag ``road-1``)."""
 
 OBSERVERS: Registry[Observer] = Registry(
     "calibration method",

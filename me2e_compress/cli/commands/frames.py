@@ -40,8 +40,8 @@ def frames(
     """Write calibration frames, coherent in time, seen by six cameras.
 
     For a driver that ships, or any ONNX file that keeps the policy contract
-    (--adapter), the expert drives fresh routes of a --road. With --from, recorded
-    driving is laid out as the file takes it (docs/writing-logs.md).
+    (--adapter), the expert drives fresh routes. With --from, recorded driving is laid
+    out as the file takes it (docs/writing-logs.md).
     """
     options = workflow.FramesOptions(
         count,

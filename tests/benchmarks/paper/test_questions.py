@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from benchmarks.paper.__main__ import PAGES
+from benchmarks.paper.__main__ import PAGE
 from benchmarks.paper.questions import PaperQuestion, PaperQuestions, PAt
 from me2e_compress.errors import StudyError
 from me2e_compress.study import load_study
@@ -45,7 +45,7 @@ def test_no_test_fails_the_papers_own_figures(asked: PaperQuestion) -> None:
 
 
 def test_every_question_asks_of_drives_that_the_study_makes() -> None:
-    study = load_study(PAGES[1].study, "1")
+    study = load_study(PAGE.study, "1")
     driven = {
         f"{variant.name}.{condition.name}"
         for condition in study.conditions

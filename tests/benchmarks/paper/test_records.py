@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.paper.__main__ import NOTHING, PAGES, main
+from benchmarks.paper.__main__ import NOTHING, PAGE, main
 from benchmarks.paper.accident import Accident, plans_before
 from benchmarks.paper.evidence import FEWEST_RUNS
 from benchmarks.paper.records import RECORDS, add_facts, read_paper
@@ -35,9 +35,8 @@ minus = "float.fps-1"
 """
 
 
-@pytest.mark.parametrize("road", PAGES)
-def test_the_page_is_that_of_the_drives_that_are_kept(road: int) -> None:
-    page = PAGES[road]
+def test_the_page_is_that_of_the_drives_that_are_kept() -> None:
+    page = PAGE
     text = page.path.read_text("utf-8")
 
     [asked_at] = re.findall("; questions committed (.*?)\\. All", text)
@@ -46,7 +45,7 @@ def test_the_page_is_that_of_the_drives_that_are_kept(road: int) -> None:
 
 
 def test_drives_that_are_kept_make_the_same_tables(tmp_path: Path) -> None:
-    page, records, kept = PAGES[1], tmp_path / "run" / "records", tmp_path / "kept"
+    page, records, kept = PAGE, tmp_path / "run" / "records", tmp_path / "kept"
     assert page.text("", tmp_path).endswith(NOTHING)
     write_records(load_study(page.study, "5").of_blocks(["table-6"]), records)
     text = page.text("", records)
@@ -71,7 +70,7 @@ def test_drives_that_are_kept_make_the_same_tables(tmp_path: Path) -> None:
 def test_questions_that_changed_after_their_drives_are_named(
     tmp_path: Path, old: str, new: str, asked: str
 ) -> None:
-    study = load_study(PAGES[1].study, "5").of_blocks(["table-2"])
+    study = load_study(PAGE.study, "5").of_blocks(["table-2"])
     write_records(study, tmp_path)
     (tmp_path / "questions.toml").write_text(ONE)
     digest = hashlib.sha256(ONE.encode()).hexdigest()
@@ -134,6 +133,6 @@ def test_what_is_no_record_is_named(tmp_path: Path) -> None:
 
 
 def test_the_page_is_drawn_of_what_is_kept(tmp_path: Path) -> None:
-    main(["--road", "2", "-o", str(tmp_path / "page.html")])
+    main(["-o", str(tmp_path / "page.html")])
 
     assert (tmp_path / "page.html").read_text().count("<svg") == 4

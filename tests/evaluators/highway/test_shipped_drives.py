@@ -10,10 +10,7 @@ from me2e_compress.simulator.routes import load_routes, pick_routes
 
 
 def test_the_shipped_driver_passes_a_parked_car() -> None:
-    """A route that nobody passes blindly, and one of the shortest.
-
-    So says benchmarks/driver/baselines/routes.csv.
-    """
+    """A route that nobody passes blindly, and one of the shortest."""
     (route,) = pick_routes(load_routes(), "ParkedObstacle_R2_0")
     policy = OnnxDriver(shipped("highway")).open()
 
