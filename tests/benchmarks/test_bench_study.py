@@ -1,6 +1,7 @@
 import csv
 import re
 from collections import defaultdict
+from pathlib import Path
 from statistics import mean
 
 import pytest
