@@ -23,8 +23,6 @@ SETTLED_M = 30.0
 """Nobody changes nearer than this to the beginning of a lane, or in a junction: who
 comes up behind is on another lane yet."""
 SLOWEST_MPS = 1.0
-BRAKING_MPS2 = 3.0
-"""Comfortable braking with which the ego is reckoned."""
 
 
 def consider(car: Car, lane_s: float, wanted_mps2: float) -> float:

@@ -14,13 +14,16 @@ from benchmarks.paper.accident import Accident, plans_before
 from benchmarks.paper.evidence import FEWEST_RUNS
 from benchmarks.paper.records import RECORDS, add_facts, read_paper
 from me2e_compress.errors import StudyError
+from me2e_compress.simulator.routes import Route
 from me2e_compress.study import Condition, Study, Timing, Variant, load_study, run_study
 from me2e_compress.study.study_blocks import StudyBlock
 from me2e_compress.workflows.listener import SILENT
 from tests.benchmarks.paper.made import write_records
 from tests.command import write_frames
-from tests.evaluators.highway.drivers import CROSSING, straight_on
+from tests.evaluators.highway.drivers import straight_on
 from tests.study.conftest import IDEAL, Here
+
+CRASHED = Route("crashed", "Accident", "Overtaking", 1)
 
 ONE = """interval = "types"
 correction = "holm"
@@ -96,7 +99,7 @@ def test_a_study_that_was_driven_is_weighed_and_its_accident_kept(
         (Variant("slow", str(tmp_path / "slow.onnx")),),
         (IDEAL, Condition("device", "trace")),
         "slow",
-        (CROSSING,),
+        (CRASHED,),
         220,
         held_out=tmp_path / "frames",
         timing=Timing(10, baseline_median_s=0.2),
@@ -117,7 +120,7 @@ def test_a_study_that_was_driven_is_weighed_and_its_accident_kept(
     assert sum(map(len, fact.modules_us.values())) > 0
     assert [each.name for each in found.finished] == ["slow.device", "slow.ideal"]
     assert all("preview" in table.title for table in found.tables())
-    # it hit what crossed
+    # it hit what stood in its lane
     assert found.accident is not None
     times = [each.time_us for each in found.accident.moments]
     assert times == list(range(times[0], times[-1] + 1, 500_000))
