@@ -1,23 +1,27 @@
 """Every file that the commands write, as a manifest of digests: did a change move one?
 
-    python -m benchmarks.written_files make FOLDER MANIFEST.json [--tree CHECKOUT]
+    python -m benchmarks.written_files make FOLDER MANIFEST.json
+        [--tree CHECKOUT] [--stacks STACKS]
     python -m benchmarks.written_files compare BEFORE.json AFTER.json
 
 ``make`` runs `RUNS` in a new FOLDER, through the command line alone, so that it
 measures any commit that has these options: the one it is part of, or that of another
-CHECKOUT. The manifest gives every file's SHA-256 after `benchmarks.masks`. ``compare``
+CHECKOUT. STACKS holds graphs, each NAME.onnx beside a folder NAME of its frames
+(`benchmarks.small_stacks` makes some): every one is compressed by `RECIPES` for
+`TARGETS`. The manifest gives every file's SHA-256 after `benchmarks.masks`. ``compare``
 lists the files that differ; exit code 1 if there are any. Digests hold for one machine
 and its package versions: on another processor, float kernels round differently.
 """
 
 import argparse
 import hashlib
+import itertools
 import json
 import os
 import resource
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from benchmarks import seven_nodes
@@ -31,6 +35,8 @@ frames highway -n 2 --scene-length 1 --seed 1 -o held-out
 compress highway -r exact --frames frames -o exact.onnx
 compress highway -r feature-ext --target tensorrt --frames frames -o feature-ext.onnx
 compress highway -r full --target onnxruntime --frames frames -o full.onnx
+compress highway -r full-fused --target onnxruntime --frames frames -o full-fused.onnx
+compress highway -r full-fused --target tensorrt --frames frames -o full-trt.onnx
 compress highway -r minus-occ --frames frames -o minus-occ.onnx
 compress seven.onnx -r exact -o seven.exact.onnx
 compress seven.onnx -r full --target tensorrt --frames seven -o seven.full.onnx
@@ -43,20 +49,24 @@ plan highway --scheme prediction -o prediction.plan.json
 evaluate blind --routes 44 -o blind
 evaluate blind:9 --routes 2 --latency trace:trace.json --in-order -o blind-in-order
 evaluate expert --routes 11 -o expert
-evaluate expert --routes HardBreakRoute_1 --render HardBreakRoute_1 -o rendered
-evaluate highway --routes HazardAtSideLane_0,Accident_0 -o highway
-evaluate highway --routes HazardAtSideLane_0,Accident_0 --latency fps:2 -o highway-fps
-evaluate highway --routes HazardAtSideLane_0,Accident_0 --latency trace:trace.json \
+evaluate expert --routes HardBreakRoute_R2_1 --render HardBreakRoute_R2_1 -o rendered
+evaluate highway --routes 20 -o highway
+evaluate highway --routes HazardAtSideLane_R2_0,Accident_R2_0 --latency fps:2 -o highway-fps
+evaluate highway --routes HazardAtSideLane_R2_0,Accident_R2_0 --latency trace:trace.json \
 --seed 3 --weather fog_m=80,noise=0.02,dropped=BACK -o highway-trace
 score blind expert highway highway-fps highway-trace --json > scores.json
 study study.toml -o study
 """
 """Command lines; what follows `>` is the file that gets the standard output."""
 
+RECIPES = ("exact", "fused", "full", "full-fused")
+LOSSLESS = ("exact", "fused")
+TARGETS = ("onnxruntime", "tensorrt")
+
 STUDY = """
 title = "Written files"
 baseline = "float"
-routes = "HazardAtSideLane_0,Accident_0"
+routes = "HazardAtSideLane_R2_0,Accident_R2_0"
 frames = "frames"
 held_out = "held-out"
 
@@ -97,6 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     making.add_argument("folder", type=Path)
     making.add_argument("manifest", type=Path)
     making.add_argument("--tree", type=Path, default=Path(__file__).parents[1])
+    making.add_argument("--stacks", type=Path)
     comparing = commands.add_parser("compare")
     comparing.add_argument("before", type=Path)
     comparing.add_argument("after", type=Path)
@@ -105,14 +116,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         before, after = (json.loads(p.read_text()) for p in (given.before, given.after))
         return report(differences(before, after), len({*before, *after}))
     package = given.tree.resolve() / PACKAGE
-    make(given.folder, package)
+    make(given.folder, package, given.stacks)
     made = manifest(given.folder, package)
     given.manifest.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
     print(f"{given.manifest}: {len(made)} files")
     return 0
 
 
-def make(folder: Path, package: Path) -> None:
+def make(folder: Path, package: Path, stacks: Path | None = None) -> None:
     """Write the inputs and run every command in a new folder."""
     if not package.is_dir():
         sys.exit(f"{package}: no such folder")
@@ -121,9 +132,26 @@ def make(folder: Path, package: Path) -> None:
     seven_nodes.write_frames(folder / "seven")
     (folder / "study.toml").write_text(STUDY, encoding="utf-8")
     (folder / "trace.json").write_text(json.dumps(TRACE), encoding="utf-8")
-    for line in RUNS.strip().splitlines():
+    for line in [*RUNS.strip().splitlines(), *stack_runs(stacks)]:
         run(line, folder, package)
     print(f"{cpu_s():6.1f} CPU s in all")
+
+
+def stack_runs(stacks: Path | None) -> Iterator[str]:
+    """Yield the command lines that compress, plan and calibrate every graph."""
+    for path in sorted(stacks.glob("*.onnx")) if stacks else ():
+        name, model = path.stem, path.resolve()
+        frames = model.with_suffix("")
+        yield f"calibrate {model} {frames} -o {name}.ranges.json"
+        for target in TARGETS:
+            yield f"plan {model} --target {target} -o {name}.{target}.plan.json"
+        for recipe, target in itertools.product(RECIPES, TARGETS):
+            if recipe in LOSSLESS and target != TARGETS[0]:
+                continue  # no quantizer is placed
+            yield (
+                f"compress {model} -r {recipe} --target {target} --frames {frames} "
+                f"-o {name}.{recipe}.{target}.onnx"
+            )
 
 
 def run(line: str, folder: Path, package: Path) -> None:
