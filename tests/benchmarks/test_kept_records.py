@@ -35,7 +35,7 @@ SIGNED = re.compile(rf"({SIGN}\d+\.\d+) to ({SIGN}\d+\.\d+)")
 INTERVAL = re.compile(
     rf"{NUMBER}(?: points?,| %| success)?\*?\*? \(?(?:95 %: )?{NUMBER} to {NUMBER}"
 )
-NOT_KEPT = {}
+NOT_KEPT: dict[str, str] = {}
 Triple = tuple[float, float, float]
 
 
