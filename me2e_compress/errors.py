@@ -62,7 +62,6 @@ FORMER = {
     "--energy-out": f"--energy-out {_NOW} TRACE.energy.json beside the trace",
     "inspect --frames": f"inspect --frames {_NOW} --trace, of profile --by-module",
     "--nodes": f"--nodes {_NOW} plan -v",
-    "--tables": f"--tables {_NOW} a study file with these blocks",
     "study paper": f"the study paper {_NOW} benchmarks/paper/paper.toml",
     "study shifts": f"the study shifts {_NOW} benchmarks/shifts.toml",
     "study tail": f"the study tail {_NOW} benchmarks/tail.toml",
@@ -99,7 +98,7 @@ FORMER = {
     "demo --stack": f"--stack {_NOW} python -m models.export",
     **{
         f"demo {option}": f"demo {option} {_NOW} compress, compare and a study"
-        for option in ("-r", "--recipe", "--routes", "--provider")
+        for option in ("-r", "--recipe", "--routes", "--workers", "--provider")
     },
     "--road": "--road is gone since 0.3.0: there is one road, with traffic",
     "study road": "the key road is gone since 0.3.0: there is one road, with traffic",

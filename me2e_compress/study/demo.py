@@ -29,7 +29,7 @@ from me2e_compress.workflows.module_changes import ModuleChanges, compare_module
 from me2e_compress.workflows.result import Result, Table
 
 CALIBRATION_FRAMES, HELD_OUT_FRAMES = 64, 24
-LATENCY_SAMPLES = 100
+LATENCY_SAMPLES, WORKERS = 100, 2
 DRIVER, FLOAT, RECIPE = "highway", "float", "full-fused"
 ROUTES = "5"
 """What both drive: a number of routes, or their names."""
@@ -82,7 +82,6 @@ class DriverDemo:
     Attributes:
         out: The folder that everything is written to.
         force: Replace files that we did not write, too.
-        workers: Number of concurrent routes.
 
     Raises:
         GraphError: The output folder is a file, or a user's file would be overwritten.
@@ -90,7 +89,6 @@ class DriverDemo:
 
     out: Path
     force: bool = False
-    workers: int = 2
     _told: list[Section] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
@@ -156,7 +154,7 @@ class DriverDemo:
             timing=Timing(LATENCY_SAMPLES),
         )
         # run it, and write its report with the demo's own sections
-        engine = LocalEngine(self.workers)
+        engine = LocalEngine(WORKERS)
         found = run_study(study, self.out, engine, listener, 1, force=self.force)
         told = (*self._told, self._files())
         written = write_study(found, self.out, self._words(), told, force=self.force)

@@ -157,14 +157,11 @@ def test_ranges_are_shown_worst_first(cli: Cli, folder: Path) -> None:
     }
 
 
-def test_fewer_frames_are_drawn_by_seed(cli: Cli, folder: Path) -> None:
-    found = list[bytes]()
-    for seed in (0, 0, 1, 2, 3):
-        cli.done(f"{RANGES} -n 2 --seed {seed} -o r.json")
-        found.append((folder / "r.json").read_bytes())
+def test_fewer_frames_are_the_same_again(cli: Cli, folder: Path) -> None:
+    for name in "ab":
+        cli.done(f"{RANGES} -n 2 -o {name}.json")
 
-    assert found[0] == found[1]
-    assert any(each != found[0] for each in found[2:])
+    assert (folder / "a.json").read_bytes() == (folder / "b.json").read_bytes()
 
 
 @pytest.mark.usefixtures("folder")

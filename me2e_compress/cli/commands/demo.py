@@ -20,7 +20,6 @@ Output = Annotated[
 
 def demo(
     output: Output = Path("out"),
-    workers: given.Workers = 2,
     force: given.Force = False,
 ) -> None:
     """Run the main job on what ships: compress, verify, compare, drive, report.
@@ -30,7 +29,7 @@ def demo(
     need_extra("highway", "driving in the demo")
     from me2e_compress.study.demo import DriverDemo
 
-    steps = DriverDemo(output, force, workers).steps
+    steps = DriverDemo(output, force).steps
     # each step says what it found as soon as it is done
     output.mkdir(parents=True, exist_ok=True)
     found = dict[str, Result]()

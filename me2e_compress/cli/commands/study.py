@@ -14,6 +14,7 @@ Provider = Annotated[
     str | None, typer.Option(help="runs the graph: cpu, cuda, ...; default the study's")
 ]
 Routes = Annotated[str | None, typer.Option(help=f"{given.ROUTES}; not the study's")]
+Tables = Annotated[str | None, typer.Option(help="only these of its blocks: A,B")]
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="count drives and hours, drive nothing")
 ]
@@ -26,6 +27,7 @@ def study(
     definition: Annotated[Path, typer.Argument(help="STUDY.toml")],
     output: Annotated[Path, typer.Option("-o", "--output", help="the folder")],
     routes: Routes = None,
+    tables: Tables = None,
     dry_run: DryRun = False,
     provider: Provider = None,
     trust_code: TrustCode = False,
@@ -46,6 +48,8 @@ def study(
 
     # read and check everything that the study needs before it starts
     asked = load_study(definition, routes, provider, trust_code=trust_code)
+    if tables is not None:
+        asked = asked.of_blocks(tables.split(","))
     inputs = (definition, *asked.inputs())
     check_folder(output, inputs, (JSON, MARKDOWN, HTML))
     ahead = workload(asked, output, workers)
@@ -55,6 +59,7 @@ def study(
     # the report quotes the command that repeats the study
     options: list[tuple[str, str | None]] = [
         ("--routes", routes),
+        ("--tables", tables),
         ("--provider", provider),
     ]
     chosen = [str(word) for each in options if each[1] is not None for word in each]
