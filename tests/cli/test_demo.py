@@ -24,7 +24,7 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "CALIBRATION_FRAMES", 3)
     monkeypatch.setattr(demo, "HELD_OUT_FRAMES", 2)
     monkeypatch.setattr(demo, "LATENCY_SAMPLES", 5)
-    monkeypatch.setattr(demo, "ROUTES", "ParkedObstacle_0")
+    monkeypatch.setattr(demo, "ROUTES", "ParkedObstacle_R2_0")
     monkeypatch.setattr(demo, "RECIPE", "full")
     monkeypatch.setattr(demo, "LocalEngine", lambda workers: Here())
 
