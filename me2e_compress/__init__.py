@@ -1,8 +1,7 @@
 """Compress modular end-to-end driving models and measure what it costs on the road.
 
 The functions are what the commands do, silently: ``compress``, ``compare``,
-``evaluate`` and so on take files, then options, and return a result, which shows
-itself in a notebook.
+``evaluate`` and so on take files, then options, and return a result.
 """
 
 import importlib

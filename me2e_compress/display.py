@@ -1,4 +1,4 @@
-"""What shows itself: one line in a terminal, tables in a notebook."""
+"""Tables, and how numbers and counts are written in them."""
 
 import abc
 import html
@@ -9,9 +9,6 @@ from dataclasses import dataclass, replace
 
 AT_LEAST = "≥ or -: plugins and open shapes are not counted; inspect names them"
 """What a table says of MACs that are a lower bound."""
-
-MOST_ROWS = 30
-"""Rows of a table in a notebook; the last line says how many more there are."""
 
 _UNSEEN = re.compile(
     "[\x00-\x09\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f"
@@ -84,28 +81,6 @@ class Table:
         title = f"**{in_markdown(self.title)}**"
         parts = [title, "\n".join(lines), *filter(None, [in_markdown(self.note)])]
         return "\n\n".join(parts) + "\n"
-
-    def html(self) -> str:
-        """Write a small table for a notebook, every name escaped."""
-        shown = [self._row("td", map(_text, row)) for row in self.rows[:MOST_ROWS]]
-        if more := len(self.rows) - len(shown):
-            shown.append(f'<tr><td colspan="{len(self.columns)}">{more} more</td></tr>')
-        note, details = _broken(self.note), _broken(self.details)
-        return (
-            f"<table><caption>{html.escape(self.title)}</caption>"
-            f"<thead>{self._row('th', self.columns)}</thead>"
-            f"<tbody>{''.join(shown)}</tbody></table>"
-            + (f"<p><small>{note}</small></p>" if note else "")
-            + (f"<details><small>{details}</small></details>" if details else "")
-        )
-
-    def _row(self, tag: str, cells: Iterable[str]) -> str:
-        row = "".join(
-            f'<{tag} style="text-align:{"left" if at < self.words else "right"}">'
-            f"{html.escape(text)}</{tag}>"
-            for at, text in enumerate(cells)
-        )
-        return f"<tr>{row}</tr>"
 
 
 def table(
@@ -193,42 +168,16 @@ def giga(macs: int | None, unknown: int | None = 0, form: str = ".2f") -> str:
 
 
 class Displayed(abc.ABC):
-    """What a reader looks at: a repr of one line, and tables in a notebook."""
+    """What is shown in one line, its repr."""
 
     @property
     @abc.abstractmethod
     def headline(self) -> str:
         """What it is, in one line."""
 
-    @abc.abstractmethod
-    def tables(self) -> tuple[Table, ...]:
-        """Return what there is to read, as tables."""
-
-    def details(self) -> tuple[Table, ...]:
-        """Return tables for who wants to know more, such as a row a node; ``-v``."""
-        return ()
-
-    def lines(self) -> tuple[str, ...]:
-        """Return what is said below the tables."""
-        return (self.headline,)
-
-    def alerts(self) -> tuple[str, ...]:
-        """Return what must not be overlooked: said last, in bold."""
-        return ()
-
     def __repr__(self) -> str:
         """Show the class and the one line."""
         return f"<{type(self).__name__}: {self.headline}>"
-
-    def _repr_html_(self) -> str:
-        """Show the tables and the lines."""
-        below = "".join(f"<p>{html.escape(line)}</p>" for line in self.lines())
-        below += "".join(f"<pre><b>{html.escape(e)}</b></pre>" for e in self.alerts())
-        return "".join(each.html() for each in self.tables()) + below
-
-
-def _broken(lines: str) -> str:
-    return "<br>".join(html.escape(line) for line in lines.splitlines())
 
 
 def in_markdown(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Public objects show themselves: in one line, and as tables in a notebook."""
+"""Public objects show themselves in one line; how numbers are written."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -69,14 +69,6 @@ def test_a_public_object_is_one_short_line(tmp_path: Path, name: str) -> None:
 
     assert "\n" not in shown
     assert len(shown) < 160
-
-
-@pytest.mark.parametrize("name", MADE)
-def test_a_public_object_is_a_table_in_a_notebook(tmp_path: Path, name: str) -> None:
-    shown = MADE[name](tmp_path)._repr_html_()
-
-    assert "<table>" in shown
-    assert "<n<" not in shown
 
 
 def test_a_frame_does_not_show_its_pictures() -> None:

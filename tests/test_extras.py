@@ -133,7 +133,7 @@ def test_a_defect_of_ours_keeps_its_traceback(
     [
         MissingExtraError("ray", "ray"),
         BrokenPackageError("cv2", "highway", "libGL.so.1"),
-        MissingPackageError("pandas"),
+        MissingPackageError("tensorrt"),
     ],
 )
 def test_errors_travel_between_processes(error: Exception) -> None:

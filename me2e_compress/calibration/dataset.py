@@ -18,7 +18,7 @@ import onnx_ir as ir
 from me2e_compress.calibration.archives import Declared, declared, load_arrays
 from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.calibration.static_inputs import check_static, static_inputs
-from me2e_compress.display import Displayed, Table, counted, reason, table
+from me2e_compress.display import Displayed, counted, reason
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.recurrence import not_fed_back, recurrent_inputs, sides
@@ -57,15 +57,6 @@ class CalibrationSet(Displayed):
         """The folder and the numbers of frames and scenes."""
         frames, scenes = counted(len(self), "frame"), counted(len(self.scenes), "scene")
         return f"{self.folder}: {frames} in {scenes}"
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return a table with the type and shape of each input in the first frame."""
-        arrays = self[0].arrays
-        rows = [
-            (name, str(each.dtype), str(list(each.shape)))
-            for name, each in arrays.items()
-        ]
-        return (table("The first frame", ("input", "type", "shape"), rows, words=3),)
 
     def __len__(self) -> int:
         return len(self.files)

@@ -18,7 +18,7 @@ import numpy as np
 
 from me2e_compress.calibration.archives import declared, load_arrays
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.display import Displayed, Table, counted, reason, table
+from me2e_compress.display import Displayed, counted, reason
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
@@ -54,12 +54,6 @@ class EngineDump(Displayed):
     def headline(self) -> str:
         """The path and the number of frames."""
         return f"{self.path}: answers to {counted(len(self), 'frame')}"
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return a table with the type and shape of each tensor in the first frame."""
-        rows = [(n, str(a.dtype), str(list(a.shape))) for n, a in self[0].items()]
-        columns = ("tensor", "type", "shape")
-        return (table("Answers to the first frame", columns, rows, words=3),)
 
     def __len__(self) -> int:
         return len(self.stems)

@@ -13,7 +13,7 @@ import pydantic
 from me2e_compress.calibration.observers import OBSERVERS, Observer
 from me2e_compress.calibration.observers.base import MaxMin
 from me2e_compress.calibration.statistics import ALL_ZERO, NOT_FINITE, Statistics
-from me2e_compress.display import Displayed, Table, counted, table
+from me2e_compress.display import Displayed, counted
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_document
@@ -90,14 +90,6 @@ class Ranges(Displayed):
             f"{counted(len(self.tensors), 'tensor')}, {self.method},"
             f" {counted(self.frames, 'frame')}"
         )
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return a table of the bounds of each tensor."""
-        rows = [
-            (name, f"{low:.4g}", f"{high:.4g}")
-            for name, (low, high) in self.tensors.items()
-        ]
-        return (table("Ranges", ("tensor", "low", "high"), rows),)
 
     @property
     def dead(self) -> tuple[str, ...]:

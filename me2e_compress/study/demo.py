@@ -66,10 +66,6 @@ class DriveResult(Result):
         """Return scoreboard and differences."""
         return (*scoreboards(self.study), differences(self.study))
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per drive."""
-        return self.study.records()
-
     def to_json(self) -> object:
         """Return the whole study as JSON."""
         return self.study.to_json()

@@ -74,10 +74,6 @@ class StudyResult(StudyOutcome, Result):
         by_section = self.tables_by_section.values()
         return tuple(table for tables in by_section for table in tables)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per drive."""
-        return [self._record(each) for each in self.drives]
-
     def _record(self, drive: DriveRecord) -> dict[str, object]:
         # a drive that was not made has no scores
         scores, of = drive.scores, self.variant(drive.variant)

@@ -88,17 +88,13 @@ class Workload(Result):
         columns = ("variant", "condition", "routes driven", "time left")
         return (Table("Drives", columns, tuple(rows), words=2),)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per drive."""
-        return [dict(vars(each)) for each in self.drives]
-
     def to_json(self) -> object:
         """Return the drives and the hours."""
         return {
             "title": self.title,
             "hours": self.hours,
             "workers": self.workers,
-            "drives": self.records(),
+            "drives": self.drives,
         }
 
 

@@ -48,10 +48,6 @@ class EngineResult(Result):
             f" {found.seconds:.0f} s; it fits this GPU and this version"
         )
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row."""
-        return [{"model": self.model, "output": self.output, **self.to_json()}]
-
     def to_json(self) -> dict[str, object]:
         """Return everything about the engine except its bytes."""
         return {

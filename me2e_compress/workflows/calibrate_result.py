@@ -44,13 +44,6 @@ class CalibrateResult(Result):
     def _said(self, severity: str) -> tuple[str, ...]:
         return tuple(str(each) for each in self.findings if each.severity == severity)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per tensor."""
-        return [
-            {"tensor": name, "low": low, "high": high}
-            for name, (low, high) in self.ranges.tensors.items()
-        ]
-
     def to_json(self) -> object:
         """Return the ranges and the tensors that are always zero."""
         found = self.ranges

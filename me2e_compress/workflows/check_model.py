@@ -77,10 +77,6 @@ class ModelCheck(Result):
         columns = ("", "name", "shape", "type", "fed by, or used as")
         return (table(self.policy, columns, rows, words=5),)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per port."""
-        return [dataclasses.asdict(each) for each in (*self.inputs, *self.outputs)]
-
     def to_json(self) -> object:
         """Return everything."""
         return {"fits": self.fits, **dataclasses.asdict(self)}

@@ -97,10 +97,6 @@ class CompareResult(Result):
         lively = (self.liveness.table(),) if self.liveness and alive else ()
         return (outputs, *lively, *agents)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per output."""
-        return [dataclasses.asdict(each) for each in self.fidelity.outputs]
-
     def to_json(self) -> object:
         """Return the fidelity, agents, and liveness."""
         alive = None if self.liveness is None else dataclasses.asdict(self.liveness)

@@ -115,10 +115,6 @@ class DumpResult(Result):
         title = f"What the engine lost over {counted(self.frames, 'frame')}"
         return (table(title, columns, rows, note + source),)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per output."""
-        return [dataclasses.asdict(each) for each in self.outputs]
-
 
 def compare_dump(
     model: str | Path,

@@ -128,21 +128,6 @@ class CompressResult(Result):
             said += f", {self.loss.seconds:.0f} of them to measure"
         return said
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per pass."""
-        return [
-            {
-                "pass": step.name,
-                "changes": step.changes,
-                "nodes": step.after.nodes,
-                "weight_bytes": step.after.weight_bytes,
-                "macs": step.after.macs,
-                "unknown_macs_nodes": step.after.unknown_macs_nodes,
-                "seconds": step.seconds,
-            }
-            for step in self.report.steps
-        ]
-
     def findings(self) -> dict[str, Any]:
         """Return weights, int8, fidelity and verdict for the report, without times.
 

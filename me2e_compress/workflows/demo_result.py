@@ -44,10 +44,6 @@ class DemoResult(Result):
         *others, last = self.steps.values()
         return (*(each for step in others for each in step.tables()), *last.details())
 
-    def records(self) -> list[dict[str, object]]:
-        """Return the rows of the last step."""
-        return self._last.records()
-
     def to_json(self) -> object:
         """Return the result of each step."""
         return {name: each.to_json() for name, each in self.steps.items()}

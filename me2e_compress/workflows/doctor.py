@@ -55,10 +55,6 @@ class DoctorResult(Result):
         rows = [(each.what, each.found or "no", each.advice) for each in self.checkups]
         return (table("This machine", ("what", "found", "to have it"), rows, words=3),)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per thing."""
-        return [dataclasses.asdict(each) for each in self.checkups]
-
 
 def doctor() -> DoctorResult:
     """Look for everything that the toolkit can make use of."""

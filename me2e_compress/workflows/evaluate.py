@@ -33,7 +33,7 @@ from me2e_compress.workflows.other_evaluators import (
     keep,
 )
 from me2e_compress.workflows.result import Result, Table, number
-from me2e_compress.workflows.score import driving_score, score_records, scores_table
+from me2e_compress.workflows.score import driving_score, scores_table
 
 _FLAGS = {"module_map": "map"}
 """Command-line names of options that differ from their Python names."""
@@ -105,10 +105,6 @@ class EvaluateResult(Result):
         late = None if self.late is None else deadlines_table(self.policy, self.late)
         scores = scores_table(self.policy, self.scores)
         return (scores,) if late is None else (scores, late)
-
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per score."""
-        return score_records(self.scores)
 
     def to_json(self) -> object:
         """Return the scores, and the latencies charged to decisions."""

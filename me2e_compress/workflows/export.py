@@ -21,15 +21,6 @@ class ExportResult(Result):
         """The file, its model and size."""
         return f"{self.output}: {self.stack}, {megabytes(file_bytes(self.output))} MB"
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row: the file."""
-        size = file_bytes(self.output)
-        return [{"stack": self.stack, "output": self.output, "bytes": size}]
-
-    def to_json(self) -> object:
-        """Return the file with its model and bytes."""
-        return self.records()[0]
-
 
 def export_stack(
     stack: str, output: str | Path, *, force: bool = False

@@ -58,10 +58,6 @@ class FirstDifferenceResult(Result):
         )
         return (table("Modules", columns, rows, note, words=3),)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per value."""
-        return [dataclasses.asdict(each) for each in self.found.values]
-
     def to_json(self) -> object:
         """Return all that was compared."""
         return dataclasses.asdict(self.found)

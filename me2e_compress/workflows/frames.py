@@ -80,22 +80,16 @@ class FramesResult(Result):
         said = f"{self.output}: {counted(self.count, 'frame')} of {self.stack}"
         return f"{said}, {f'seed {seed}' if log is None else f'from {LOGS.text(log)}'}"
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row: the recording."""
-        log = self.options.log
-        return [
-            {
-                "stack": self.stack,
-                "output": self.output,
-                "frames": self.count,
-                "seed": self.options.seed if log is None else None,
-                "log": None if log is None else LOGS.text(log),
-            }
-        ]
-
     def to_json(self) -> object:
-        """Return the recording: model, folder, frames, seed, log."""
-        return self.records()[0]
+        """Return the recording: stack, folder, frames, seed, log."""
+        log = self.options.log
+        return {
+            "stack": self.stack,
+            "output": self.output,
+            "frames": self.count,
+            "seed": self.options.seed if log is None else None,
+            "log": None if log is None else LOGS.text(log),
+        }
 
 
 def record_frames(

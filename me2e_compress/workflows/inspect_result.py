@@ -116,10 +116,6 @@ class InspectResult(Result):
             f"{known}{number(self.unknown_macs_nodes)} {nodes} not counted: {why}{ways}"
         )
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per module."""
-        return [dataclasses.asdict(item) for item in self.modules]
-
 
 def _activations(item: Item) -> str:
     if item.activation_bytes is None:

@@ -50,10 +50,6 @@ class JoinResult(Result):
         columns = ("part", "input", "fed by", "form")
         return (table("What feeds what", columns, rows, words=4),)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per input of a part."""
-        return [dataclasses.asdict(each) for each in self.fed]
-
 
 def join(stack: str | Path, output: str | Path, *, force: bool = False) -> JoinResult:
     """Join the files that a stack's TOML names, and write them as one graph.

@@ -196,10 +196,6 @@ class LintResult(Result):
         columns = ("", "rule", "node", "what")
         return (table("Findings", columns, rows, "\n".join(more), words=4),)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per finding."""
-        return [dataclasses.asdict(each) for each in self.findings]
-
     def to_json(self) -> object:
         """Return the target, the findings, and the answer of TensorRT-RTX."""
         asked, build = self.options.target, self.build

@@ -63,14 +63,6 @@ class ListResult(Result):
             for kind, found in self.kinds.items()
         )
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per name."""
-        return [
-            {"kind": kind, "name": each.name, "source": each.source, "doc": each.doc}
-            for kind, found in self.kinds.items()
-            for each in found
-        ]
-
     def to_json(self) -> object:
         """Return the entries by kind."""
         return self.kinds

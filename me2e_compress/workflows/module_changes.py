@@ -59,19 +59,6 @@ class ModuleChanges(Result):
             note += f"\n{AT_LEAST}"
         return (table("Module by module", columns, rows, note),)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per module."""
-        return [
-            {
-                "module": item.module,
-                "nodes_before": item.nodes,
-                "nodes": now.nodes if now else 0,
-                "weight_bytes_before": item.weight_bytes,
-                "weight_bytes": now.weight_bytes if now else 0,
-            }
-            for item, now in self._pairs()
-        ]
-
     def _pairs(self) -> list[tuple[Item, Item | None]]:
         held = {item.module: item for item in self.after}
         return [(item, held.get(item.module)) for item in self.before]

@@ -101,11 +101,6 @@ class PlanResult(Result):
         columns = ("of", "kind", "tensors", "read by")
         return (table("Decided together", columns, rows, words=4),)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per node."""
-        names = ("module", "node", "op", "dtype", "rule", "reason", "borderline")
-        return [{n: getattr(each, n) for n in names} for each in self.plan.decisions]
-
     def to_json(self) -> object:
         """Return the plan, or the differences from another."""
         if self.changes is None:

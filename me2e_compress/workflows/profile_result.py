@@ -94,10 +94,6 @@ class ProfileResult(Result):
         note = "; ".join(filter(None, (shown.note, more)))
         return *found, dataclasses.replace(shown, rows=shown.rows[:_SHOWN], note=note)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per inference, in their order."""
-        return [{"latency_us": sample} for sample in self.trace.samples_us]
-
     def to_json(self) -> object:
         """Return the trace, deadlines, shares, joules, and how busy the machine was."""
         load = self.trace.others

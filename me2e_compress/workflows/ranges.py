@@ -39,11 +39,11 @@ class RangesResult(Result):
     def tables(self) -> tuple[Table, ...]:
         """Return a table of the tensors that are furthest off."""
         title = "Ranges, the furthest off first"
-        return (self._table(title, self.records()[:_SHOWN]),)
+        return (self._table(title, self._rows()[:_SHOWN]),)
 
     def details(self) -> tuple[Table, ...]:
         """Return a table of all tensors."""
-        return (self._table("All ranges", self.records()),)
+        return (self._table("All ranges", self._rows()),)
 
     def lines(self) -> tuple[str, ...]:
         """Return the headlines, and what may be meant."""
@@ -56,7 +56,7 @@ class RangesResult(Result):
         """Return what is wrong for all that is known."""
         return self._said("warning")
 
-    def records(self) -> list[dict[str, object]]:
+    def _rows(self) -> list[dict[str, object]]:
         """Return one row per tensor; what is not known is None."""
         crests = self.ranges.crests
         others = {} if self.other is None else self.other.tensors
@@ -79,7 +79,7 @@ class RangesResult(Result):
 
     def to_json(self) -> object:
         """Return what was found, and every tensor."""
-        return {"findings": self.findings, "tensors": self.records()}
+        return {"findings": self.findings, "tensors": self._rows()}
 
     def _said(self, severity: str) -> tuple[str, ...]:
         return tuple(str(each) for each in self.findings if each.severity == severity)

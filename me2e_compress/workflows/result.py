@@ -1,15 +1,13 @@
-"""Results that show themselves: on a terminal, in a notebook, to a program."""
+"""Results of workflows: what is said of them, and the document of `--json`."""
 
-import abc
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from me2e_compress.display import (
     AT_LEAST,
-    MOST_ROWS,
     Cell,
     Displayed,
     Table,
@@ -22,11 +20,9 @@ from me2e_compress.display import (
     significant,
     table,
 )
-from me2e_compress.errors import MissingPackageError
 
 __all__ = [
     "AT_LEAST",
-    "MOST_ROWS",
     "SCHEMA",
     "Cell",
     "Result",
@@ -58,9 +54,17 @@ class Result(Displayed):
         """Return no table where the lines say everything."""
         return ()
 
-    @abc.abstractmethod
-    def records(self) -> list[dict[str, object]]:
-        """Return flat rows of one kind, to compute with."""
+    def details(self) -> tuple[Table, ...]:
+        """Return tables for who wants to know more, such as a row a node; ``-v``."""
+        return ()
+
+    def lines(self) -> tuple[str, ...]:
+        """Return what is said below the tables."""
+        return (self.headline,)
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return what must not be overlooked: said last, in bold."""
+        return ()
 
     def to_json(self) -> object:
         """Return everything, as JSON data: by default what the fields hold."""
@@ -83,19 +87,6 @@ class Result(Displayed):
         said = [*(self.lines() or (self.headline,)), *self.alerts()]
         return {"schema": SCHEMA, "status": self.status, "verdict": said, **found}
 
-    def to_pandas(self) -> Any:
-        """Build a ``pandas.DataFrame`` of the records; pandas must be installed."""
-        try:
-            import pandas as pd
-        except ImportError as error:
-            raise MissingPackageError("pandas") from error
-        return pd.DataFrame(self.records())
-
-    def _repr_html_(self) -> str:
-        """Show the tables in a notebook, or the records where there are none."""
-        records = () if self.tables() else _table_of(self.records())
-        return "".join(each.html() for each in records) + super()._repr_html_()
-
 
 def plain(value: object) -> object:
     """Turn dataclasses, paths, NaN and infinities into what JSON can hold."""
@@ -108,10 +99,3 @@ def plain(value: object) -> object:
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value
-
-
-def _table_of(records: Sequence[Mapping[str, object]]) -> tuple[Table, ...]:
-    if not records:
-        return ()
-    rows = [[str(value) for value in record.values()] for record in records]
-    return (table("", list(records[0]), rows),)

@@ -104,9 +104,9 @@ class RoutesResult(Result):
         columns = ("scenario", "admitted", "tried", "refused because")
         return (table("Routes", columns, rows, words=4),)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per scenario."""
-        return [
+    def to_json(self) -> object:
+        """Return the counts, in all and by scenario."""
+        scenarios = [
             {
                 "scenario": one.scenario,
                 "admitted": len(one.routes),
@@ -115,11 +115,8 @@ class RoutesResult(Result):
             }
             for one in self.harvests
         ]
-
-    def to_json(self) -> object:
-        """Return the counts, in all and by scenario."""
         counts = {"admitted": self.admitted, "tried": self.tried}
-        return {**counts, "scenarios": self.records()}
+        return {**counts, "scenarios": scenarios}
 
 
 def _by_reason(refusals: Sequence[str]) -> str:
@@ -220,13 +217,6 @@ class ExaminationResult(Result):
         rows = [(one.route.id, str(one.refusal)) for one in self.refused]
         columns = ("route", "refused because")
         return (table("Refused", columns, rows, words=2),) if rows else ()
-
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per route."""
-        return [
-            {"route": one.route.id, "admitted": one.admitted, "refusal": one.refusal}
-            for one in self.verdicts
-        ]
 
     def to_json(self) -> object:
         """Return how many were examined, and why some are refused."""

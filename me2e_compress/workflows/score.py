@@ -76,14 +76,6 @@ class ScoreResult(Result):
         real = [line for name, each in self.real.items() for line in each.alerts(name)]
         return (*failed, *real)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per folder and score."""
-        return [
-            {"results": name, **record}
-            for name, scores in self.scores.items()
-            for record in score_records(scores)
-        ]
-
     def to_json(self) -> object:
         """Return the scores of every folder, and EER_AV of all together."""
         found = [
@@ -199,14 +191,6 @@ def scores_table(name: str, scores: Scores) -> Table:
     columns = ("score", "mean", "95 %", "95 %, other types", "n", "unit")
     why = {label: e.measure.reason for label, e in _each(scores) if e.value is None}
     return table(f"{name}: {routes}{partial}", columns, rows, not_measured(why))
-
-
-def score_records(scores: Scores) -> list[dict[str, object]]:
-    """Return one row per score: value, interval, routes, unit, reason."""
-    return [
-        {"score": label.strip(), **estimate.to_json()}
-        for label, estimate in _each(scores)
-    ]
 
 
 def _each(scores: Scores) -> Iterator[tuple[str, Estimate]]:

@@ -78,20 +78,6 @@ class SearchResult(Result):
         note = f"budget: {limits}"
         return (table("Tried, best first", columns, rows, note),)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per assignment; a cost is that of the first budget."""
-        return [
-            {
-                "modules": each.modules,
-                "loss": None if each.score is None else each.score.loss,
-                "predicted_loss": each.loss,
-                "cost": each.measured_costs[0] if each.measured_costs else None,
-                "predicted_cost": each.costs[0],
-                "unit": self.limits[0][0],
-            }
-            for each in self.tried
-        ]
-
     def to_json(self) -> object:
         """Return what was tried; ``unit`` and ``cost`` are of the first budget."""
         tried = [

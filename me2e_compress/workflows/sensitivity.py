@@ -90,19 +90,6 @@ class SensitivityResult(Result):
         note = f"{counted(found.trials, 'variant')} run; all together {size} MB"
         return (table("Int8 module by module", columns, rows, note),)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per module."""
-        return [
-            {
-                "module": each.module,
-                "nodes": each.nodes,
-                "loss": each.score.loss,
-                "unit": each.score.unit,
-                "weight_bytes": each.score.weight_bytes,
-            }
-            for each in self.found.findings
-        ]
-
     def to_json(self) -> object:
         """Return what was found."""
         return self.found

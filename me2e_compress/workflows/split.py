@@ -34,10 +34,6 @@ class SplitResult(Result):
         """Return the parts that are gone."""
         return tuple(f"{each}: no output is left of it" for each in self.missing)
 
-    def records(self) -> list[dict[str, object]]:
-        """Return one row per file."""
-        return [{"part": part, "file": path} for part, path in self.files.items()]
-
 
 def split(
     model: str | Path, stack: str | Path, output: str | Path, *, force: bool = False

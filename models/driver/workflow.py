@@ -8,7 +8,6 @@ from me2e_compress.workflows.checks import check_count, check_folder
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, number, table
-from me2e_compress.workflows.score import score_records
 from models.driver.course import RoundResult, run
 from models.driver.curriculum import FULL, FULL_LATENCY, SMALL, SMALL_LATENCY
 
@@ -45,14 +44,6 @@ class TrainResult(Result):
         ]
         columns = ("round", "routes", "driving score, %", "success rate, %")
         return (table("driven on fresh routes after every round", columns, rows),)
-
-    def records(self) -> list[dict[str, object]]:
-        """Return a row a score of a round."""
-        return [
-            {"round": which, **record}
-            for which, each in enumerate(self.rounds)
-            for record in score_records(each.scores)
-        ]
 
     def to_json(self) -> object:
         """Return driver, log and scores of every round."""

@@ -22,7 +22,7 @@ HEAVY = frozenset(
             "onnx",
             "onnx_ir",
         ),
-        *("onnxruntime", "onnxsim", "pandas", "pydantic", "ray", "scipy", "sympy"),
+        *("onnxruntime", "onnxsim", "pydantic", "ray", "scipy", "sympy"),
         "torch",
     }
 )

@@ -177,17 +177,13 @@ def test_a_study_is_silent_and_its_file_is_taken_as_it_is(
     assert found.study == load_study(toml)
 
 
-def test_a_study_shows_itself_in_a_notebook(found: StudyResult) -> None:
-    shown = found._repr_html_()
+def test_a_study_shows_itself(found: StudyResult) -> None:
+    titles = [each.title for each in found.tables()]
 
-    assert "Scoreboard, ideal: decisions cost no time" in shown
-    assert "<fast>" not in shown
+    assert any("Scoreboard, ideal: decisions cost no time" in t for t in titles)
     assert repr(found) == (
         "<StudyResult: Slow & <fast>: 4 variants under 2 conditions on 2 of 220 routes>"
     )
-    assert [(row["variant"], row["condition"]) for row in found.records()] == [
-        (each.variant, each.condition) for each in found.drives
-    ]
 
 
 def test_studies_share_what_they_have_in_common(make: Make, tmp_path: Path) -> None:

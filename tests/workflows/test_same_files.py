@@ -215,9 +215,7 @@ def test_a_result_shows_itself(
 
     assert isinstance(found, Result)
     assert "\n" not in found.headline
-    assert found.headline.replace("->", "-&gt;") in found._repr_html_()
-    columns = {tuple(record) for record in found.records()}
-    assert len(columns) == (name != "lint")
+    assert found.headline in repr(found)
 
 
 def test_a_result_says_in_one_line_what_it_is(dense: Path) -> None:

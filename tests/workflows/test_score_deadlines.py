@@ -46,5 +46,5 @@ def test_what_ds_does_not_see_stands_beside_it(tmp_path: Path) -> None:
 
     told = "driving score 100.0 (- to -), room kept 50.0 (- to -) %; 1 of 1 routes"
     assert found.headline.endswith(told)
-    rows = [each["score"] for each in found.records()]
+    rows = [row[0].text for row in found.tables()[0].rows]
     assert rows[3:5] == ["efficiency", "Bench2Drive's efficiency"]

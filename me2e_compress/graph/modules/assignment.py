@@ -7,7 +7,7 @@ from typing import Literal
 
 import onnx_ir as ir
 
-from me2e_compress.display import Displayed, Table, table
+from me2e_compress.display import Displayed
 from me2e_compress.graph.modules.module_map import ModuleMap
 
 Rule = Literal["stamp", "parameter", "scope", "neighbour"]
@@ -33,12 +33,6 @@ class Assignment(Displayed):
         """Count the nodes, by rule."""
         counts = ", ".join(f"{count} by {rule}" for rule, count in self.rules().items())
         return f"map {self.modules.name}, {len(self.placements)} nodes: {counts}"
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return a row per module: its nodes."""
-        nodes = Counter(place.module for place in self.placements.values())
-        rows = [(name, str(nodes[name])) for name in self.modules.names()]
-        return (table("Nodes by module", ("module", "nodes"), rows),)
 
     def module_of(self, node: ir.Node) -> str:
         """Return the module of a node of the graph that was assigned."""

@@ -9,7 +9,7 @@ from typing import Literal, Self
 
 import pydantic
 
-from me2e_compress.display import Displayed, Table, table
+from me2e_compress.display import Displayed
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.graph.modules.paths import PathGlob, is_malformed
 from me2e_compress.registry import documents
@@ -165,14 +165,6 @@ class ModuleMap(Displayed):
     def headline(self) -> str:
         """Name the map and its modules."""
         return f"{self.name}: {', '.join(self.names())}"
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return a row per module: its role and the names it goes by."""
-        rows = [
-            (each.name, each.role, ", ".join(each.patterns + each.optional))
-            for each in self.modules
-        ]
-        return (table("Modules", ("module", "role", "patterns"), rows, words=3),)
 
     def names(self, role: Role | None = None) -> tuple[str, ...]:
         """List the modules, all or those of a role, in the order of the file."""
