@@ -1,6 +1,5 @@
 """Tables, and how numbers and counts are written in them."""
 
-import abc
 import html
 import math
 import re
@@ -165,19 +164,6 @@ def giga(macs: int | None, unknown: int | None = 0, form: str = ".2f") -> str:
     if macs is None:
         return "-"
     return ("≥ " if unknown else "") + format(macs / 1e9, form)
-
-
-class Displayed(abc.ABC):
-    """What is shown in one line, its repr."""
-
-    @property
-    @abc.abstractmethod
-    def headline(self) -> str:
-        """What it is, in one line."""
-
-    def __repr__(self) -> str:
-        """Show the class and the one line."""
-        return f"<{type(self).__name__}: {self.headline}>"
 
 
 def in_markdown(text: str) -> str:

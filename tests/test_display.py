@@ -1,16 +1,9 @@
-"""Public objects show themselves in one line; how numbers are written."""
-
-from collections.abc import Callable, Mapping
-from pathlib import Path
+"""A frame in one line, a plan as a table; how numbers are written."""
 
 import numpy as np
-import onnx_ir as ir
 import pytest
 
-from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.display import (
-    Displayed,
     counted,
     not_measured,
     number,
@@ -18,19 +11,13 @@ from me2e_compress.display import (
     reason,
     significant,
 )
-from me2e_compress.graph.modules import ModuleMap, assign
-from me2e_compress.manager import PassManager
-from me2e_compress.passes import PASSES, Context
 from me2e_compress.quantization.plan import QuantPlan
 from me2e_compress.quantization.plan.decision import Decision
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.latency_trace import LatencyTrace
-from tests.command import write_frames
-from tests.conftest import DRIVER, DRIVER_MAP
 
 COUNT = 400
-"""Nodes, tensors or samples of an object: enough for a long repr."""
+"""Nodes of a plan."""
 
 
 def plan() -> QuantPlan:
@@ -39,36 +26,6 @@ def plan() -> QuantPlan:
         for at in range(COUNT)
     )
     return QuantPlan(QuantScheme("full", ("head",)), tuple(made))
-
-
-def recording(folder: Path) -> CalibrationSet:
-    write_frames(folder / "frames", camera=np.zeros((1, 4), np.float32))
-    return CalibrationSet(str(folder / "frames"))
-
-
-MADE: Mapping[str, Callable[[Path], Displayed]] = {
-    "assignment": lambda folder: assign(
-        ir.from_onnx_text(DRIVER), ModuleMap.parse(DRIVER_MAP, "mine")
-    ),
-    "calibration set": recording,
-    "module map": lambda folder: ModuleMap.load("vad"),
-    "plan": lambda folder: plan(),
-    "ranges": lambda folder: Ranges(
-        {f"t{at}": (-1.0, 1.0) for at in range(COUNT)}, "max-min", 2, "m", "f"
-    ),
-    "report": lambda folder: PassManager((PASSES.parse("eliminate-redundant"),)).run(
-        ir.from_onnx_text(DRIVER), Context(ModuleMap.parse(DRIVER_MAP, "mine"))
-    ),
-    "trace": lambda folder: LatencyTrace("0", "a CPU", tuple(range(COUNT))),
-}
-
-
-@pytest.mark.parametrize("name", MADE)
-def test_a_public_object_is_one_short_line(tmp_path: Path, name: str) -> None:
-    shown = repr(MADE[name](tmp_path))
-
-    assert "\n" not in shown
-    assert len(shown) < 160
 
 
 def test_a_frame_does_not_show_its_pictures() -> None:

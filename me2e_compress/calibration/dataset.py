@@ -18,7 +18,7 @@ import onnx_ir as ir
 from me2e_compress.calibration.archives import Declared, declared, load_arrays
 from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.calibration.static_inputs import check_static, static_inputs
-from me2e_compress.display import Displayed, counted, reason
+from me2e_compress.display import reason
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.recurrence import not_fed_back, recurrent_inputs, sides
@@ -30,7 +30,7 @@ T = TypeVar("T", Array, Declared)
 __all__ = ["CalibrationSet", "Frame", "synthetic"]
 
 
-class CalibrationSet(Displayed):
+class CalibrationSet:
     """A recording on disk, read frame by frame.
 
     Raises:
@@ -51,12 +51,6 @@ class CalibrationSet(Displayed):
         index = _index(folder / "scenes.json")
         self.scenes = _scenes(folder / "scenes.json", index, len(self.files))
         self.pixels = _pixels(folder / "scenes.json", index).inputs
-
-    @property
-    def headline(self) -> str:
-        """The folder and the numbers of frames and scenes."""
-        frames, scenes = counted(len(self), "frame"), counted(len(self.scenes), "scene")
-        return f"{self.folder}: {frames} in {scenes}"
 
     def __len__(self) -> int:
         return len(self.files)

@@ -18,7 +18,7 @@ import numpy as np
 
 from me2e_compress.calibration.archives import declared, load_arrays
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.display import Displayed, counted, reason
+from me2e_compress.display import counted, reason
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
@@ -32,7 +32,7 @@ _KEPT = 8
 """Frames in memory: some are read again and again."""
 
 
-class EngineDump(Displayed):
+class EngineDump:
     """What an engine answered, read frame by frame.
 
     Attributes:
@@ -49,11 +49,6 @@ class EngineDump(Displayed):
         self._read, self.stems, self.named = _opened(self.path)
         self._at = functools.lru_cache(maxsize=_KEPT)(self._read)
         self.names = tuple(self[0])
-
-    @property
-    def headline(self) -> str:
-        """The path and the number of frames."""
-        return f"{self.path}: answers to {counted(len(self), 'frame')}"
 
     def __len__(self) -> int:
         return len(self.stems)

@@ -13,7 +13,7 @@ import pydantic
 from me2e_compress.calibration.observers import OBSERVERS, Observer
 from me2e_compress.calibration.observers.base import MaxMin
 from me2e_compress.calibration.statistics import ALL_ZERO, NOT_FINITE, Statistics
-from me2e_compress.display import Displayed, counted
+from me2e_compress.display import counted
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_document
@@ -39,7 +39,7 @@ were the same in all, were zero in all, or had a NaN or infinity."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Ranges(Displayed):
+class Ranges:
     """The range of every calibrated tensor.
 
     Attributes:

@@ -95,9 +95,6 @@ def show(found: Result, tables: Sequence[Table] | None = None) -> None:
     # tables first, so that the verdict stays in sight at the end
     for each in found.tables() if tables is None else tables:
         print_table(each)
-    if tables is None and is_verbose():
-        for each in found.details():
-            print_table(each)
     for line in found.lines():
         say(line)
     for line in found.alerts():

@@ -11,7 +11,6 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.display import (
     AT_LEAST,
-    Displayed,
     Table,
     counted,
     giga,
@@ -133,7 +132,7 @@ class Verification:
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Report(Displayed):
+class Report:
     """The compressed model and how it came to be.
 
     Attributes:
@@ -156,14 +155,6 @@ class Report(Displayed):
     def unproven(self) -> tuple[Verification, ...]:
         """The checks of exact passes in which no output could be judged."""
         return tuple(each for each in self.verifications if each.unproven is not None)
-
-    @property
-    def headline(self) -> str:
-        """Count the passes, and the nodes before and after."""
-        if not self.steps:
-            return "no passes"
-        nodes = self.steps[0].before.counted_nodes, self.steps[-1].after.counted_nodes
-        return f"{len(self.steps)} passes, {' → '.join(nodes)} nodes"
 
     def tables(self) -> tuple[Table, ...]:
         """Return pass by pass what changed, and how exact passes were checked."""

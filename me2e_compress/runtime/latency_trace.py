@@ -7,7 +7,7 @@ from typing import Annotated, Any, Self, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from me2e_compress.display import Displayed, Table, counted, not_measured, table
+from me2e_compress.display import Table, counted, not_measured, table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.percentiles import percentile, too_few
 from me2e_compress.registry import documents, drafts
@@ -79,7 +79,7 @@ def _ms(taken_us: int | None) -> str:
 
 
 @dataclass(frozen=True, repr=False)
-class LatencyTrace(Displayed):
+class LatencyTrace:
     """Latencies in the order in which they were measured.
 
     Attributes:

@@ -12,7 +12,6 @@ from me2e_compress.study.definition import Study, Timing, Variant
 from me2e_compress.study.report.page import Section
 from me2e_compress.study.run import run_study
 from me2e_compress.study.study_result import StudyResult
-from me2e_compress.study.tables import differences, scoreboards
 from me2e_compress.study.verdict import before_and_after, road_verdict
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.study.write import StudyFiles, write_study
@@ -61,10 +60,6 @@ class DriveResult(Result):
     def tables(self) -> tuple[Table, ...]:
         """Return size, time, plan and driving, before and after."""
         return (before_and_after(self.study, self.variant),)
-
-    def details(self) -> tuple[Table, ...]:
-        """Return scoreboard and differences."""
-        return (*scoreboards(self.study), differences(self.study))
 
     def to_json(self) -> object:
         """Return the whole study as JSON."""

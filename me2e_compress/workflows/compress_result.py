@@ -71,11 +71,6 @@ class CompressResult(Result):
         measured = None if self.loss is None else self.loss.table()
         return (*self.report.tables(), *filter(None, [measured]))
 
-    def details(self) -> tuple[Table, ...]:
-        """Return the largest weights that stay float."""
-        weights = None if self.int8 is None else self.int8.table()
-        return tuple(filter(None, [weights]))
-
     def lines(self) -> tuple[str, ...]:
         """Return the verdict: int8, how far outputs and plan moved, time and size."""
         said = (*self.verdict(), self._time, self.headline, self.weights)

@@ -39,11 +39,6 @@ class DemoResult(Result):
         """Return the tables of the last step, which compares before and after."""
         return self._last.tables()
 
-    def details(self) -> tuple[Table, ...]:
-        """Return the tables of the other steps, and the last one's details."""
-        *others, last = self.steps.values()
-        return (*(each for step in others for each in step.tables()), *last.details())
-
     def to_json(self) -> object:
         """Return the result of each step."""
         return {name: each.to_json() for name, each in self.steps.items()}

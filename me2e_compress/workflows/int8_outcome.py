@@ -14,7 +14,7 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import FLOAT, Decision, QuantPlan, plan_of
 from me2e_compress.runtime.providers import CPU
-from me2e_compress.workflows.result import Table, counted, megabytes, table
+from me2e_compress.workflows.result import counted, megabytes
 
 LEAST_BYTES = 1024
 """Smaller constants are not worth a word."""
@@ -87,8 +87,8 @@ def _float_weight(value: ir.Value, decision: Decision, kept: str | None) -> Floa
     )
 
 
-LISTED, SHOWN = 10, 5
-"""Numbers of float weights that a report lists, and that a table shows."""
+LISTED = 10
+"""Number of float weights that a report lists."""
 LEAST_SHOWN = 10_000
 """Bytes of float weights from which on a rule is named."""
 _FOR_TENSORRT = (
@@ -161,17 +161,6 @@ class Int8Outcome:
             said += f"; {total} MB of weights stay float"
             said += f", by rule: {rules}" if rules else ""
         return said
-
-    def table(self) -> Table | None:
-        """Return the largest weights that stayed float, and why; None without any."""
-        if not self.weights:
-            return None
-        rows = [
-            (each.name, each.op, f"{each.rule}: {each.reason}", megabytes(each.bytes))
-            for each in self.weights[:SHOWN]
-        ]
-        columns = ("weight", "read by", "rule", "MB")
-        return table("Largest weights that stay float", columns, rows, words=3)
 
     @property
     def empty(self) -> str:

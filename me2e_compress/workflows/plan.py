@@ -79,7 +79,7 @@ class PlanResult(Result):
         """Return how many nodes of each module became what, by which rule."""
         return () if self.changes is not None else self.plan.tables()
 
-    def details(self) -> tuple[Table, ...]:
+    def nodes(self) -> tuple[Table, ...]:
         """Return one row per node that could be int8, and what was decided together."""
         if self.changes is not None:
             return ()

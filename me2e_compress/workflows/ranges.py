@@ -18,7 +18,7 @@ from me2e_compress.registry import documents
 from me2e_compress.workflows.result import Result, Table, number, table
 
 _SHOWN = 10
-"""Rows of the table without ``-v``."""
+"""Rows of the table; ``--json`` has all tensors."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -38,12 +38,16 @@ class RangesResult(Result):
 
     def tables(self) -> tuple[Table, ...]:
         """Return a table of the tensors that are furthest off."""
-        title = "Ranges, the furthest off first"
-        return (self._table(title, self._rows()[:_SHOWN]),)
-
-    def details(self) -> tuple[Table, ...]:
-        """Return a table of all tensors."""
-        return (self._table("All ranges", self._rows()),)
+        columns = ["low", "high", "rms", "crest"]
+        if self.other is not None:
+            columns += ["other", "ratio"]
+        cells = [
+            [str(row["tensor"]), *(_written(row[each]) for each in columns)]
+            for row in self._rows()[:_SHOWN]
+        ]
+        heads = {"crest": "range / rms", "other": f"range in {self.other_path}"}
+        named = ["tensor", *(heads.get(each, each) for each in columns)]
+        return (table("Ranges, the furthest off first", named, cells),)
 
     def lines(self) -> tuple[str, ...]:
         """Return the headlines, and what may be meant."""
@@ -83,17 +87,6 @@ class RangesResult(Result):
 
     def _said(self, severity: str) -> tuple[str, ...]:
         return tuple(str(each) for each in self.findings if each.severity == severity)
-
-    def _table(self, title: str, rows: list[dict[str, object]]) -> Table:
-        columns = ["low", "high", "rms", "crest"]
-        if self.other is not None:
-            columns += ["other", "ratio"]
-        cells = [
-            [str(row["tensor"]), *(_written(row[each]) for each in columns)]
-            for row in rows
-        ]
-        heads = {"crest": "range / rms", "other": f"range in {self.other_path}"}
-        return table(title, ["tensor", *(heads.get(c, c) for c in columns)], cells)
 
 
 def _written(value: object) -> str:

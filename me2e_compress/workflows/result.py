@@ -1,5 +1,6 @@
 """Results of workflows: what is said of them, and the document of `--json`."""
 
+import abc
 import dataclasses
 import math
 from collections.abc import Mapping
@@ -9,7 +10,6 @@ from typing import Literal
 from me2e_compress.display import (
     AT_LEAST,
     Cell,
-    Displayed,
     Table,
     counted,
     duration,
@@ -47,15 +47,20 @@ grows where a key goes or changes its meaning, not where one is added."""
 Status = Literal["ok", "warning", "refused"]
 
 
-class Result(Displayed):
+class Result(abc.ABC):
     """The result of a workflow."""
+
+    @property
+    @abc.abstractmethod
+    def headline(self) -> str:
+        """What it is, in one line."""
+
+    def __repr__(self) -> str:
+        """Show the class and the one line."""
+        return f"<{type(self).__name__}: {self.headline}>"
 
     def tables(self) -> tuple[Table, ...]:
         """Return no table where the lines say everything."""
-        return ()
-
-    def details(self) -> tuple[Table, ...]:
-        """Return tables for who wants to know more, such as a row a node; ``-v``."""
         return ()
 
     def lines(self) -> tuple[str, ...]:

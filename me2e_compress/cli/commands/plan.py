@@ -7,6 +7,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import show
+from me2e_compress.cli.verbosity import is_verbose
 from me2e_compress.workflows import plan as workflow
 
 Model = Annotated[
@@ -35,4 +36,4 @@ def plan(
     """
     options = workflow.PlanOptions(scheme, rules, target, overrides, module_map, force)
     found = workflow.plan(model, output, against, options)
-    show(found)
+    show(found, (*found.tables(), *found.nodes()) if is_verbose() else None)

@@ -7,7 +7,6 @@ from typing import Literal
 
 import onnx_ir as ir
 
-from me2e_compress.display import Displayed
 from me2e_compress.graph.modules.module_map import ModuleMap
 
 Rule = Literal["stamp", "parameter", "scope", "neighbour"]
@@ -22,17 +21,11 @@ class Placement:
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Assignment(Displayed):
+class Assignment:
     """The module of every node of a graph and its subgraphs, in graph order."""
 
     modules: ModuleMap
     placements: Mapping[ir.Node, Placement]
-
-    @property
-    def headline(self) -> str:
-        """Count the nodes, by rule."""
-        counts = ", ".join(f"{count} by {rule}" for rule, count in self.rules().items())
-        return f"map {self.modules.name}, {len(self.placements)} nodes: {counts}"
 
     def module_of(self, node: ir.Node) -> str:
         """Return the module of a node of the graph that was assigned."""

@@ -9,7 +9,6 @@ from typing import Literal, Self
 
 import pydantic
 
-from me2e_compress.display import Displayed
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.graph.modules.paths import PathGlob, is_malformed
 from me2e_compress.registry import documents
@@ -67,7 +66,7 @@ class Ports(_Strict):
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class ModuleMap(Displayed):
+class ModuleMap:
     """The modules of a stack and the names they go by.
 
     One list of patterns per module is matched against both parameter names
@@ -160,11 +159,6 @@ class ModuleMap(Displayed):
     def whole(cls) -> Self:
         """Return the map of a graph that is no ME2E stack: one module, ``model``."""
         return cls(WHOLE, (Module("model", "feature", (), ("**",)),))
-
-    @property
-    def headline(self) -> str:
-        """Name the map and its modules."""
-        return f"{self.name}: {', '.join(self.names())}"
 
     def names(self, role: Role | None = None) -> tuple[str, ...]:
         """List the modules, all or those of a role, in the order of the file."""

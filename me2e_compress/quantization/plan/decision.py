@@ -9,7 +9,7 @@ from pathlib import Path
 import onnx_ir as ir
 import pydantic
 
-from me2e_compress.display import Displayed, Table, table
+from me2e_compress.display import Table, table
 from me2e_compress.errors import RecipeError
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.operators import int8_op_types
@@ -98,7 +98,7 @@ class KeptFloat:
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class QuantPlan(Displayed):
+class QuantPlan:
     """Decisions for every node of a graph, in graph order; the same for all targets.
 
     Attributes:

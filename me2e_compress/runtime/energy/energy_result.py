@@ -8,7 +8,7 @@ from typing import Annotated, Any, Self, TypeAlias
 import numpy as np
 from pydantic import Field, TypeAdapter
 
-from me2e_compress.display import Displayed, Table, table
+from me2e_compress.display import Table, table
 from me2e_compress.errors import EnergyError
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_document
@@ -25,7 +25,7 @@ bad case is 187 J beside 327 J (Zeus, issue 181)."""
 
 
 @dataclass(frozen=True, repr=False)
-class EnergyResult(Displayed):
+class EnergyResult:
     """Energy per frame over windows of a counter; None means not measured.
 
     Frames run one at a time, back to back, as in MLPerf's SingleStream.
