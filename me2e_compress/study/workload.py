@@ -88,15 +88,6 @@ class Workload(Result):
         columns = ("variant", "condition", "routes driven", "time left")
         return (Table("Drives", columns, tuple(rows), words=2),)
 
-    def to_json(self) -> object:
-        """Return the drives and the hours."""
-        return {
-            "title": self.title,
-            "hours": self.hours,
-            "workers": self.workers,
-            "drives": self.drives,
-        }
-
 
 def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
     """Count the missing routes, and estimate the hours.

@@ -77,10 +77,6 @@ class ModelCheck(Result):
         columns = ("", "name", "shape", "type", "fed by, or used as")
         return (table(self.policy, columns, rows, words=5),)
 
-    def to_json(self) -> object:
-        """Return everything."""
-        return {"fits": self.fits, **dataclasses.asdict(self)}
-
 
 def check_model(
     policy: str | Path,

@@ -99,14 +99,11 @@ class CompareResult(Result):
 
     def to_json(self) -> object:
         """Return the fidelity, agents, and liveness."""
-        alive = None if self.liveness is None else dataclasses.asdict(self.liveness)
-        agents = None if self.agents is None else dataclasses.asdict(self.agents)
-        runtime = None if self.runtime is None else dataclasses.asdict(self.runtime)
         return {
             **dataclasses.asdict(self.fidelity),
-            "agents": agents,
-            "liveness": alive,
-            "runtime": runtime,
+            "agents": self.agents,
+            "liveness": self.liveness,
+            "runtime": self.runtime,
             "slow_here": self.slow_here,
         }
 

@@ -60,7 +60,7 @@ class FirstDifferenceResult(Result):
 
     def to_json(self) -> object:
         """Return all that was compared."""
-        return dataclasses.asdict(self.found)
+        return self.found
 
 
 def headline_of(found: FirstDifference) -> str:

@@ -102,7 +102,7 @@ class ProfileResult(Result):
             "deadlines": self.deadlines.to_json(),
             "modules": shares(self.trace.modules_us),
             "operators": shares(self.operators_us),
-            "energy": None if self.energy is None else self.energy.to_json(),
+            "energy": self.energy,
             "slow_here": self.slow_here,
             **(
                 {"others_cores": None, "cores": None}

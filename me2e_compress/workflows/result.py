@@ -40,7 +40,7 @@ __all__ = [
 ]
 
 
-SCHEMA = 2
+SCHEMA = 3
 """Version of the documents that ``--json`` prints; docs/json.md tells their keys. It
 grows where a key goes or changes its meaning, not where one is added."""
 

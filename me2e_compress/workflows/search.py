@@ -79,19 +79,9 @@ class SearchResult(Result):
         return (table("Tried, best first", columns, rows, note),)
 
     def to_json(self) -> object:
-        """Return what was tried; ``unit`` and ``cost`` are of the first budget."""
-        tried = [
-            dataclasses.asdict(each)
-            | {
-                "cost": each.costs[0],
-                "measured_cost": each.measured_costs[0]
-                if each.measured_costs
-                else None,
-            }
-            for each in self.tried
-        ]
+        """Return the budgets, and what was tried."""
         budgets = [{"unit": unit, "limit": limit} for unit, limit in self.limits]
-        return {"unit": self.limits[0][0], "budgets": budgets, "tried": tried}
+        return {"budgets": budgets, "tried": self.tried}
 
 
 def search(

@@ -10,13 +10,12 @@ from me2e_compress.cli.app import COMMANDS
 from tests.docs.documents import EVERY, PAGE, faults, sections
 
 GOOD = {
-    "schema": 2,
+    "schema": 3,
     "status": "ok",
     "verdict": ["done"],
     "stack": "highway",
     "output": "m.onnx",
     "opset": 17,
-    "bytes": 1,
     "weights": None,
 }
 WEIGHTS: dict[str, object] = {
@@ -57,6 +56,6 @@ def test_what_differs_from_the_page_is_found(
 
 
 def test_a_key_that_is_missing_is_found() -> None:
-    lacking = {key: value for key, value in GOOD.items() if key != "bytes"}
+    lacking = {key: value for key, value in GOOD.items() if key != "opset"}
 
-    assert faults("export", lacking) == ["bytes is missing"]
+    assert faults("export", lacking) == ["opset is missing"]

@@ -160,6 +160,10 @@ class ModuleMap:
         """Return the map of a graph that is no ME2E stack: one module, ``model``."""
         return cls(WHOLE, (Module("model", "feature", (), ("**",)),))
 
+    def __repr__(self) -> str:
+        """Name the map and its modules: fingerprints of drives hold it."""
+        return f"<ModuleMap: {self.name}: {', '.join(self.names())}>"
+
     def names(self, role: Role | None = None) -> tuple[str, ...]:
         """List the modules, all or those of a role, in the order of the file."""
         return tuple(m.name for m in self.modules if role in (None, m.role))

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeAlias
+from typing import Annotated, Self, TypeAlias
 
 import numpy as np
 from pydantic import Field, TypeAdapter
@@ -150,14 +150,10 @@ class EnergyResult:
         ]
         return notes
 
-    def to_json(self) -> dict[str, Any]:
-        """Return every attribute by name."""
-        return asdict(self)
-
     def save(self, path: Path) -> None:
         """Write the result atomically."""
         with drafts.written(path, EnergyError):
-            write_document(path, self.to_json(), indent=2)
+            write_document(path, asdict(self), indent=2)
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -1,7 +1,7 @@
 """What was measured is written, read back and shown; what was not has a reason."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -43,9 +43,7 @@ def test_what_is_saved_is_read_back(result: EnergyResult, tmp_path: Path) -> Non
 
 
 def test_nothing_measured_is_null_and_says_why() -> None:
-    found = NONE.to_json()
-
-    assert (found["joules"], found["j_per_frame"], found["low"]) == (None, None, None)
+    assert (NONE.joules, NONE.j_per_frame, NONE.low) == (None, None, None)
     assert NONE.headline == f"energy: not measured: {NONE.reason}"
     assert NONE.tables() == ()
 
@@ -86,7 +84,7 @@ def test_a_file_that_contradicts_itself_is_one_line(
     change: dict[str, object], fault: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "energy.json"
-    path.write_text(json.dumps({**FOUND.to_json(), **change}))
+    path.write_text(json.dumps({**asdict(FOUND), **change}))
 
     with pytest.raises(EnergyError, match=fault) as caught:
         EnergyResult.load(path)
