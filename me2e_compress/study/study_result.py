@@ -74,25 +74,6 @@ class StudyResult(StudyOutcome, Result):
         by_section = self.tables_by_section.values()
         return tuple(table for tables in by_section for table in tables)
 
-    def _record(self, drive: DriveRecord) -> dict[str, object]:
-        # a drive that was not made has no scores
-        scores, of = drive.scores, self.variant(drive.variant)
-        names = (
-            *("driving_score", "success_rate", "efficiency", "comfort"),
-            *("bench2drive_efficiency", "bench2drive_smoothness"),
-        )
-        found = {} if scores is None else {n: getattr(scores, n).value for n in names}
-        if scores is not None:
-            found["room_kept"] = scores.safety.room_kept.value
-        return {
-            "variant": drive.variant,
-            "condition": drive.condition,
-            **found,
-            "size_mb": of.size_mb.value,
-            **{f"p{p}_ms": each.value for p, each in of.latency_ms.items()},
-            "plan_mean_m": of.fidelity.mean_m.value,
-        }
-
     def to_json(self) -> dict[str, Any]:
         """Return a document; the same study and seed give the same bytes but latencies.
 
