@@ -13,20 +13,15 @@ GOOD = {
     "schema": 3,
     "status": "ok",
     "verdict": ["done"],
-    "stack": "highway",
-    "output": "m.onnx",
-    "opset": 17,
-    "weights": None,
+    "budgets": [{"unit": "s", "limit": 1.0}],
+    "tried": [],
 }
-WEIGHTS: dict[str, object] = {
-    "file": "m.pth",
-    "sha256": "0",
-    "epoch": None,
-    "iteration": 3,
-    "averaged": False,
-    "converted": {},
-    "unread": ["head.weight"],
-    "averages": 0,
+TRIED: dict[str, object] = {
+    "modules": ["head"],
+    "loss": 0.1,
+    "costs": [1],
+    "score": None,
+    "measured_costs": None,
 }
 
 
@@ -42,20 +37,20 @@ def test_the_page_has_no_other_section() -> None:
     ("change", "fault"),
     [
         ({}, []),
-        ({"opset": "17"}, ["opset is a str"]),
+        ({"tried": "17"}, ["tried is a str"]),
         ({"more": 1}, ["more is not documented"]),
         ({"verdict": [1]}, ["verdict[] is a int"]),
-        ({"weights": {**WEIGHTS, "sha256": None}}, ["weights.sha256 is a NoneType"]),
-        ({"weights": {**WEIGHTS, "converted": {"float16": 2}}}, []),
+        ({"budgets": [{"unit": None, "limit": 1}]}, ["budgets[].unit is a NoneType"]),
+        ({"tried": [TRIED]}, []),
     ],
 )
 def test_what_differs_from_the_page_is_found(
     change: dict[str, object], fault: list[str]
 ) -> None:
-    assert faults("export", {**GOOD, **change}) == fault
+    assert faults("search", {**GOOD, **change}) == fault
 
 
 def test_a_key_that_is_missing_is_found() -> None:
-    lacking = {key: value for key, value in GOOD.items() if key != "opset"}
+    lacking = {key: value for key, value in GOOD.items() if key != "tried"}
 
-    assert faults("export", lacking) == ["opset is missing"]
+    assert faults("search", lacking) == ["tried is missing"]
