@@ -14,6 +14,7 @@ otherwise is the difference.
 """
 
 import argparse
+import dataclasses
 import json
 import sys
 import time
@@ -167,9 +168,9 @@ def measured(given: Any) -> dict[str, Any]:
         "gpu_mb": None if reason else taken,
         "gpu_reason": reason,
         "host_mb": peak_mb(),
-        "energy": (
+        "energy": dataclasses.asdict(
             energy(run, provider) if given.energy else EnergyResult(reason="not asked")
-        ).to_json(),
+        ),
     }
 
 

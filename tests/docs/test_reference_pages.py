@@ -55,7 +55,7 @@ def test_the_code_of_a_page_runs(page: Path, folder: Path, site: Path) -> None:
     script = folder / "page.py"
     code = "".join(block.text for block in blocks(page, "python"))
     script.write_text(BEFORE.get(page.stem, "") + code)
-    cells = "exec(open('page.py', encoding='utf-8').read())"  # as in a notebook
+    cells = "exec(open('page.py', encoding='utf-8').read())"  # it has no main guard
     run([sys.executable, "-c", cells], folder, site)
 
 
