@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import chain, islice, repeat
 from pathlib import Path
-from statistics import median
 from time import perf_counter, process_time
 
 from me2e_compress.graph import sha256_of
@@ -36,35 +35,23 @@ class RunTimes:
     cpu_s: tuple[float, ...]
 
     @property
-    def median_wall_s(self) -> float:
-        """The median wall time in seconds."""
-        return median(self.wall_s)
-
-    @property
     def best_wall_s(self) -> float:
         """The least wall time in seconds: that of an idle machine."""
         return min(self.wall_s)
 
 
 def time_interleaved(
-    sessions: Mapping[str, Session],
-    frames: Sequence[Frame],
-    rounds: int,
-    on_run: Callable[[int, int, str], None] | None = None,
+    sessions: Mapping[str, Session], frames: Sequence[Frame], rounds: int
 ) -> dict[str, RunTimes]:
     """Time one frame of every model in turn, A B C A B C, after one uncounted round.
 
     All models should have the same number of threads. Only the first frame is run, with
-    recurrent state at zeros; ``on_run`` is called with runs done, all runs, and the
-    name.
+    recurrent state at zeros.
     """
     wall: dict[str, list[float]] = {name: [] for name in sessions}
     cpu: dict[str, list[float]] = {name: [] for name in sessions}
-    total = (rounds + 1) * len(sessions)
     for turn in range(rounds + 1):
-        for place, (name, session) in enumerate(sessions.items()):
-            if on_run is not None:
-                on_run(turn * len(sessions) + place, total, name)
+        for name, session in sessions.items():
             start, used = perf_counter(), process_time()
             for _ in replay(session, frames[:1]):
                 pass

@@ -179,12 +179,10 @@ def check_number(
     )
 
 
-def check_count(
-    option: str, value: int, least: int = 0, most: int | None = None
-) -> None:
-    """Refuse a count below `least`, or above `most` unless that is None."""
-    if value < least:
-        raise RecipeError(f"{option} is {value}: it must be {least} or more")
+def check_count(option: str, value: int, most: int | None = None) -> None:
+    """Refuse a count below 0, or above `most` unless that is None."""
+    if value < 0:
+        raise RecipeError(f"{option} is {value}: it must be 0 or more")
     if most is not None and value > most:
         raise RecipeError(f"{option} is {value}: it must be {most:,} at most")
 
