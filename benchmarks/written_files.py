@@ -41,20 +41,20 @@ compress highway -r minus-occ --frames frames -o minus-occ.onnx
 compress seven.onnx -r exact -o seven.exact.onnx
 compress seven.onnx -r full --target tensorrt --frames seven -o seven.full.onnx
 calibrate seven.onnx seven -o seven.ranges.json --method percentile:99.9
-compress seven.onnx --scheme full --target tensorrt --ranges seven.ranges.json \\
+compress seven.onnx --scheme full --target tensorrt --ranges seven.ranges.json \
 --method percentile:99.9 -o seven.ranges.onnx
-calibrate highway frames -o ranges.json --tensorrt-cache trt.cache \\
+calibrate highway frames -o ranges.json --tensorrt-cache trt.cache \
 --onnxruntime-table table
 plan highway --scheme prediction -o prediction.plan.json
 evaluate blind --routes 44 -o blind
-evaluate blind:9 --routes 2 --latency trace{trace=trace.json,in_order=true} \\
+evaluate blind:9 --routes 2 --latency trace{trace=trace.json,in_order=true} \
 -o blind-in-order
 evaluate expert --routes 11 -o expert
 evaluate expert --routes HardBreakRoute_R2_1 --render HardBreakRoute_R2_1 -o rendered
 evaluate highway --routes 20 -o highway
-evaluate highway --routes HazardAtSideLane_R2_0,Accident_R2_0 --latency fps:2 \\
+evaluate highway --routes HazardAtSideLane_R2_0,Accident_R2_0 --latency fps:2 \
 -o highway-fps
-evaluate highway --routes HazardAtSideLane_R2_0,Accident_R2_0 --latency \\
+evaluate highway --routes HazardAtSideLane_R2_0,Accident_R2_0 --latency \
 trace:trace.json --seed 3 --weather fog_m=80,noise=0.02,dropped=BACK -o highway-trace
 score blind expert highway highway-fps highway-trace --json > scores.json
 study study.toml -o study
