@@ -212,11 +212,17 @@ def test_futures_are_known_until_the_end(calm: Arrays) -> None:
     assert known[-1] <= 2
 
 
+STRAIGHT = 8
+"""Samples before the junction."""
+
+
 def test_noise_leaves_the_route(noisy: Arrays) -> None:
     calm = episode_of(CALM, task("T_Junction"), None)
     assert calm is not None
 
-    assert np.abs(calm["lateral_m"]).max() + 0.1 < np.abs(noisy["lateral_m"]).max()
+    # where the road is straight: in the junction the expert itself cuts the corner
+    calm_m, noisy_m = (np.abs(a["lateral_m"][:STRAIGHT]) for a in (calm, noisy))
+    assert calm_m.max() + 0.1 < noisy_m.max()
 
 
 @dataclass
