@@ -20,7 +20,7 @@ from tests.frames import record
 from tests.nets import save_text
 from tests.runtime.energy.opened import Driver
 from tests.simulator.world.driving import route_of
-from tests.workflows.test_check_model import ADAPTER, tcp_like
+from tests.workflows.test_check_model import ADAPTER, PLAN, tcp_like
 
 BLIND = "evaluate blind --routes routes.json -o results"
 STOP = "VanillaNonSignalizedTurnEncounterStopsign"
@@ -89,7 +89,7 @@ def test_a_route_is_drawn(cli: Cli, manifest: Path) -> None:
 def test_what_fits_and_what_is_missing_is_said_before_a_drive(
     cli: Cli, tmp_path: Path
 ) -> None:
-    (tmp_path / "a.toml").write_text(ADAPTER)
+    (tmp_path / "a.toml").write_text(ADAPTER + PLAN)
     tcp_like(tmp_path / "m.onnx")
 
     found = cli.document("evaluate m.onnx --check --adapter a.toml")

@@ -11,6 +11,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.graph import rewrite
+from me2e_compress.simulator.routes import ROAD_VERSION, VERSION
 from tests.command import Cli, write_frames
 from tests.nets import save_text
 
@@ -200,7 +201,8 @@ def folder(dense: Path, cli: Cli) -> Path:
     first.write_bytes(first.read_bytes()[:-40])
     for name in ("empty", "results"):
         (dense / name).mkdir()
-    (dense / "results" / "evaluation.json").write_text('{"routes": ["a"]}')
+    manifest = json.dumps({"routes": ["a"], VERSION: ROAD_VERSION})
+    (dense / "results" / "evaluation.json").write_text(manifest)
     save_text(dense / "open.onnx", OPEN)
     save_text(dense / "path.onnx", "m (float[4,16] camera) => (float[4,16] path)"
               "{ path = Relu(camera) }")  # fmt: skip

@@ -48,7 +48,6 @@ def test_what_ships_is_admitted(route: object) -> None:
         (FAILED, (FAILED,) * 3, "the expert commits: collisions_vehicle"),
         (LATE, (FAILED,) * 3, "ends after 75 s: blocked"),
         (BROKEN, (FAILED,) * 3, "ends after 1 s: ValueError: no"),
-        (replace(SOLVED, triggered=False), (FAILED,) * 3, "never happened"),
         (replace(SOLVED, actors_crashed=True), (FAILED,) * 3, "two actors collide"),
     ],
 )
