@@ -35,8 +35,8 @@ SIGNED = re.compile(rf"({SIGN}\d+\.\d+) to ({SIGN}\d+\.\d+)")
 INTERVAL = re.compile(
     rf"{NUMBER}(?: points?,| %| success)?\*?\*? \(?(?:95 %: )?{NUMBER} to {NUMBER}"
 )
-NOT_KEPT: dict[str, str] = {}
 Triple = tuple[float, float, float]
+NOT_KEPT: dict[Triple, str] = {}
 
 
 def number(text: str) -> float:
