@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 import onnx_ir as ir
 
+from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import FramesError, GraphError, Me2eError
 from me2e_compress.fidelity.first_difference import find_first_difference
 from me2e_compress.graph.nodes import DRAWS, bodies_of, reads_of
@@ -23,23 +24,16 @@ from me2e_compress.manager.output_errors import (
 from me2e_compress.manager.pieces import Pieces, show
 from me2e_compress.manager.report import Verification
 from me2e_compress.manager.verification_inputs import Outputs, VerificationInputs
-from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session, replay, run_once
 
 NUDGES = 3
 """How often inputs are nudged to see what rounding alone does to an output."""
 
-Answers: TypeAlias = Sequence[Outputs]
-"""What a graph gave, frame by frame."""
-
-Known: TypeAlias = tuple[Answers | None, Answers | None]
-"""What the graph before and the one after gave; None where they are to be run."""
-
 _BODY = "body"
 """Domain in which a body is run: no kernel is registered for it."""
 
-TryFirst: TypeAlias = Callable[[ir.Model, str, Sequence[Frame]], Answers | None]
-"""Opens a graph before this process does: returns what it answered, or refuses it."""
+TryFirst: TypeAlias = Callable[[ir.Model, str, Recording | None], None]
+"""Opens a graph before this process does, and may refuse it."""
 
 
 def verify(
@@ -47,13 +41,10 @@ def verify(
     before: ir.Model,
     after: ir.Model,
     inputs: VerificationInputs,
-    known: Known = (None, None),
 ) -> Verification:
     """Compare two graphs on the same inputs; one that no longer runs differs by inf.
 
     A body that the passes attached is held against its kernel beside the outputs.
-
-    ``known`` is what they answered before, who is then not run again.
 
     An output that is drawn anew at every run tells nothing about the passes, and is
     named; so is one that differs but that rounding alone moves as far: inputs that
@@ -62,7 +53,7 @@ def verify(
     (:mod:`me2e_compress.manager.pieces`), then without onnxruntime's own optimizations
     (:mod:`me2e_compress.manager.runtime_levels`).
     """
-    found = _verify_outputs(passes, before, after, inputs, known)
+    found = _verify_outputs(passes, before, after, inputs)
     if not after.functions.keys() - before.functions.keys():
         return found
     gaps, allowed = dict(found.errors), dict(found.tolerances)
@@ -77,14 +68,12 @@ def _verify_outputs(
     before: ir.Model,
     after: ir.Model,
     inputs: VerificationInputs,
-    known: Known,
 ) -> Verification:
-    answers, changed = known
     # a session is gone before the next one opens
-    left = list(inputs.run(before)) if answers is None else answers
+    left = list(inputs.run(before))
     allowed = tolerances(left[0])
     try:
-        gaps = errors(left, inputs.run(after) if changed is None else changed)
+        gaps = errors(left, inputs.run(after))
     except GraphError:
         gaps = dict.fromkeys(left[0], float("inf"))
     found = Verification(
@@ -110,7 +99,7 @@ def _verify_outputs(
 
 
 def unsteadiness(
-    model: ir.Model, answers: Answers, inputs: VerificationInputs
+    model: ir.Model, answers: Sequence[Outputs], inputs: VerificationInputs
 ) -> dict[str, float]:
     """Measure how far each output moves when inputs change in their last places.
 

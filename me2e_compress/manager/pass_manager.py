@@ -22,10 +22,10 @@ from me2e_compress.errors import (
 from me2e_compress.graph.opset import lowered
 from me2e_compress.manager import equivalence, pass_contract, reproducer
 from me2e_compress.manager.attempt import attempt
-from me2e_compress.manager.equivalence import Answers, TryFirst
+from me2e_compress.manager.equivalence import TryFirst
 from me2e_compress.manager.recipe import to_text
 from me2e_compress.manager.report import LossyPass, Report, Step, Verification
-from me2e_compress.manager.verification_inputs import VerificationInputs, first_frames
+from me2e_compress.manager.verification_inputs import VerificationInputs
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize, needs_import
 
@@ -48,9 +48,7 @@ class PassManager:
         samples: recorded frames that exact passes are checked on where the context has
             none; None makes seeded inputs up then.
         try_first: called with a graph, its name and frames before it is run on them;
-            may refuse it, and may return what it answered.
-        answers: what the graph that is run answers on the first ``verify_frames``
-            recorded frames, where that is known.
+            may refuse it.
     """
 
     passes: tuple[Pass, ...]
@@ -58,7 +56,6 @@ class PassManager:
     reproducers: Path | None = None
     samples: CalibrationSet | None = None
     try_first: TryFirst | None = None
-    answers: Answers | None = None
 
     def run(
         self, model: ir.Model, context: Context, progress: Progress | None = None
@@ -140,8 +137,6 @@ class _Books:
         self._unchecked: list[str] = []
         self._size = graph.size(checkpoint)
         self._digest = graph.digest(checkpoint)
-        self._source = self._digest
-        self._came_in = checkpoint  # or an unchanged copy of it
 
     def transact(self, current: Pass, model: ir.Model) -> ir.Model:
         """Run one pass on a clone; return the clone only if all checks hold.
@@ -156,8 +151,6 @@ class _Books:
             raise self._with_reproducer(current, model, found) from found.__cause__
         if isinstance(found, Me2eError):
             raise found
-        if self._digest == self._source:
-            self._came_in = model
         # Commit: what the next pass is given has its shapes, and is hashed once.
         result, self._digest = found.result, found.digest
         self._enter(current, result, process_time() - start)
@@ -178,12 +171,10 @@ class _Books:
         if not stretch:
             return
         # what onnxruntime dies of is refused here, not merely unproven
-        answers = None
         if self.manager.try_first is not None:
-            fed = first_frames(self._frames(), self.manager.verify_frames)
             what = f"the graph after {stretch[-1][0].name}"
-            answers = self.manager.try_first(model, what, fed)
-        found, runnable, inputs = self._compare(stretch, model, answers)
+            self.manager.try_first(model, what, self._frames())
+        found, runnable, inputs = self._compare(stretch, model)
         self.verifications.append(found)
         if equivalence.passed(found) or inputs is None:
             return
@@ -198,7 +189,7 @@ class _Books:
         raise self._with_reproducer(current, guilty, error)
 
     def _compare(
-        self, stretch: Stretch, model: ir.Model, answers: Answers | None
+        self, stretch: Stretch, model: ir.Model
     ) -> tuple[Verification, Stretch, VerificationInputs | None]:
         """Compare with the earliest graph that runs (import may make it runnable)."""
         context, frames = self.context, self._frames()
@@ -209,9 +200,7 @@ class _Books:
                 inputs = VerificationInputs.of(
                     before, frames, context.seed, count, model, context.provider
                 )
-                came_in = before is self._came_in
-                known = (self.manager.answers if came_in else None, answers)
-                found = equivalence.verify(names, before, model, inputs, known)
+                found = equivalence.verify(names, before, model, inputs)
             except (GraphError, PreconditionError) as error:
                 reason = reason or str(error)
                 continue

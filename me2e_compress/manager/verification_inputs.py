@@ -91,7 +91,8 @@ class VerificationInputs:
             GraphError: onnxruntime cannot open the graph to try sizes.
         """
         if frames is not None:
-            return cls(first_frames(frames, count), "recorded", provider)
+            first = [frames[index] for index in range(min(count, len(frames)))]
+            return cls(first, "recorded", provider)
         shaped = model if successor is None or is_static(model) else successor
         if open_dimensions(shaped):
             scenes = _runnable_scenes(model, shaped, seed, count, provider)
@@ -132,13 +133,6 @@ class VerificationInputs:
             for frame in self.frames
         ]
         return dataclasses.replace(self, frames=frames)
-
-
-def first_frames(recording: Recording | None, count: int) -> list[Frame]:
-    """Return the recorded frames that graphs are compared on; none without any."""
-    if recording is None:
-        return []
-    return [recording[index] for index in range(min(count, len(recording)))]
 
 
 def nudge(

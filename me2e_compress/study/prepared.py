@@ -22,7 +22,7 @@ from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.version import __version__
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import beside
-from me2e_compress.workflows.first_opening import try_file
+from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.workflows.weights_record import named_weights
 
@@ -92,7 +92,7 @@ def prepare_variant(
     stage = HOST_STAGES.parse(variant.host_stage) if variant.host_stage else None
     driver = replace(driver, path=model, provider=study.provider, host_stage=stage)
     # fail early on a model that cannot run or drive
-    try_file(model, listener, study.provider)
+    try_first(model, model.name, listener=listener, provider=study.provider)
     if not study.elsewhere:  # another evaluator may ask for another interface
         driver.open()
     # origin of the file

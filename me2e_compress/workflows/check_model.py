@@ -12,7 +12,7 @@ from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.evaluate import driver_of
-from me2e_compress.workflows.first_opening import try_file
+from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, table
 
@@ -103,7 +103,7 @@ def check_model(
         opened(driver)
         return ModelCheck(named, "what its code answers", (), (), ())
     # the ports are read without a policy, which would refuse at the first problem
-    try_file(driver.path, listener, provider)
+    try_first(driver.path, driver.path.name, listener=listener, provider=provider)
     read = Adapter() if driver.adapter is None else Adapter.load(driver.adapter)
     try:
         session = Session(

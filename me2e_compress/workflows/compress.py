@@ -211,13 +211,12 @@ class Compression:
         """Try, compress, measure and write; errors are those of :func:`compress`."""
         start, options, listener = cpu_seconds(), self.options, self.listener
         source, provider = self.source, options.provider
-        seen, count = frames.calibration or frames.samples, options.verify_frames or 1
-        first = partial(try_first, listener=listener, count=count, provider=provider)
-        answers = first(model, source.name, seen, file=source)
+        first = partial(try_first, listener=listener, provider=provider)
+        first(model, source.name, frames.calibration or frames.samples, file=source)
         # apply the passes, and refuse a result that is unproven or not int8
         context = Context(modules, frames.calibration, provider=provider)
         checked, folder = options.verify_frames, self.output.parent
-        manager = PassManager(passes, checked, folder, frames.samples, first, answers)
+        manager = PassManager(passes, checked, folder, frames.samples, first)
         report = manager.run(model, context, partial(listener.on_progress, "passes"))
         _refuse_unproven(report, options)
         int8 = Int8Outcome.of(report, context)

@@ -21,7 +21,7 @@ from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import check_folder, model_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.deadlines_table import deadlines_table
-from me2e_compress.workflows.first_opening import try_file
+from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.other_evaluators import (
     HIGHWAY,
@@ -173,7 +173,8 @@ def _evaluated(
     # find the driver, and open its graph in a process of its own first
     driver = driver_of(policy, options.adapter, options.provider, options.module_map)
     if isinstance(driver, OnnxDriver):
-        try_file(driver.path, listener, options.provider)
+        file, provider = driver.path, options.provider
+        try_first(file, file.name, listener=listener, provider=provider)
 
     def on_progress(now: DrivingProgress) -> None:
         running = f"DS {number(now.driving_score, '.1f')}"

@@ -24,7 +24,7 @@ from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
 from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.first_opening import try_file
+from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, counted
 
@@ -133,7 +133,7 @@ def _recorded(
         about = {"stack": str(source), "log": LOGS.text(options.log)}
     else:
         model = model_path(source)
-        try_file(model, listener, options.provider)
+        try_first(model, model.name, listener=listener, provider=options.provider)
         make, of = _driven(model, options), sha256_of(model)
     # a recording is continued only if the sources and the adapter are the same
     if options.adapter is not None:
