@@ -2,7 +2,7 @@
 
     python -m benchmarks.bench_runtime OUT [--peer-python PYTHON] [--rounds 5]
         [--threads 2] [--frames 1] [--only "ours, int8;PyTorch, eager"]
-        [--static-geometry] [--with torch.compile] [--prepare]
+        [--freeze-inputs] [--with torch.compile] [--prepare]
         [--stack vad-tiny|vad-tiny-original|uniad-tiny|tcp|deformable-detr]
 
 One frame of a stack at its published size, recurrent state at zeros: a process a row,
@@ -18,8 +18,8 @@ onnxruntime.quantization. A runtime that is missing or refuses a file is named b
 the table. Files stay in OUT and are not made again; ``--prepare`` writes them, and
 measures nothing.
 
-The cameras' matrices are an input. With ``--static-geometry`` they are constants, for
-every file: others read the exported file after our passes ``static-geometry`` and
+The cameras' matrices are an input. With ``--freeze-inputs`` they are constants, for
+every file: others read the exported file after our passes ``freeze-inputs`` and
 ``fold-constants``; PyTorch has no such pass and runs what it always does. SQNR is still
 that against the file as exported.
 
@@ -213,7 +213,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--threads", type=int, default=2)
     found.add_argument("--frames", type=int, default=1)
     found.add_argument("--only", default="", help="rows, joined by ;")
-    found.add_argument("--static-geometry", action="store_true")
+    found.add_argument("--freeze-inputs", action="store_true")
     found.add_argument(
         "--with", action="append", choices=OPTIONAL, default=[], dest="optional"
     )
@@ -241,7 +241,7 @@ def chosen(given: argparse.Namespace) -> dict[str, Entry]:
     """Return the rows that are asked for, the reference always."""
     wanted = [each.strip() for each in given.only.split(";")] if given.only else []
     left_out = set(OPTIONAL.values()) - {OPTIONAL[each] for each in given.optional}
-    entries = static(ENTRIES) if given.static_geometry else ENTRIES
+    entries = static(ENTRIES) if given.freeze_inputs else ENTRIES
     return {
         name: entry
         for name, entry in entries.items()

@@ -71,13 +71,13 @@ OPTIONAL = {"torch.compile": "PyTorch, torch.compile"}
 """Rows that only ``--with`` measures: torch.compile compiles for six minutes."""
 
 _STATIC = "static-"
-_STATIC_FOLDED = "import-normalize,static-geometry,fold-constants"
+_STATIC_FOLDED = "import-normalize,freeze-inputs,fold-constants"
 
 
 def static(entries: Mapping[str, Entry]) -> dict[str, Entry]:
     """Return the rows with constant camera matrices.
 
-    What others read is the exported file after ``static-geometry`` and
+    What others read is the exported file after ``freeze-inputs`` and
     ``fold-constants``; PyTorch runs what it always does.
     """
     return {

@@ -105,6 +105,7 @@ FORMER = {
     "study record.road": "the key road is gone since 0.3.0: there is one road",
     "policy highway-2": f"highway-2 {_NOW} highway",
     "model highway-2": f"highway-2 {_NOW} highway",
+    "pass static-geometry": f"static-geometry {_NOW} freeze-inputs, with --frames",
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""
 

@@ -7,6 +7,7 @@ frame of every scene, and which inputs are pixels (`me2e_compress.calibration.pi
 
 import hashlib
 import itertools
+import json
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -17,7 +18,6 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.archives import Declared, declared, load_arrays
 from me2e_compress.calibration.pixels import PixelInput, PixelInputs
-from me2e_compress.calibration.static_inputs import check_static, static_inputs
 from me2e_compress.display import reason
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
@@ -26,6 +26,9 @@ from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array, Frame
 
 T = TypeVar("T", Array, Declared)
+
+FROZEN_INPUTS = "me2e.static_inputs"
+"""Metadata key of a graph: JSON with a digest of every input that became constant."""
 
 __all__ = ["CalibrationSet", "Frame", "synthetic"]
 
@@ -112,23 +115,37 @@ class CalibrationSet:
         """Read every frame once and check it against a model's inputs.
 
         Recurrent inputs may be absent. Names that the model lacks are an error, except
-        those that ``static-geometry`` made constants of it: their values must be the
-        same.
+        those that ``freeze-inputs`` made constants: their values must be the same.
 
         Raises:
             FramesError: an array is missing, unknown, of another shape or dtype, or not
                 finite.
         """
-        fixed = static_inputs(model)
+        frozen = frozen_inputs(model)
         for path in self.files:
             # Compare headers before any array is read.
             held = self._as_fed(path, declared(path), PixelInput.fed)
-            asked = {name: held[name] for name in held if name not in fixed}
+            asked = {name: held[name] for name in held if name not in frozen}
             _check_frame(asked, model, str(path))
             for name, array in load_arrays(path).items():
                 _check_finite(array, f"{path}: {name}")
-                if name in fixed:
-                    check_static(name, array, fixed[name], str(path))
+                if name in frozen and digest_of(array) != frozen[name]:
+                    line = "is not the one that the graph was made for (freeze-inputs)"
+                    raise FramesError(f"{path}: {name} {line}")
+
+
+def frozen_inputs(model: ir.Model) -> dict[str, str]:
+    """Read the digests of inputs that ``freeze-inputs`` made constants."""
+    try:
+        return dict(json.loads(model.metadata_props.get(FROZEN_INPUTS, "{}")))
+    except (TypeError, ValueError, RecursionError):
+        return {}
+
+
+def digest_of(array: Array) -> str:
+    """Return a digest of an array's type, shape and content."""
+    head = repr((array.dtype.str, array.shape)).encode()
+    return hashlib.blake2b(head + array.tobytes(), digest_size=16).hexdigest()
 
 
 def _check_frame(frame: Mapping[str, Declared], model: ir.Model, source: str) -> None:
@@ -139,7 +156,7 @@ def _check_frame(frame: Mapping[str, Declared], model: ir.Model, source: str) ->
     for name, value in ports.items():
         array = frame.get(name)
         if array is not None:
-            _check_array(array, value, f"{source}: {name}")
+            check_array(array, value, f"{source}: {name}")
         elif name not in optional:
             raise FramesError(
                 f"{source}: {name} is missing; there is {', '.join(frame)}"
@@ -152,7 +169,8 @@ def _check_frame(frame: Mapping[str, Declared], model: ir.Model, source: str) ->
         )
 
 
-def _check_array(array: Declared, value: ir.Value, where: str) -> None:
+def check_array(array: Declared | Array, value: ir.Value, where: str) -> None:
+    """Raise a FramesError where an array has not an input's dtype and shape."""
     if value.dtype is not None and array.dtype != value.dtype.numpy():
         raise FramesError(f"{where} is {array.dtype}, expected {value.dtype.numpy()}")
     if value.shape is not None and not _fits(array.shape, value.shape):

@@ -15,7 +15,7 @@ PASSES: Registry[Pass] = Registry(
     {
         "import-normalize": f"{_HERE}.import_normalize:ImportNormalize",
         "fix-shapes": f"{_HERE}.fix_shapes:FixShapes",
-        "static-geometry": f"{_HERE}.static_geometry:StaticGeometry",
+        "freeze-inputs": f"{_HERE}.freeze_inputs:FreezeInputs",
         "fold-constants": f"{_HERE}.fold_constants:FoldConstants",
         "fold-with-onnxsim": f"{_HERE}.fold_with_onnxsim:FoldWithOnnxsim",
         "eliminate-redundant": f"{_HERE}.eliminate_redundant:EliminateRedundant",

@@ -36,8 +36,8 @@ def test_constant_matrices_are_in_every_file_but_pytorchs() -> None:
         if entry.tool:
             assert entry.of == "static-source"
         else:
-            assert "static-geometry,fold-constants" in entry.passes
-    assert found[REFERENCE].passes == "import-normalize,static-geometry,fold-constants"
+            assert "freeze-inputs,fold-constants" in entry.passes
+    assert found[REFERENCE].passes == "import-normalize,freeze-inputs,fold-constants"
     assert found["ours, fused"].passes.endswith(ENTRIES["ours, fused"].passes[33:])
 
 
@@ -58,7 +58,7 @@ def test_the_files_of_other_tools_are_made_of_the_folded_one(
     assert made(subject, static(ENTRIES)["onnxsim + onnxruntime"], 1) is None
 
     folded, simplified = ran
-    assert "import-normalize,static-geometry,fold-constants" in folded
+    assert "import-normalize,freeze-inputs,fold-constants" in folded
     assert simplified[-2:] == [
         str(tmp_path / name) for name in ("static-source.onnx", "static-onnxsim.onnx")
     ]

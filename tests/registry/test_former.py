@@ -93,9 +93,13 @@ def test_a_method_that_is_gone_is_one_line(cli: Cli) -> None:
             "fold-constants{growth=0}",
             "growth is gone since 0.3.0: use bytes_per_node",
         ),
+        (
+            "static-geometry",
+            "static-geometry is gone since 0.3.0: use freeze-inputs, with --frames",
+        ),
     ],
 )
-def test_an_option_of_a_pass_that_is_gone(text: str, line: str) -> None:
+def test_a_pass_or_an_option_of_one_that_is_gone(text: str, line: str) -> None:
     with pytest.raises(RecipeError) as refused:
         recipe.parse(text)
     assert str(refused.value) == line

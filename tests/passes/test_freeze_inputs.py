@@ -13,7 +13,7 @@ from me2e_compress.manager import PassManager
 from me2e_compress.manager.report import Report
 from me2e_compress.passes import Context
 from me2e_compress.passes.fold_constants import FoldConstants
-from me2e_compress.passes.static_geometry import StaticGeometry
+from me2e_compress.passes.freeze_inputs import FreezeInputs
 from tests.frames import record
 from tests.passes.small import compute, ops, read
 
@@ -42,7 +42,7 @@ def frames(folder: Path, *rigs: Any) -> CalibrationSet:
 
 
 def run(model: ir.Model, recorded: CalibrationSet | None, **options: Any) -> Report:
-    passes = (StaticGeometry(**options), FoldConstants())
+    passes = (FreezeInputs(**options), FoldConstants())
     return PassManager(passes).run(model, Context(ModuleMap.whole(), recorded))
 
 
@@ -57,19 +57,11 @@ def test_geometry_is_computed_once(tmp_path: Path) -> None:
     )
 
 
-def test_a_file_holds_the_rig(tmp_path: Path) -> None:
-    file = tmp_path / "rig.npz"
-    np.savez(file, lidar2img=RIG, other=RIG)
-    result = run(net(), None, calibration=file).model
-    assert ops(result) == ["Add"]
-    assert StaticGeometry(calibration=file).files() == (file,)
-
-
 def test_a_second_run_changes_nothing(tmp_path: Path) -> None:
     recorded = frames(tmp_path, RIG)
     result = run(net(), recorded).model
     context = Context(ModuleMap.whole(), recorded)
-    assert StaticGeometry().run(result, context).changes == 0
+    assert FreezeInputs().run(result, context).changes == 0
 
 
 def test_frames_of_this_vehicle_still_fit(tmp_path: Path) -> None:
@@ -88,7 +80,7 @@ REFUSED: dict[str, tuple[Any, dict[str, Any], type[Me2eError], str]] = {
     "unknown": ((RIG,), {"inputs": ("rig",)}, PreconditionError, "no input is called"),
     "type": ((RIG.astype(np.float64),), {}, FramesError, "is float64"),
     "shape": ((RIG[0],), {}, FramesError, r"shape \[2, 2\]"),
-    "nan": ((RIG * np.float32("nan"),), {}, FramesError, "not"),
+    "nan": ((RIG * np.float32("nan"),), {}, FramesError, "has another lidar2img"),
 }
 
 
@@ -100,18 +92,17 @@ def test_what_does_not_fit_is_named(case: str, tmp_path: Path) -> None:
 
 
 def test_a_value_that_is_missing_is_named(tmp_path: Path) -> None:
-    file = tmp_path / "rig.npz"
-    np.savez(file, other=RIG)
-    with pytest.raises(FramesError, match="lidar2img is missing; there is other"):
-        run(net(), None, calibration=file)
+    recorded = CalibrationSet(record(tmp_path, [{"other": RIG}]))
+    with pytest.raises(FramesError, match="frame 0: lidar2img is missing"):
+        run(net(), recorded)
 
 
-def test_neither_frames_nor_a_file() -> None:
+def test_no_frames() -> None:
     with pytest.raises(FramesError, match="--frames"):
         run(net(), None)
-    assert StaticGeometry().needs_frames
+    assert FreezeInputs().needs_frames
 
 
 def test_no_input_at_all() -> None:
     with pytest.raises(RecipeError, match="needs inputs"):
-        StaticGeometry(inputs=())
+        FreezeInputs(inputs=())

@@ -1,0 +1,82 @@
+"""Turn inputs that have one value on all frames (camera matrices) into constants."""
+
+import dataclasses
+import json
+from typing import ClassVar
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.calibration import dataset
+from me2e_compress.errors import FramesError, PreconditionError, RecipeError
+from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.runtime.frames import Array, Frames
+
+
+@dataclasses.dataclass(frozen=True)
+class FreezeInputs(Pass):
+    """Make inputs constant that have one value on all frames.
+
+    Given:   lidar2img float[1,6,4,4] -> at = MatMul(pillars, lidar2img) -> ...
+
+    Result:  at = MatMul(pillars, lidar2img) of weights, which ``fold-constants`` folds
+
+    The graph then fits one vehicle: the input is gone, and frames that hold another
+    value are refused. For that vehicle outputs are equal up to rounding.
+
+    Attributes:
+        inputs: the inputs that become constant.
+    """
+
+    name: ClassVar[str] = "freeze-inputs"
+    exact: ClassVar[bool] = False
+    changes_interface: ClassVar[bool] = True
+    inputs: tuple[str, ...] = ("lidar2img",)
+
+    def __post_init__(self) -> None:
+        """Check that inputs are given."""
+        if not self.inputs:
+            raise RecipeError(f"{self.name} needs inputs: inputs=[lidar2img]")
+
+    @property
+    def needs_frames(self) -> bool:
+        """Whether the values are read from the frames: always."""
+        return True
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Register the values as weights under the names of the inputs."""
+        known = dataset.frozen_inputs(model)
+        names = [name for name in self.inputs if name not in known]
+        if not names:
+            return PassResult(model, 0)
+        ports = {str(value.name): value for value in model.graph.inputs}
+        there = ", ".join(ports) or "none"
+        for name in names:
+            if name not in ports or ports[name].is_graph_output():
+                line = f"no input is called {name!r}, or it is an output too"
+                raise PreconditionError(f"{self.name}: {line}; there is {there}")
+        for name, array in self._values(names, context.frames).items():
+            value = ports[name]
+            dataset.check_array(array, value, f"{self.name}: {name}")
+            model.graph.inputs.remove(value)
+            value.const_value = ir.tensor(np.ascontiguousarray(array), name=name)
+            value.shape = ir.Shape(array.shape)
+            model.graph.register_initializer(value)
+            known[name] = dataset.digest_of(array)
+        model.metadata_props[dataset.FROZEN_INPUTS] = json.dumps(known, sort_keys=True)
+        listed = ", ".join(names)
+        return PassResult(model, len(names), (f"constant from now on: {listed}",))
+
+    def _values(self, names: list[str], frames: Frames | None) -> dict[str, Array]:
+        values: dict[str, Array] = {}
+        for frame in frames or ():
+            where = f"{self.name}: frame {frame.index}"
+            for name in names:
+                if name not in frame.arrays:
+                    raise FramesError(f"{where}: {name} is missing")
+                array = frame.arrays[name]
+                if not np.array_equal(values.setdefault(name, array), array):
+                    raise FramesError(f"{where} has another {name} than the first")
+        if not values:
+            raise FramesError(f"{self.name} needs recorded frames (--frames)")
+        return values
