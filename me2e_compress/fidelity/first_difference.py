@@ -161,6 +161,7 @@ def _feeds_of_last(
     """Return what a graph is fed at the last frame, state included."""
     session = Session(model, optimize=False, release=True, provider=provider)
     state: Mapping[str, Array] = {}
+    feeds: Mapping[str, Array] = {}
     for at, frame in enumerate(frames):
         if frame.starts_scene or not at:
             state = session.first_state(frame.arrays)

@@ -5,9 +5,8 @@ line takes a function of a module of your own that returns such a policy.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -96,8 +95,8 @@ class TcpPolicy:
     graph: OnnxPolicy
     heads: ActionHeads
     fusion: HeadFusion | None
-    needs_images: ClassVar[bool] = True
-    privileged: ClassVar[bool] = False
+    needs_images: bool = field(default=True, init=False)
+    privileged: bool = field(default=False, init=False)
 
     @property
     def image_size(self) -> tuple[int, int]:

@@ -139,7 +139,8 @@ class _Search:
             return None
         owned = owned and all(sole_reader(each.outputs[0]) for each in layer.nodes)
         inner = self.of(layer.source, owned=owned, depth=depth)
-        rows, width = static_shape(layer.source) or (), (static_shape(value) or ())[-1]
+        rows = static_shape(layer.source) or (1,)
+        width = (static_shape(value) or (1,))[-1]
         gone = owned * math.prod(rows) * width
         cost = inner.cost + rows[-1] * self.columns * self.item_cost
         cost -= owned * len(layer.nodes) + gone / MACS_PER_NODE
