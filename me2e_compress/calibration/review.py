@@ -16,12 +16,12 @@ so that most elements round to zero."""
 DISAGREE = 4
 """Ratio of two ranges of one tensor from which it is named: the wider one costs 12 dB,
 two of seven bits. Between three recordings of 256 frames of other routes, no tensor of
-the driver ``highway`` differs by more than 1.61 (benchmarks/bench_observers.py)."""
+the driver at the tag ``road-1`` differs by more than 1.61 (bench_observers)."""
 
 FEW_SCENES = 8
-"""Fewest scenes of a recording that nothing is said of. On the driver ``highway``, 4 of
-16 scenes miss more than a fifth of the range of 9 % of the tensors, 8 of 3 %, one of
-35 % (benchmarks/bench_observers.py)."""
+"""Fewest scenes of a recording that nothing is said of. At the tag ``road-1``,
+4 of 16 scenes miss more than a fifth of the range of 9 % of the driver's tensors, 8 of
+3 %, one of 35 % (benchmarks/bench_observers.py)."""
 
 _SHOWN = 5
 """Number of tensors that a line lists."""

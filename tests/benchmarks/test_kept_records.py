@@ -120,15 +120,14 @@ def test_every_interval_of_a_page_is_that_of_the_kept_drives() -> None:
     pages = [each for each in PAGES if each.name not in ELSEWHERE]
     told = {(page.name, each) for page in pages for each in intervals(page)}
 
-    lost = sorted(e for e in told if e[1] not in known() and e[1] not in NOT_KEPT)
+    lost = sorted(e for e in told if e[1] not in known())
 
     assert len(told) > 30
     assert not lost
-    assert {each for _, each in told} >= set(NOT_KEPT)
 
 
 def test_so_are_those_of_differences_that_stand_alone() -> None:
-    ends = {each[1:] for each in (*known(), *NOT_KEPT)}
+    ends = {each[1:] for each in known()}
     pages = [each for each in PAGES if each.name not in ELSEWHERE]
     told = {
         (page.name, tuple(map(number, found)))
