@@ -184,8 +184,8 @@ def _gains_by_balance(node: ir.Node) -> bool:
 
     They do over neighbouring pixels, and over elements that are never negative. Over
     tokens of both signs, behind a LayerNormalization, balance only adds to the errors:
-    on the driver such products lose up to 1.2 dB, while products behind a ReLU and
-    convolutions gain 0.2 to 10.1, but for one that loses 0.1
+    on the driver such products lose up to 1.7 dB, while products behind a ReLU and
+    convolutions gain 0.2 to 8.6, but for one that loses 0.2
     (``python -m benchmarks.bench_weights``).
     """
     made = producer_of(node.inputs[0])
