@@ -73,7 +73,8 @@ def card(name: str) -> ModelCard:
     """
     if name not in SHIPPED:
         line = f"no model {name!r} ships; there is {', '.join(SHIPPED)}"
-        raise GraphError(FORMER.get(f"stack {name}", line))
+        gone = FORMER.get(f"model {name}", FORMER.get(f"stack {name}", line))
+        raise GraphError(gone)
     return ModelCard.load(WEIGHTS / f"{name}.json")
 
 
