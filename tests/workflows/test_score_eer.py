@@ -15,6 +15,7 @@ from me2e_compress.evaluators.highway.worker import Driven
 from me2e_compress.metrics.episode import Episode, Given, InferenceRecord
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.runtime.energy import EnergyResult
+from me2e_compress.simulator.routes import ROAD_VERSION, VERSION
 from me2e_compress.workflows.score_eer import EerOptions, joules_named, score_eer
 from tests.docs.documents import faults
 from tests.metrics.drives import cruise, drive, infraction
@@ -160,7 +161,8 @@ def test_joules_without_a_name_or_with_two(words: list[str]) -> None:
 def test_the_command_prints_what_the_page_says(tmp_path: Path) -> None:
     for name, episodes in FOLDERS.items():
         path = tmp_path / Path(name).name
-        folder = ResultsFolder.create(path, {"routes": ["a", "b"], "set_size": 2})
+        made_by = {"routes": ["a", "b"], "set_size": 2, VERSION: ROAD_VERSION}
+        folder = ResultsFolder.create(path, made_by)
         for each in episodes:
             folder.save(Driven(each, 0.0, 0))
     words = [
