@@ -14,6 +14,9 @@ import tempfile
 import time
 from pathlib import Path
 
+import onnx
+import onnx.parser
+
 from me2e_compress.cli.app import COMMANDS
 from me2e_compress.shipped.drivers import WEIGHTS
 
@@ -63,7 +66,11 @@ USES = (
     "study study.toml -o study",
     "routes --scenarios ParkingCutIn --variants 1 -o routes.json",
     "demo -o out",
+    "join stack.toml -o one.onnx",
+    "split one.onnx stack.toml -o files",
 )
+PARTS = {"body": ("x", "features"), "head": ("features", "plan")}
+"""Files of a stack, each one Relu: what it reads and what it gives."""
 
 
 def main() -> int:
@@ -78,6 +85,7 @@ def main() -> int:
     failed = False
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "study.toml").write_text(STUDY)
+        write_stack(Path(folder))
         real = Path(folder) / "real"
         real.mkdir()
         (real / "run.json").write_text(json.dumps(RUN))
@@ -89,6 +97,16 @@ def main() -> int:
                 sys.stdout.write(f"{said}\n")
                 sys.stdout.flush()
     return int(failed)
+
+
+def write_stack(folder: Path) -> None:
+    """Write a stack of two files, and the TOML that names them."""
+    for name, (read, given) in PARTS.items():
+        text = f'<ir_version: 9, opset_import: ["" : 17]> {name} (float[1,4] {read})'
+        text += f" => (float[1,4] {given}) {{ {given} = Relu({read}) }}"
+        onnx.save(onnx.parser.parse_model(text), folder / f"{name}.onnx")
+    tables = (f'[[part]]\nname = "{name}"\nfile = "{name}.onnx"\n' for name in PARTS)
+    (folder / "stack.toml").write_text("".join(tables))
 
 
 def attempt(words: list[str], folder: str) -> tuple[bool | None, str]:
