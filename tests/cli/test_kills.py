@@ -97,6 +97,7 @@ def hears_ctrl_c() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.opens_apart
 @pytest.mark.usefixtures("hears_ctrl_c", "files")
 @BOTH
 @pytest.mark.parametrize(
