@@ -28,10 +28,10 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.targets import Target
-from me2e_compress.targets.biases import biased_end
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.onnxruntime.costs import costs_of
 from me2e_compress.targets.onnxruntime.kernels import end_of, has_kernel
+from me2e_compress.targets.weights import biased_end
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 from models.export import export
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.simulated_counter import Counter, Load, simulate
-from me2e_compress.runtime.energy.estimate import estimate
-from me2e_compress.runtime.energy.schedule import EnergySchedule
+from me2e_compress.runtime.energy.energy_counter import EnergySchedule
+from me2e_compress.runtime.energy.energy_result import estimate
 
 FRAMES_MS = (5, 10, 20, 25, 33, 40, 50, 70, 100, 101, 150, 200, 400)
 LOADS = {

@@ -43,7 +43,7 @@ from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.convert_float32 import ConvertFloat32
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.runtime.interleaved import time_interleaved
+from me2e_compress.runtime.profile import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import int8_layers
 

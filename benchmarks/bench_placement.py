@@ -46,7 +46,7 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.quantization.rules.safe_rules import SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.runtime.interleaved import time_interleaved
+from me2e_compress.runtime.profile import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.weights import evaluate_constants

@@ -23,7 +23,7 @@ from me2e_compress.fidelity.matched_sets import SetFidelity
 from me2e_compress.fidelity.sensitivity import Candidate, Sensitivity
 from me2e_compress.manager import Step, Verification
 from me2e_compress.quantization.plan import Decision, QuantPlan
-from me2e_compress.registry.entries import Entry
+from me2e_compress.registry.registry import Entry
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import TimeShare

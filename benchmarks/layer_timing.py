@@ -16,7 +16,7 @@ from me2e_compress.quantization.plan import QuantPlan, make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.interleaved import time_interleaved
+from me2e_compress.runtime.profile import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 

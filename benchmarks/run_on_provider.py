@@ -30,10 +30,13 @@ from benchmarks.run_one import peak_mb
 from me2e_compress.errors import EnergyError, Me2eError
 from me2e_compress.registry import name_in
 from me2e_compress.runtime.energy import EnergyResult
-from me2e_compress.runtime.energy.energy_counter import ENERGY_COUNTERS, open_counter
+from me2e_compress.runtime.energy.energy_counter import (
+    ENERGY_COUNTERS,
+    EnergySchedule,
+    open_counter,
+)
+from me2e_compress.runtime.energy.energy_result import Absent, Reader
 from me2e_compress.runtime.energy.meter import EnergyMeter
-from me2e_compress.runtime.energy.reader import Absent, Reader
-from me2e_compress.runtime.energy.schedule import EnergySchedule
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider, provider_named
 from me2e_compress.runtime.session import Session

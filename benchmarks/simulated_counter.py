@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from me2e_compress.runtime.energy.estimate import Window
-from me2e_compress.runtime.energy.schedule import EnergySchedule
+from me2e_compress.runtime.energy.energy_counter import EnergySchedule
+from me2e_compress.runtime.energy.energy_result import Window
 
 Floats = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 

@@ -23,8 +23,8 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError, Me2eError, RecipeError
 from me2e_compress.graph import file_bytes
 from me2e_compress.operators.deformable_attention import DeformableAttention
-from me2e_compress.registry.marks import PRODUCER
-from me2e_compress.shipped.model_files import write
+from me2e_compress.registry.drafts import PRODUCER
+from me2e_compress.shipped.drivers import write
 from me2e_compress.workflows.checks import check_count
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.result import megabytes

@@ -10,12 +10,11 @@ import onnx
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.calibration.calibrator import CalibrationCheckpoint, CalibrationState
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.recording import write_recording
-from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
-from me2e_compress.fidelity.sensitivity.recipes import write_recipe
-from me2e_compress.fidelity.sensitivity.trials import Int8Choice
-from me2e_compress.registry.marks import BYTES, MARK, is_marked
+from me2e_compress.fidelity.sensitivity.analysis import Int8Choice, write_recipe
+from me2e_compress.registry.drafts import BYTES, MARK, is_marked
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.simulator.routes import load_routes, save_routes

@@ -6,10 +6,15 @@ from typing import Literal
 from benchmarks.paper.drives import ModelFacts, PaperDrives
 from benchmarks.paper.published import PublishedDrive
 from me2e_compress.driving.realtime import DT_US, skipped_decisions
-from me2e_compress.metrics.eer import POINTS, eer, rankings
+from me2e_compress.metrics.eer import (
+    POINTS,
+    RouteMeasures,
+    eer,
+    rankings,
+    route_measures,
+)
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
-from me2e_compress.metrics.route_values import DS, ROOM
+from me2e_compress.metrics.route_summary import DS, ROOM
 from me2e_compress.study.cells import MISSING, estimate_cell, number
 from me2e_compress.workflows.result import Cell
 

@@ -11,7 +11,7 @@ from pydantic import ConfigDict, TypeAdapter, with_config
 from benchmarks.paper.accident import Accident
 from benchmarks.paper.questions import SHIPPED, PaperQuestions
 from me2e_compress.errors import StudyError
-from me2e_compress.metrics.route_values import COLUMNS, RouteColumn
+from me2e_compress.metrics.route_summary import COLUMNS, RouteColumn
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.energy import EnergyResult

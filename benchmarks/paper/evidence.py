@@ -20,7 +20,7 @@ from me2e_compress.metrics.intervals import (
     p_value,
 )
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.metrics.route_values import COLUMNS, POINTS
+from me2e_compress.metrics.route_summary import COLUMNS, POINTS
 from me2e_compress.study.cells import number
 from me2e_compress.study.drive_record import DriveRecord
 

@@ -19,7 +19,7 @@ from me2e_compress.errors import StudyError
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.energy.models import measure_energy
-from me2e_compress.runtime.interleaved import record_traces
+from me2e_compress.runtime.profile import record_traces
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drives import DriveSetup

@@ -1,26 +1,193 @@
 """Calibrate a graph in one streaming pass, in the memory of inference."""
 
 import dataclasses
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.calibration.dataset import archive_of, load_arrays
 from me2e_compress.calibration.observers import DEFAULT_METHOD, OBSERVERS
-from me2e_compress.calibration.probes import Counts, Extremes
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
 from me2e_compress.calibration.statistics import BINS, Statistics, checksum, no_element
 from me2e_compress.calibration.stream import Readings, Recording, probed_session, stream
 from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.registry import documents
+from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.probing import Probe
+from me2e_compress.runtime.probing import Probe, Reading, shared_constant
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import unsupported
 from me2e_compress.runtime.session import DTYPES
+
+# The probes of a calibration: extremes, and histograms of magnitudes.
+
+
+@dataclasses.dataclass(frozen=True)
+class Extremes:
+    """Smallest element, largest element, mean square.
+
+    The mean square shows where few elements determine the range. It also finds every
+    NaN, which onnxruntime's ReduceMin and ReduceMax overlook unless it comes first.
+    A tensor without elements gives infinity, minus infinity and 0.
+    """
+
+    width: int = 3
+
+    def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
+        """Build three reductions of the whole tensor."""
+        one = shared_constant(where, np.array([1], np.int64), "one")
+        least = shared_constant(where, np.array(1, np.float32), "least")
+        low, high, total = (
+            ir.node(op, [value], {"keepdims": 0})
+            for op in ("ReduceMin", "ReduceMax", "ReduceSumSquare")
+        )
+        # Divide by at least 1: a tensor may be empty.
+        size = ir.node("Size", [value])
+        count = _cast(size.outputs[0], ir.DataType.FLOAT)
+        some = ir.node("Max", [count.outputs[0], least])
+        mean = ir.node("Div", [total.outputs[0], some.outputs[0]])
+        # All readings are 1-D, so that they can be joined.
+        flat = [
+            ir.node("Reshape", [each.outputs[0], one]) for each in (low, high, mean)
+        ]
+        nodes = [low, high, total, size, count, some, mean, *flat]
+        return nodes, [each.outputs[0] for each in flat]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Counts:
+    """A histogram of magnitudes.
+
+    Attributes:
+        exponents: int64 [tensors]: the bins of a tensor divide [0, 2^exponent).
+        width: the number of bins.
+    """
+
+    exponents: npt.NDArray[np.int64]
+    width: int = BINS
+
+    def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
+        """Compute bin numbers, and count them as a text's words are counted.
+
+        TfidfVectorizer is the one standard operator that counts integers: exact,
+        available from opset 9 on, without a second array as large as the tensor.
+        Scaling by a power of two is exact: every element lies in its own bin.
+        """
+        bins_per_unit = np.ldexp(np.float32(BINS), -self.exponents[at])
+        factor = shared_constant(
+            where, np.asarray(bins_per_unit, np.float32), f"factor_{at}"
+        )
+        last = shared_constant(where, np.array(BINS - 1, np.float32), "last_bin")
+        row = shared_constant(where, np.array([-1], np.int64), "row")
+        # Number the bins; the last one takes what lies beyond.
+        magnitude = ir.node("Abs", [value])
+        scaled = ir.node("Mul", [magnitude.outputs[0], factor])
+        capped = ir.node("Min", [scaled.outputs[0], last])
+        number = _cast(capped.outputs[0], ir.DataType.INT32)
+        words = ir.node("Reshape", [number.outputs[0], row])
+        bins = list(range(BINS))
+        # Count n-grams of length 1: the bin numbers.
+        count = ir.node(
+            "TfIdfVectorizer",
+            [words.outputs[0]],
+            {
+                "mode": "TF", "min_gram_length": 1, "max_gram_length": 1,
+                "max_skip_count": 0, "ngram_counts": [0], "ngram_indexes": bins,
+                "pool_int64s": bins,
+            },
+        )  # fmt: skip
+        nodes = [magnitude, scaled, capped, number, words, count]
+        return nodes, [count.outputs[0]]
+
+
+def _cast(value: ir.Value, to: ir.DataType) -> ir.Node:
+    return ir.node("Cast", [value], {"to": to.value})
+
+
+# Checkpoints of a long calibration, so that it can resume after a kill.
+
+
+_STATE = "state/"
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibrationState:
+    """Frames done in one pass, results so far, and the state for the next frame."""
+
+    done: int = 0
+    results: Mapping[str, Array] = dataclasses.field(default_factory=dict)
+    state: Mapping[str, Array] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibrationCheckpoint:
+    """The file of a calibration's progress; a path of None keeps nothing.
+
+    ``key`` identifies the calibration: digest of the graph, tensors, frames, ...
+    """
+
+    path: Path | None
+    key: Mapping[str, object]
+    every: int = 8
+
+    def read(self) -> CalibrationState:
+        """Read the progress; an empty one if there is no file."""
+        if self.path is None or not self.path.is_file():
+            return CalibrationState()
+        try:
+            found = load_arrays(self.path, "a checkpoint")
+            key = documents.from_json(str(found.pop("key")))
+            done = int(str(found.pop("done")))
+        except (ValueError, KeyError) as error:
+            raise FramesError(f"{self.path}: not a checkpoint ({error})") from error
+        # A checkpoint of another calibration is refused.
+        self._check(key)
+        return CalibrationState(
+            done,
+            {name: a for name, a in found.items() if not name.startswith(_STATE)},
+            {
+                name.removeprefix(_STATE): array
+                for name, array in found.items()
+                if name.startswith(_STATE)
+            },
+        )
+
+    def write(self, progress: CalibrationState) -> None:
+        """Write the progress atomically."""
+        if self.path is None:
+            return
+        state = {_STATE + name: array for name, array in progress.state.items()}
+        # The state shares the archive, under a prefix.
+        head = {"key": np.array(json.dumps(self.key)), "done": np.array(progress.done)}
+        write_bytes(self.path, archive_of({**head, **progress.results, **state}))
+
+    def due(self, done: int, total: int) -> bool:
+        """Return whether it is time to write."""
+        return self.path is not None and (done % self.every == 0 or done == total)
+
+    def clear(self) -> None:
+        """Remove the file of a finished calibration."""
+        if self.path is not None:
+            self.path.unlink(missing_ok=True)
+
+    def _check(self, key: object) -> None:
+        wanted = json.loads(json.dumps(self.key))
+        if not isinstance(key, dict) or key.keys() != wanted.keys():
+            raise FramesError(
+                f"{self.path}: a checkpoint of another version; remove it"
+            )
+        if stale := [name for name in wanted if key[name] != wanted[name]]:
+            raise FramesError(
+                f"{self.path}: stale: a checkpoint of another {stale[0]}; remove it to"
+                " begin again"
+            )
+
 
 Progress: TypeAlias = Callable[[int, int], None]
 

@@ -2,35 +2,235 @@
 
 A recording is a folder with one ``.npz`` a frame, keyed by input name and ordered by
 file name, and ``scenes.json``: ``{"scenes": [0, 64, ...]}``, the index of the first
-frame of every scene, and which inputs are pixels (`me2e_compress.calibration.pixels`).
+frame of every scene, and which inputs are pixels (`me2e_compress.calibration.dataset`).
+
+Images in recordings: bytes on disk, normalised when they are fed.
+
+A frame of six 1600 x 928 images has 107 MB as float32 and 27 MB as bytes. A recording
+lists the inputs stored as bytes in ``scenes.json``:
+``{"pixels": {"version": 1, "inputs": {"img": {"mean": ..., "std": ..., ...}}}}``.
+Other inputs are fed unchanged. A reader that does not know the key refuses the bytes,
+since their type and shape do not fit the model.
 """
 
+import dataclasses
 import hashlib
+import io
 import itertools
 import json
+import math
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Annotated, Any, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 import onnx_ir as ir
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt
 
-from me2e_compress.calibration.archives import Declared, declared, load_arrays
-from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.display import reason
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.recurrence import not_fed_back, recurrent_inputs, sides
-from me2e_compress.registry import documents
+from me2e_compress.registry import documents, drafts
+from me2e_compress.registry.documents import UNREADABLE, check_regular
 from me2e_compress.runtime.frames import Array, Frame
+
+__all__ = [
+    "CHANNELS",
+    "LARGEST_BYTES",
+    "CalibrationSet",
+    "Declared",
+    "Frame",
+    "PixelInput",
+    "PixelInputs",
+    "Spread",
+    "Triple",
+    "archive_of",
+    "declared",
+    "load_arrays",
+    "synthetic",
+]
+
+
+# Write ``.npz`` files, and read them, checking their sizes first.
+
+
+LARGEST_BYTES = 2 << 30
+"""The most bytes of all arrays of one file. Six full-size camera images have 0.1 GB."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Declared:
+    """Shape and type of an array, as its file states."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[np.generic]
+
+
+def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared]:
+    """Read the headers of an ``.npz`` by array name, without the arrays.
+
+    The message calls the expected content ``what``.
+    """
+    try:
+        check_regular(path)
+        with path.open("rb") as source, zipfile.ZipFile(source) as archive:
+            found = [_member(archive, each) for each in archive.infolist()]
+    except UNREADABLE as error:
+        raise FramesError(f"{path}: not {what} ({reason(error)})") from error
+    # A name may occur once only.
+    if len(dict(found)) < len(found):
+        raise FramesError(f"{path}: not {what} (an array is there twice)")
+    # A header could claim any size: check before reading.
+    total = sum(_bytes(each) for _, each in found)
+    if total > LARGEST_BYTES:
+        raise FramesError(
+            f"{path}: not {what}: its arrays have {total:,} bytes, more than"
+            f" {LARGEST_BYTES:,}"
+        )
+    return dict(found)
+
+
+def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
+    """Read every array of an ``.npz`` by name, after the checks of :func:`declared`."""
+    declared(path, what)
+    try:
+        with path.open("rb") as source, np.load(source, allow_pickle=False) as content:
+            return {name: np.asarray(content[name]) for name in content}
+    except UNREADABLE as error:
+        raise FramesError(f"{path}: not {what} ({reason(error)})") from error
+
+
+def archive_of(arrays: Mapping[str, Array]) -> bytes:
+    """Return an ``.npz`` of arrays; equal arrays give equal bytes."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        archive.comment = drafts.BYTES
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, np.asanyarray(array))
+    return content.getvalue()
+
+
+def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[str, Declared]:
+    with archive.open(entry) as stream:
+        about = _header(stream)
+        begin = stream.tell()
+    if entry.file_size != begin + _bytes(about):
+        raise ValueError(
+            f"{entry.filename} has {entry.file_size} bytes, its header says"
+            f" {begin + _bytes(about)}"
+        )
+    return entry.filename.removesuffix(".npy"), about
+
+
+def _header(stream: IO[bytes]) -> Declared:
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    elif version == (2, 0):
+        shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
+    else:
+        raise ValueError(f"an array of version {version}")
+    # Objects would be unpickled, which runs code.
+    if dtype.hasobject:
+        raise ValueError("an array of Python objects")
+    if any(side < 0 for side in shape):
+        raise ValueError(f"an array of shape {shape}")
+    return Declared(tuple(shape), dtype)
+
+
+def _bytes(about: Declared) -> int:
+    return math.prod(about.shape) * about.dtype.itemsize
+
+
+Triple: TypeAlias = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Spread: TypeAlias = Annotated[FiniteFloat, Field(gt=0)]
+
+CHANNELS = 3
+
+
+class PixelInput(BaseModel):
+    """An image input stored as bytes: (pixel - mean) / std, padded with zeros.
+
+    On disk it is uint8 [..., 3, h, w], its planes in the order of the model; fed it is
+    float32 [..., 3, rows, columns], zero below and to the right of the picture, as
+    mmdetection pads after it normalises.
+
+    Attributes:
+        mean: in grey levels 0 to 255, for each plane.
+        std: in grey levels, for each plane.
+        order: order of the planes: red first or blue first.
+        rows: rows of the input.
+        columns: columns of the input.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    mean: Triple
+    std: tuple[Spread, Spread, Spread]
+    order: Literal["rgb", "bgr"]
+    rows: PositiveInt
+    columns: PositiveInt
+
+    def fed(self, stored: Declared) -> Declared:
+        """Return shape and type of a stored input when it is fed.
+
+        Raises:
+            ValueError: it is not bytes, has not three planes, or is too large.
+        """
+        if stored.dtype != np.uint8:
+            raise ValueError(f"is {stored.dtype}, pixels are uint8")
+        if len(stored.shape) < CHANNELS or stored.shape[-3] != CHANNELS:
+            raise ValueError(
+                f"has shape {list(stored.shape)}, pixels are [..., 3, h, w]"
+            )
+        if stored.shape[-2] > self.rows or stored.shape[-1] > self.columns:
+            raise ValueError(
+                f"has shape {list(stored.shape)}, more than {self.rows} rows or"
+                f" {self.columns} columns"
+            )
+        shape = (*stored.shape[:-2], self.rows, self.columns)
+        return Declared(shape, np.dtype(np.float32))
+
+    def normalised(self, stored: Array) -> npt.NDArray[np.float32]:
+        """Return the input, float32 [..., 3, rows, columns]; errors as :meth:`fed`."""
+        shape = self.fed(Declared(stored.shape, stored.dtype)).shape
+        height, width = stored.shape[-2:]
+        ready = np.zeros(shape, np.float32)
+        picture = ready[..., :height, :width]
+        picture[...] = stored
+        picture -= np.array(self.mean, np.float32)[:, None, None]
+        picture /= np.array(self.std, np.float32)[:, None, None]
+        return ready
+
+
+class PixelInputs(BaseModel):
+    """The entry ``pixels`` of ``scenes.json``.
+
+    Attributes:
+        version: version of this format; later ones are refused.
+        inputs: the inputs stored as bytes, by name.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    version: Literal[1] = 1
+    inputs: dict[str, PixelInput] = {}
+
+    @classmethod
+    def of(cls, index: Mapping[str, object]) -> Self:
+        """Read the entry from the content of ``scenes.json``; old ones have none."""
+        found = index.get("pixels")
+        return cls() if found is None else cls.model_validate(found)
+
 
 T = TypeVar("T", Array, Declared)
 
 FROZEN_INPUTS = "me2e.static_inputs"
 """Metadata key of a graph: JSON with a digest of every input that became constant."""
-
-__all__ = ["CalibrationSet", "Frame", "synthetic"]
 
 
 class CalibrationSet:

@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from me2e_compress.calibration.archives import declared, load_arrays
-from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.dataset import CalibrationSet, declared, load_arrays
 from me2e_compress.display import counted, reason
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import documents

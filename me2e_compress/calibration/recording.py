@@ -4,17 +4,20 @@ import dataclasses
 import json
 import shutil
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 
-from me2e_compress.calibration.pixels import PixelInput, PixelInputs
+from me2e_compress.calibration.dataset import PixelInput, PixelInputs
 from me2e_compress.errors import FramesError
-from me2e_compress.registry import documents, drafts, marks
+from me2e_compress.registry import Registry, documents, drafts
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.providers import CPU, Provider
 
 INDEX = "scenes.json"
 
@@ -143,7 +146,7 @@ class _Draft:
         for left in self.folder.glob(f".{PROGRESS}.*"):  # by a kill
             left.unlink()
         about = {**self.about, "count": self.count}
-        index = {**marks.IN_JSON, "scenes": self.scenes, **about}
+        index = {**drafts.IN_JSON, "scenes": self.scenes, **about}
         with drafts.naming(self.folder / INDEX):
             (self.folder / INDEX).write_text(json.dumps(index, indent=1) + "\n")
 
@@ -176,9 +179,55 @@ def _check_replaceable(folder: Path, mark: str = INDEX) -> None:
 def _write_npz(path: Path, arrays: Mapping[str, Array]) -> None:
     """Write like numpy.savez_compressed, reproducibly."""
     with zipfile.ZipFile(path, "w") as archive:
-        archive.comment = marks.BYTES
+        archive.comment = drafts.BYTES
         for name, value in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy")
             entry.compress_type = zipfile.ZIP_DEFLATED
             with archive.open(entry, "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, value, allow_pickle=False)
+
+
+# Recorded driving, which other packages read (docs/writing-logs.md).
+
+
+@dataclass(frozen=True)
+class LogRequest:
+    """What frames a log is asked for.
+
+    Attributes:
+        model: the ONNX file, or the TOML of a stack, whose inputs they are.
+        count: most frames in all.
+        scene_length: most frames a scene; None means all.
+        adapter: TOML file that adapts the model to the policy contract.
+        provider: what opens the model.
+    """
+
+    model: Path
+    count: int
+    scene_length: int | None = None
+    adapter: Path | None = None
+    provider: Provider = CPU
+
+
+@dataclass(frozen=True)
+class DriveLog(ABC):
+    """A data set of recorded driving."""
+
+    name: ClassVar[str]
+
+    @abstractmethod
+    def frames(self, request: LogRequest, begin: Begin) -> Iterator[Frame]:
+        """Yield frames of the model's inputs, from the beginning of a scene on.
+
+        Raises:
+            FramesError: something is missing or malformed, or does not fit the model.
+        """
+
+    def pixels(self, request: LogRequest) -> Mapping[str, PixelInput]:
+        """Return the inputs that are yielded as bytes, by name."""
+        return {}
+
+
+LOGS: Registry[DriveLog] = Registry(
+    "driving log", "me2e_compress.logs", FramesError, {}
+)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from me2e_compress.driving.latency_source import (
+from me2e_compress.driving.latency import (
     Charge,
     DecisionFacts,
     LatencySource,

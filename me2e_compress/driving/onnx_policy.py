@@ -9,10 +9,16 @@ from me2e_compress.driving.adapter import Adapter, ImageNormalization
 from me2e_compress.driving.adapter.inputs import ModelInputs, contract_names
 from me2e_compress.driving.adapter.outputs import ModelOutputs
 from me2e_compress.driving.adapter.recurrent import FirstValues, answers_by_input
-from me2e_compress.driving.answer import PLAN_TIMES_S, six_waypoints
-from me2e_compress.driving.contract import Answer, Observation, RouteInfo, Trajectory
+from me2e_compress.driving.contract import (
+    PLAN_TIMES_S,
+    Answer,
+    Observation,
+    RouteInfo,
+    Trajectory,
+    fits,
+    six_waypoints,
+)
 from me2e_compress.driving.host_stage import HostStage, HostWork
-from me2e_compress.driving.ports import fits
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider

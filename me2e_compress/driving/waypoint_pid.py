@@ -7,8 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from me2e_compress.driving.answer import timed
-from me2e_compress.driving.contract import PedalsAndWheel, Plan
+from me2e_compress.driving.contract import PedalsAndWheel, Plan, timed
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.trajectory import Trajectory
 

@@ -13,7 +13,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.compare import decibels
-from me2e_compress.fidelity.engine_run import EngineRun
+from me2e_compress.fidelity.engine_loss import EngineRun
 from me2e_compress.fidelity.floor import SQNR_FLOOR_DB
 from me2e_compress.graph.nodes import constant_values, nodes_of, reads_of
 from me2e_compress.graph.provenance import module_of

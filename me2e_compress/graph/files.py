@@ -24,7 +24,7 @@ from me2e_compress.graph.weight_files import (
     settle,
     write_inline,
 )
-from me2e_compress.registry import drafts, marks
+from me2e_compress.registry import drafts
 
 INLINE_LIMIT_BYTES = 1_900_000_000
 """Weights beyond this go to a data file: protobuf cannot hold 2 GiB in one message."""
@@ -134,7 +134,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
         draft_data = draft.with_name(data.name)
         if draft_data.exists():
             with draft_data.open("ab") as stream:
-                stream.write(marks.BYTES)
+                stream.write(drafts.BYTES)
             drafts.put(draft_data, data)
         drafts.put(draft, path)
     for old in earlier:
@@ -145,7 +145,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
 def _ours(model: ir.Model) -> Iterator[None]:
     """Let a model name us as its producer while it is written."""
     before = model.producer_name, model.producer_version
-    model.producer_name, model.producer_version = marks.PRODUCER, None
+    model.producer_name, model.producer_version = drafts.PRODUCER, None
     try:
         yield
     finally:

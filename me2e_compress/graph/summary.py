@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterable
 import onnx_ir as ir
 
 from me2e_compress.graph.nodes import input_at, is_plugin, nodes_in, nodes_inside
-from me2e_compress.graph.plugins import knowledge
-from me2e_compress.graph.shapes import static_shape
+from me2e_compress.graph.shapes import knowledge, static_shape
 
 Counter = Callable[[ir.Node], int | None]
 

@@ -6,12 +6,136 @@ it was made of. In graphsurgeon, call ``fold_constants(recurse_functions=False)`
 as if these were graphs of their own, and the model is not valid any more (0.6.1).
 """
 
+from collections.abc import Iterable, Sequence
+
 import onnx_graphsurgeon as gs
 import onnx_ir as ir
 from onnx_graphsurgeon.util.exception import OnnxGraphSurgeonException
 
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.restore import restore
+from me2e_compress.graph import provenance
+
+# Restore the metadata and provenance that a foreign tool has dropped.
+
+
+def restore(
+    model: ir.Model, like: ir.Model, *, by: str, node_names: bool = False
+) -> None:
+    """Restore metadata and provenance in a graph that a tool has rewritten.
+
+    onnxsim and onnx-graphsurgeon drop what models say of themselves, and the metadata
+    of functions, nodes and values. Here a node is known again by the name of its first
+    output, then by its own name. One of the same operator gets all its metadata back;
+    one of another operator now inherits from that and from the nodes that vanished
+    above it; one that is new inherits from its nearest neighbour: the producer that
+    comes last in the graph, else the consumer that comes first. Linear in nodes.
+
+    ``model`` is the tool's result, in graph order, and changed in place, ``like`` its
+    input; ``by`` is the pass to name in the provenance of new nodes. ``node_names``
+    restores the names of known nodes of the same operator too.
+    """
+    model.domain, model.doc_string = like.domain, like.doc_string
+    model.model_version = like.model_version
+    _merge(model.metadata_props, like.metadata_props)
+    _merge(model.graph.metadata_props, like.graph.metadata_props)
+    for key, function in model.functions.items():
+        if key in like.functions:
+            _merge(function.metadata_props, like.functions[key].metadata_props)
+            _match(list(function.all_nodes()), list(like.functions[key].all_nodes()))
+    _restore_values(model, like)
+    nodes = list(model.graph.all_nodes())
+    found = _match(nodes, list(like.graph.all_nodes()))
+    if node_names:
+        _rename(nodes, found)
+    _inherit_from_neighbours(nodes, found, by)
+
+
+def _merge(props: dict[str, str], past: dict[str, str]) -> None:
+    for key, text in past.items():
+        props.setdefault(key, text)
+
+
+def _restore_values(model: ir.Model, like: ir.Model) -> None:
+    known = {value.name: value.metadata_props for value in _values(like)}
+    for value in _values(model):
+        if past := known.get(value.name):
+            _merge(value.metadata_props, past)
+
+
+def _values(model: ir.Model) -> Iterable[ir.Value]:
+    for graph in (model.graph, *model.graph.subgraphs()):
+        yield from graph.inputs
+        yield from graph.initializers.values()
+    for node in model.graph.all_nodes():
+        yield from node.outputs
+
+
+def _match(nodes: Sequence[ir.Node], past: Sequence[ir.Node]) -> dict[ir.Node, ir.Node]:
+    by_output = {node.outputs[0].name: node for node in past if node.outputs}
+    by_name = {node.name: node for node in past if node.name}
+    found: dict[ir.Node, ir.Node] = {}
+    for node in nodes:
+        known = by_output.get(node.outputs[0].name) if node.outputs else None
+        if known is None and node.name:
+            named = by_name.get(node.name)
+            known = named if named is not None and _alike(named, node) else None
+        if known is not None:
+            found[node] = known
+            if _alike(node, known):
+                _merge(node.metadata_props, known.metadata_props)
+    return found
+
+
+def _alike(one: ir.Node, other: ir.Node) -> bool:
+    return one.op_identifier() == other.op_identifier()
+
+
+def _rename(nodes: Sequence[ir.Node], found: dict[ir.Node, ir.Node]) -> None:
+    renamed = {n: p.name for n, p in found.items() if p.name and _alike(n, p)}
+    taken = {node.name for node in nodes if node not in renamed}
+    for node, name in renamed.items():
+        if name not in taken:
+            taken.add(name)
+            node.name = name
+
+
+def _inherit_from_neighbours(
+    nodes: Sequence[ir.Node], found: dict[ir.Node, ir.Node], by: str
+) -> None:
+    alive = {value.name for node in nodes for value in node.outputs}
+    claimed: set[ir.Node] = set()
+    for node in nodes:
+        if provenance.read(node) is None and (known := found.get(node)) is not None:
+            vanished = _vanished_above(known, alive, claimed)
+            provenance.inherit(node, (known, *vanished), by=by)
+    place = {node: index for index, node in enumerate(nodes)}
+    for node in nodes:
+        makers = [value.producer() for value in node.inputs if value is not None]
+        heard = [m for m in makers if m in place and provenance.read(m) is not None]
+        if provenance.read(node) is None and heard:
+            provenance.inherit(node, (max(heard, key=place.__getitem__),), by=by)
+    for node in reversed(nodes):
+        readers = [reader for value in node.outputs for reader in value.consumers()]
+        heard = [r for r in readers if provenance.read(r) is not None]
+        if provenance.read(node) is None and heard:
+            provenance.inherit(node, (min(heard, key=place.__getitem__),), by=by)
+
+
+def _vanished_above(
+    node: ir.Node, alive: set[str | None], claimed: set[ir.Node]
+) -> list[ir.Node]:
+    found: list[ir.Node] = []
+    stack = [node]
+    while stack:
+        for value in stack.pop().inputs:
+            maker = None if value is None else value.producer()
+            if maker is None or maker in claimed:
+                continue
+            if not any(output.name in alive for output in maker.outputs):
+                claimed.add(maker)
+                found.append(maker)
+                stack.append(maker)
+    return found
 
 
 def to_graphsurgeon(model: ir.Model) -> gs.Graph:
@@ -26,7 +150,7 @@ def to_graphsurgeon(model: ir.Model) -> gs.Graph:
             if isinstance(value.const_value, ir.ExternalTensor):
                 array = value.const_value.numpy().copy()
                 value.const_value = ir.tensor(array, name=value.name)
-    _rename(copy, {key: _spelled(key) for key in copy.functions if key[2]})
+    _surgeon_rename(copy, {key: _spelled(key) for key in copy.functions if key[2]})
     return gs.import_onnx(ir.to_proto(copy))
 
 
@@ -49,7 +173,7 @@ def from_graphsurgeon(
         raise GraphError(f"{by}: graphsurgeon's graph is not a model: {reason}") from (
             error
         )
-    _rename(model, {_spelled(key): key for key in like.functions if key[2]})
+    _surgeon_rename(model, {_spelled(key): key for key in like.functions if key[2]})
     restore(model, like, by=by)
     return model
 
@@ -59,7 +183,7 @@ def _spelled(key: ir.OperatorIdentifier) -> ir.OperatorIdentifier:
     return domain, f"{name}__{overload}", ""
 
 
-def _rename(
+def _surgeon_rename(
     model: ir.Model, names: dict[ir.OperatorIdentifier, ir.OperatorIdentifier]
 ) -> None:
     if not names:

@@ -20,8 +20,8 @@ from me2e_compress.errors import (
     VerificationError,
 )
 from me2e_compress.graph.opset import lowered
-from me2e_compress.manager import equivalence, pass_contract, reproducer
-from me2e_compress.manager.attempt import attempt
+from me2e_compress.manager import equivalence, reproducer
+from me2e_compress.manager.attempt import attempt, blame_file
 from me2e_compress.manager.equivalence import TryFirst
 from me2e_compress.manager.recipe import to_text
 from me2e_compress.manager.report import LossyPass, Report, Step, Verification
@@ -147,7 +147,7 @@ class _Books:
         start = process_time()
         found = attempt(current, model, self.context, self._digest)
         if isinstance(found, PassError | VerificationError):
-            pass_contract.blame_file(current.name, model, found)
+            blame_file(current.name, model, found)
             raise self._with_reproducer(current, model, found) from found.__cause__
         if isinstance(found, Me2eError):
             raise found

@@ -2,14 +2,33 @@
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph.nodes import reads_of
-from me2e_compress.graph.part import part_of
+
+# Cut a part out of a graph, to be run alone.
+
+
+def part_of(
+    model: ir.Model, inputs: Sequence[ir.Value], outputs: Sequence[ir.Value]
+) -> ir.Model:
+    """Return the nodes between some values of a graph as a model of their own.
+
+    Weights, functions and opsets come along. ValueError where the outputs need more
+    than these inputs.
+    """
+    body = ir.convenience.extract(model.graph, inputs, outputs)
+    body.opset_imports.update(model.graph.opset_imports)
+    return ir.Model(
+        body,
+        ir_version=model.ir_version,
+        functions=[function.clone() for function in model.functions.values()],
+    )
+
 
 PIPELINE = "pipeline.txt"
 """Says what fails, and by that whose folder it is."""

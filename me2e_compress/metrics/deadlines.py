@@ -6,8 +6,7 @@ from statistics import fmean
 from typing import Any
 
 from me2e_compress.metrics.episode import FRAME_US, Episode
-from me2e_compress.metrics.measure import Measure
-from me2e_compress.metrics.percentiles import percentile, too_few
+from me2e_compress.metrics.measure import Measure, percentile, too_few
 from me2e_compress.metrics.surrogate_safety import TTC_CRITICAL_S
 
 BUDGET_MS = FRAME_US / 1000

@@ -9,8 +9,7 @@ from typing import Any
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.intervals import unseen_interval, unseen_share
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.metrics.route_summary import RouteSummary
-from me2e_compress.metrics.route_values import DS, ROOM, SR, RouteValues
+from me2e_compress.metrics.route_summary import DS, ROOM, SR, RouteSummary, RouteValues
 
 SCATTER = 26.0
 """Standard deviation, points a route, of the driving score's paired difference between

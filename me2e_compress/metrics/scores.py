@@ -19,7 +19,7 @@ from me2e_compress.metrics.intervals import (
     mean_estimate,
 )
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.metrics.route_values import PERCENT, SHARE
+from me2e_compress.metrics.route_summary import PERCENT, SHARE
 
 FULL_SET = 220
 """Routes of a whole benchmark: 44 scenario types with 5 variants each."""

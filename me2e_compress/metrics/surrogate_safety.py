@@ -6,8 +6,7 @@ measures also count near misses. Each is None if its input was not recorded.
 
 from collections.abc import Iterable
 
-from me2e_compress.metrics.conflict_record import CROSSING_RAD
-from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.episode import CROSSING_RAD, Episode
 from me2e_compress.metrics.infraction import COLLISIONS
 from me2e_compress.metrics.measure import Measure
 

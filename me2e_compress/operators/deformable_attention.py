@@ -1,12 +1,17 @@
 """Multi-scale deformable attention (Deformable DETR, arXiv 2010.04159, equation 3)."""
 
 import dataclasses
+import math
+from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.operators.attention_layouts import JoinedHeads, RawAttention
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import array_of
+from me2e_compress.graph.nodes import maker, permutation_of
+from me2e_compress.graph.shapes import Dims, product, static_shape
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall
@@ -24,6 +29,244 @@ from me2e_compress.operators.dialect import (
     present,
 )
 from me2e_compress.operators.raw_attention import raw_own_form
+
+# Two layouts of deformable attention that differ from TensorRT OSS's.
+
+
+@dataclasses.dataclass(frozen=True)
+class JoinedHeads(Dialect):
+    """A library whose output is [N, Q, M * D] instead of [N, Q, M, D]."""
+
+    def result_to_own(self, call: FusedCall, result: ir.Value, own: Values) -> ir.Value:
+        """Split the heads."""
+        value, _, _, locations, _ = present(own)
+        sizes = (call.size(value, 0), call.size(locations, 1))
+        return call.reshape(result, (*sizes, call.size(value, 2), call.size(value, 3)))
+
+    def result_from_own(
+        self, call: FusedCall, result: ir.Value, own: Values
+    ) -> ir.Value:
+        """Join the heads."""
+        value, _, _, locations, _ = present(own)
+        width = call.product(call.size(value, 2), call.size(value, 3))
+        sizes = (call.size(value, 0), call.size(locations, 1), width)
+        return call.reshape(result, sizes)
+
+    def result_from_own_array(self, result: NdArray) -> NdArray:
+        """Join the heads."""
+        return result.reshape(*result.shape[:2], -1)
+
+    def shape_from_own(self, shape: Dims) -> Dims:
+        """Join the heads."""
+        return (*shape[:2], product(shape[2:]))
+
+
+@dataclasses.dataclass(frozen=True)
+class RawAttention(Dialect):
+    """A library that takes reference points, offsets in pixels and raw weights.
+
+    With g reference points, point p refers to reference point p % g; the softmax is
+    over all levels and points (BEVFormer_tensorrt, multiScaleDeformableAttnKernel.cu).
+    """
+
+    def inputs_to_own(
+        self, call: FusedCall, inputs: Values, attributes: Attributes
+    ) -> Values:
+        """Write the locations, the softmax and the start of each level."""
+        value, shapes, reference, offsets, weights = present(inputs)
+        # Offsets are in pixels of each level
+        levels, group = _levels_and_group(call, shapes, reference, offsets, weights)
+        batch, queries, heads = (call.size(offsets, axis) for axis in range(3))
+        split = call.reshape(offsets, (batch, queries, heads, levels, -1, group, 2))
+        scale = _columns_and_rows(call, shapes, offsets)
+        split = call.add("Div", [split, call.unsqueeze(scale, (1, 2))])
+        # Add the reference points, then normalize the weights
+        points = call.reshape(reference, (batch, queries, 1, 1, 1, group, 2))
+        locations = call.add("Add", [split, points])
+        locations = call.reshape(locations, (batch, queries, heads, levels, -1, 2))
+        softmax = call.add("Softmax", [weights], {"axis": -1})
+        softmax = call.reshape(softmax, (batch, queries, heads, levels, -1))
+        return (value, shapes, _starts(call, shapes), locations, softmax)
+
+    def inputs_from_own(
+        self, call: FusedCall, inputs: Values, attributes: Attributes
+    ) -> Values:
+        """Write offsets from a reference point at 0; weights must be of a softmax."""
+        value, shapes, _, locations, weights = present(inputs)
+        batch, queries, heads = (call.size(locations, axis) for axis in range(3))
+        # Positions 0..1 become pixels
+        scale = _columns_and_rows(call, shapes, locations)
+        pixels = call.add("Mul", [locations, call.unsqueeze(scale, (1,))])
+        offsets = call.reshape(pixels, (batch, queries, heads, -1))
+        reference = call.full((batch, queries, 1, 2), 0.0, locations)
+        # The plugin applies the softmax itself
+        raw = self._before_softmax(call, weights)
+        raw = call.reshape(raw, (batch, queries, heads, -1))
+        given = {
+            "value": value,
+            "spatial_shapes": shapes,
+            "reference_points": reference,
+            "sampling_offsets": offsets,
+            "attention_weights": raw,
+        }
+        return self.in_types(call, given)
+
+    def _before_softmax(self, call: FusedCall, weights: ir.Value) -> ir.Value:
+        found = _before_softmax(call, weights, 2)
+        if found is None:
+            raise PreconditionError(
+                f"node {call.node.name}: {self.op_type} of {self.source} takes weights"
+                f" before their softmax, and {weights.name} is not of a softmax over"
+                " all levels and points"
+            )
+        return found
+
+    def arrays_to_own(self, arrays: Arrays, attributes: Attributes) -> Arrays:
+        """Compute the locations, the softmax and the start of each level."""
+        value, shapes, reference, offsets, raw = (np.asarray(each) for each in arrays)
+        count, (batch, queries, heads, _) = len(shapes), offsets.shape
+        group = reference.shape[-1] // 2
+        # Offsets in pixels, around the reference points
+        parted = offsets.reshape(batch, queries, heads, count, -1, group, 2)
+        scale = shapes[:, None, None, ::-1].astype(np.float64)
+        # an empty level has no positions: any number will do
+        parted = parted.astype(np.float64) / np.where(scale == 0, 1, scale)
+        at = parted + reference.reshape(batch, queries, 1, 1, 1, group, 2)
+        # Softmax in float64
+        powers = np.exp(raw - raw.max(axis=-1, keepdims=True).astype(np.float64))
+        weights = powers / powers.sum(axis=-1, keepdims=True)
+        # Start of each level
+        areas = shapes.astype(np.int64).prod(axis=1)
+        return (
+            value,
+            shapes,
+            np.cumsum(areas) - areas,
+            at.reshape(batch, queries, heads, count, -1, 2),
+            weights.reshape(batch, queries, heads, count, -1),
+        )
+
+    def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
+        """Split the last axes into levels, points and x, y."""
+        value, sizes, _, offsets, weights = shapes
+        levels = None if sizes is None else sizes[0]
+        if offsets is None or weights is None:
+            return (value, sizes, (levels,), None, None)
+        both = weights[3]
+        points = None if both is None or not levels else both // levels
+        own = (*offsets[:3], levels, points)
+        return (value, sizes, (levels,), (*own, 2), own)
+
+
+def _tail(value: ir.Value, count: int) -> list[int | None]:
+    shape = value.shape
+    if shape is None:
+        return [None] * count
+    return [dim if isinstance(dim, int) else None for dim in list(shape)[-count:]]
+
+
+def _levels_and_group(
+    call: FusedCall,
+    shapes: ir.Value,
+    reference: ir.Value,
+    offsets: ir.Value,
+    weights: ir.Value,
+) -> tuple[int, int]:
+    """Return the numbers of levels and reference points; both must be known."""
+    levels, pairs = _tail(shapes, 2)[0], _tail(reference, 1)[0]
+    (steps,), (points,) = _tail(offsets, 1), _tail(weights, 1)
+    name = f"node {call.node.name}: {call.node.op_type}"
+    if levels is None or pairs is None:
+        raise PreconditionError(
+            f"{name}: the shapes of {shapes.name} and {reference.name} must be known"
+        )
+    # Offsets and weights must agree with both numbers
+    group = pairs // 2
+    whole = (
+        steps is None
+        or points is None
+        or (steps == 2 * points and points % max(levels * group, 1) == 0)
+    )
+    if pairs % 2 or not group or not whole:
+        raise PreconditionError(
+            f"{name}: offsets [.., {steps}] and weights [.., {points}] do not go with"
+            f" {levels} levels and reference points [.., {pairs}]"
+        )
+    return levels, group
+
+
+def _columns_and_rows(call: FusedCall, shapes: ir.Value, like: ir.Value) -> ir.Value:
+    """Write the sizes of the levels as (W, H), [L, 2], at least 1 each."""
+    known = array_of(shapes)
+    kind = like.dtype or ir.DataType.FLOAT
+    if known is not None:
+        turned = np.maximum(known[:, ::-1], 1)
+        return call.constant(turned.astype(kind.numpy()), "sizes")
+    turned = call.add("Gather", [shapes, call.integers([1, 0])], {"axis": 1})
+    sizes = call.cast(turned, kind)
+    return call.add("Max", [sizes, call.numbers(1.0, sizes)])
+
+
+def _starts(call: FusedCall, shapes: ir.Value) -> ir.Value:
+    known = array_of(shapes)
+    if known is not None:
+        areas = known.astype(np.int64).prod(axis=1)
+        return call.integers((np.cumsum(areas) - areas).tolist())
+    wide = call.cast(shapes, ir.DataType.INT64)
+    areas = call.add("Mul", call.split_last(wide, 2))
+    return call.add("CumSum", [areas, call.integers(0)], {"exclusive": 1})
+
+
+_LAYOUT = ("Expand", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze")
+
+
+def _before_softmax(call: FusedCall, weights: ir.Value, axes: int) -> ir.Value | None:
+    """Write the scores of a softmax in the layout of its weights, if there is one.
+
+    The last ``axes`` axes of ``weights`` are one row of the softmax.
+    """
+    shape = static_shape(weights)
+    if shape is None:
+        return None
+    # Walk back over layout operators that keep rows whole
+    row, chain, source = math.prod(shape[-axes:]), list[ir.Node](), weights
+    while node := maker(source, *_LAYOUT):
+        read = node.inputs[0]
+        if read is None or not _keeps_rows(node, row):
+            return None
+        chain.append(node)
+        source = read
+    # The softmax must be over the last axis
+    softmax = maker(source, "Softmax")
+    scores = None if softmax is None else softmax.inputs[0]
+    made = static_shape(source)
+    if softmax is None or scores is None or not made or made[-1] != row:
+        return None
+    if softmax.attributes.get_int("axis", -1) not in (-1, len(made) - 1):
+        return None
+    # Repeat the layout operators on its input
+    for node in reversed(chain):
+        attributes = {name: each.value for name, each in node.attributes.items()}
+        scores = call.add(node.op_type, [scores, *node.inputs[1:]], attributes)
+    return scores
+
+
+def _keeps_rows(node: ir.Node, row: int) -> bool:
+    read, made = static_shape(node.inputs[0]), static_shape(node.outputs[0])
+    if read is None or made is None:
+        return False
+    if node.op_type not in ("Expand", "Transpose"):
+        return True
+    # A row consists of the last axes of the input
+    kept = next(
+        (at for at in range(len(read) + 1) if math.prod(read[len(read) - at :]) == row),
+        None,
+    )
+    if kept is None:
+        return False
+    if node.op_type == "Expand":
+        return read[len(read) - kept :] == made[len(made) - kept :]
+    order = permutation_of(node) or []
+    return order[len(read) - kept :] == list(range(len(read) - kept, len(read)))
 
 
 def _operands(integers: tuple[ir.DataType, ...]) -> tuple[Operand, ...]:

@@ -8,7 +8,7 @@ from me2e_compress.operators.replace import set_output
 
 
 class DialectKnowledge:
-    """See :class:`me2e_compress.graph.plugins.PluginKnowledge`.
+    """See :class:`me2e_compress.graph.shapes.PluginKnowledge`.
 
     A node that its dialect refuses counts as unknown.
     """

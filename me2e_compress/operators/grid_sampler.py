@@ -1,14 +1,17 @@
 """Sample an image or a volume at a grid of positions (torch's ``grid_sample``)."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import ClassVar
 
+import numpy as np
 import onnx_ir as ir
 
+from me2e_compress.errors import PreconditionError
 from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.base import Operator
-from me2e_compress.operators.call import Attributes, FusedCall
+from me2e_compress.operators.call import Attributes, FusedCall, Size
 from me2e_compress.operators.dialect import (
     FLOAT32,
     FLOATS,
@@ -23,7 +26,200 @@ from me2e_compress.operators.dialect import (
     number,
     present,
 )
-from me2e_compress.operators.grid_positions import grid_by_gather, grid_sample_array
+
+# ``grid_sample`` in any number of dimensions, by Gather and in numpy.
+
+
+_BILINEAR, _NEAREST, _BICUBIC = range(3)
+_ZEROS, _BORDER, _REFLECTION = range(3)
+_CUBIC = -0.75
+"""The parameter of torch's and ONNX's cubic convolution (Keys 1981 has -0.5)."""
+
+
+def grid_by_gather(
+    call: FusedCall, image: ir.Value, grid: ir.Value, attributes: Attributes
+) -> ir.Value:
+    """Write the neighbours of each position and their weighted sum; not bicubic."""
+    mode = number(attributes, "interpolation_mode")
+    if mode == _BICUBIC:
+        raise PreconditionError(
+            f"node {call.node.name}: bicubic sampling needs GridSample, of opset 16"
+        )
+    # One row of channels per pixel
+    rank = len(image.shape) if image.shape is not None else 4
+    sizes = [call.size(image, axis) for axis in range(2, rank)]
+    batch, channels = call.size(image, 0), call.size(image, 1)
+    rows = call.reshape(image, (batch, channels, -1))
+    rows = call.reshape(call.transpose(rows, (0, 2, 1)), (-1, channels))
+    # Neighbours along each axis
+    axes = [
+        _neighbours(call, at, size, attributes)
+        for at, size in zip(
+            call.split_last(grid, len(sizes)), reversed(sizes), strict=True
+        )
+    ]  # x first
+    # Add all combinations of neighbours
+    step = call.value_of(call.product(*sizes))
+    first = call.add("Mul", [call.counting(batch), step])
+    first = call.unsqueeze(first, range(1, rank - 1))
+    total: ir.Value | None = None
+    for near in itertools.product(*axes):
+        index, share = _one(call, near, sizes)
+        taken = call.add("Gather", [rows, call.add("Add", [first, index])], {"axis": 0})
+        taken = call.add("Mul", [taken, call.unsqueeze(share, (-1,))])
+        total = taken if total is None else call.add("Add", [total, taken])
+    if total is None:
+        raise PreconditionError(f"node {call.node.name}: {image.name} has no dimension")
+    return call.transpose(total, (0, rank - 1, *range(1, rank - 1)))
+
+
+def _one(
+    call: FusedCall, near: Sequence[tuple[ir.Value, ir.Value]], sizes: Sequence[Size]
+) -> tuple[ir.Value, ir.Value]:
+    """Write index and share of one neighbour from those along x, y, ..."""
+    (index, share), *others = near
+    step = call.value_of(sizes[-1])
+    for (along, part), size in zip(others, reversed(sizes[:-1]), strict=True):
+        index = call.add("Add", [index, call.add("Mul", [along, step])])
+        share = call.add("Mul", [share, part])
+        step = call.value_of(call.product(_size(step), size))
+    return index, share
+
+
+def _size(value: ir.Value) -> Size:
+    known = value.const_value
+    return value if known is None else int(known.numpy().item())
+
+
+def _neighbours(
+    call: FusedCall, at: ir.Value, size: Size, attributes: Attributes
+) -> list[tuple[ir.Value, ir.Value]]:
+    """Write index and share of the pixels around a position on one axis."""
+    kind = at.dtype or ir.DataType.FLOAT
+    count = call.cast(call.value_of(size), kind)
+    one = call.numbers(1.0, at)
+    last = call.add("Sub", [count, one])
+    # The pixel position, after padding
+    pixel = _padded(call, _pixel(call, at, count, last, attributes), last, attributes)
+    # The neighbours and their shares
+    if attributes["interpolation_mode"] == _NEAREST:
+        edges: list[tuple[ir.Value, ir.Value | None]]
+        edges = [(call.add("Round", [pixel]), None)]
+    else:
+        low = call.add("Floor", [pixel])
+        part = call.add("Sub", [pixel, low])
+        rest = call.add("Sub", [one, part])
+        edges = [(low, rest), (call.add("Add", [low, one]), part)]
+    # Neighbours outside of the image have no share
+    zero, found = call.numbers(0.0, at), []
+    for edge, share in edges:
+        kept = call.add("Max", [call.add("Min", [edge, last]), zero])
+        inside = call.cast(call.add("Equal", [kept, edge]), kind)
+        share = inside if share is None else call.add("Mul", [share, inside])
+        found.append((call.cast(kept, ir.DataType.INT64), share))
+    return found
+
+
+def _pixel(
+    call: FusedCall,
+    at: ir.Value,
+    count: ir.Value,
+    last: ir.Value,
+    attributes: Attributes,
+) -> ir.Value:
+    moved = call.add("Add", [at, call.numbers(1.0, at)])
+    half = call.numbers(0.5, at)
+    if attributes["align_corners"]:
+        return call.add("Mul", [call.add("Mul", [moved, half]), last])
+    scaled = call.add("Mul", [call.add("Mul", [moved, half]), count])
+    return call.add("Sub", [scaled, half])
+
+
+def _padded(
+    call: FusedCall, pixel: ir.Value, last: ir.Value, attributes: Attributes
+) -> ir.Value:
+    padding = number(attributes, "padding_mode")
+    if padding == _ZEROS:
+        return pixel
+    zero, one = call.numbers(0.0, pixel), call.numbers(1.0, pixel)
+    if padding == _REFLECTION:
+        aligned = bool(attributes["align_corners"])
+        low = call.numbers(0.0 if aligned else -0.5, pixel)
+        span = last if aligned else call.add("Add", [last, one])
+        span = call.add("Max", [span, one])  # one pixel alone has nothing to reflect
+        period = call.add("Add", [span, span])
+        off = call.add("Abs", [call.add("Sub", [pixel, low])])
+        off = call.add("Mod", [off, period], {"fmod": 1})
+        off = call.add("Min", [off, call.add("Sub", [period, off])])
+        pixel = call.add("Add", [off, low])
+    return call.add("Max", [call.add("Min", [pixel, last]), zero])
+
+
+def grid_sample_array(inputs: Arrays, attributes: Attributes) -> NdArray:
+    """Compute ``grid_sample`` in numpy, [N, C, ...] float64."""
+    image, grid = (np.asarray(each, np.float64) for each in inputs)
+    batch, channels, *sizes = image.shape
+    rows = image.reshape(batch, channels, -1)
+    # Neighbours along each axis
+    axes = [
+        _nearby(grid[..., axis], size, attributes)
+        for axis, size in enumerate(reversed(sizes))
+    ]
+    total = np.zeros((batch, channels, *grid.shape[1:-1]))
+    first = np.arange(batch).reshape(batch, *(1 for _ in sizes))
+    # Add all combinations of neighbours
+    for near in itertools.product(*axes):
+        index = np.zeros(grid.shape[:-1], np.int64)
+        share, step = np.ones(grid.shape[:-1]), 1
+        for (along, part), size in zip(near, reversed(sizes), strict=True):
+            index, share, step = index + along * step, share * part, step * size
+        taken = rows[first, :, index]  # [N, ..., C]
+        total += np.moveaxis(taken * share[..., None], -1, 1)
+    return total
+
+
+def _nearby(
+    at: NdArray, size: int, options: Attributes
+) -> list[tuple[NdArray, NdArray]]:
+    aligned, mode = bool(options["align_corners"]), options["interpolation_mode"]
+    # Position in pixels, padded unless bicubic
+    pixel = (at + 1) / 2 * (size - 1) if aligned else ((at + 1) * size - 1) / 2
+    if mode != _BICUBIC:
+        pixel = _looked_up(pixel, size, options)
+    low = np.floor(pixel)
+    part = pixel - low
+    # Neighbours and their shares
+    if mode == _NEAREST:
+        found = [(np.round(pixel), np.ones_like(pixel))]
+    elif mode == _BILINEAR:
+        found = [(low, 1 - part), (low + 1, part)]
+    else:
+        found = [(low + step, _cubic(np.abs(part - step))) for step in (-1, 0, 1, 2)]
+    # Bicubic neighbours are padded one by one
+    result = []
+    for place, share in found:
+        edge = _looked_up(place, size, options) if mode == _BICUBIC else place
+        kept = edge.clip(0, size - 1)
+        result.append((kept.astype(np.int64), np.where(kept == edge, share, 0)))
+    return result
+
+
+def _cubic(distance: NdArray) -> NdArray:
+    near = ((_CUBIC + 2) * distance - (_CUBIC + 3)) * distance**2 + 1
+    far = _CUBIC * (((distance - 5) * distance + 8) * distance - 4)
+    return np.where(distance <= 1, near, far)
+
+
+def _looked_up(pixel: NdArray, size: int, options: Attributes) -> NdArray:
+    padding, aligned = options["padding_mode"], bool(options["align_corners"])
+    if padding == _REFLECTION:
+        low, span = (0.0, size - 1) if aligned else (-0.5, size)
+        if span == 0:
+            return np.zeros_like(pixel)
+        off = np.abs(pixel - low) % (2 * span)
+        pixel = np.minimum(off, 2 * span - off) + low
+    return pixel if padding == _ZEROS else pixel.clip(0, size - 1)
+
 
 _SCALE = 10.0
 """BEVFormer_tensorrt multiplies a grid by this for a better int8 range."""

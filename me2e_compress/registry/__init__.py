@@ -1,7 +1,13 @@
 """Everything that can be added, by name: ours, and what other packages bring."""
 
-from me2e_compress.registry.entries import Entry, Option, describe, options_of
-from me2e_compress.registry.registry import NamedItem, Registry
+from me2e_compress.registry.registry import (
+    Entry,
+    NamedItem,
+    Option,
+    Registry,
+    describe,
+    options_of,
+)
 from me2e_compress.registry.text import name_in
 
 __all__ = [

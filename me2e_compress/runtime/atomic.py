@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from me2e_compress.registry import drafts, marks
+from me2e_compress.registry import drafts
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -38,4 +38,4 @@ def write_document(
     path: Path, record: dict[str, Any], indent: int | None = None
 ) -> None:
     """Write a JSON file that says that we wrote it, and may so be replaced."""
-    write_json(path, marks.IN_JSON | record, indent)
+    write_json(path, drafts.IN_JSON | record, indent)

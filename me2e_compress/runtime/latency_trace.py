@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from me2e_compress.display import Table, counted, not_measured, table
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.percentiles import percentile, too_few
+from me2e_compress.metrics.measure import percentile, too_few
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.others_load import Load

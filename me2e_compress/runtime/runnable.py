@@ -28,8 +28,7 @@ from me2e_compress.graph.nodes import (
 )
 from me2e_compress.graph.rewrite import add_constant, value_names
 from me2e_compress.operators import OWN_DOMAIN, kernels
-from me2e_compress.runtime.float_products import write_float_products
-from me2e_compress.runtime.int8_values import read_int8
+from me2e_compress.runtime.int8_values import read_int8, write_float_products
 from me2e_compress.runtime.providers import CPU, Provider
 
 QDQ_OFF = "session.disable_quant_qdq"

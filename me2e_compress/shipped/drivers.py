@@ -2,14 +2,36 @@
 
 import functools
 import hashlib
+import tempfile
 from pathlib import Path
 from typing import Self
 
 import pydantic
 
 from me2e_compress.errors import FORMER, GraphError
+from me2e_compress.registry import drafts
 from me2e_compress.registry.documents import reading
-from me2e_compress.shipped.model_files import write
+
+# Write model files atomically.
+
+
+def write(path: Path, content: bytes) -> Path:
+    """Write a file atomically, with its folder if needed; errors are GraphErrors."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise GraphError(
+            f"{path}: its folder cannot be made: {error.strerror}"
+        ) from error
+    with (
+        drafts.written(path, GraphError),
+        tempfile.TemporaryDirectory(dir=path.parent, prefix=".model-") as folder,
+    ):
+        draft = Path(folder) / path.name
+        draft.write_bytes(content)
+        drafts.put(draft, path)
+    return path
+
 
 WEIGHTS = Path(__file__).with_name("weights")
 """One ``NAME.onnx``, ``NAME.json`` and ``NAME-frames`` per model."""

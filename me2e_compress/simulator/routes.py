@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.registry import documents, drafts
-from me2e_compress.registry.marks import IN_JSON
+from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 

@@ -23,9 +23,8 @@ from me2e_compress.simulator.scene import (
     Scene,
     SignalKind,
 )
-from me2e_compress.simulator.traffic.bodies import StaticObject, Walker
+from me2e_compress.simulator.traffic.bodies import Contacts, StaticObject, Walker
 from me2e_compress.simulator.traffic.cars import Car
-from me2e_compress.simulator.traffic.contacts import Contacts
 from me2e_compress.simulator.traffic.right_of_way import RightOfWay
 from me2e_compress.simulator.traffic.traffic_road import TrafficRoad
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.metrics.route_values import DS, ROOM, SR, RouteColumn
+from me2e_compress.metrics.route_summary import DS, ROOM, SR, RouteColumn
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.drive_record import DriveRecord
 

@@ -16,8 +16,12 @@ from me2e_compress.errors import StudyError
 from me2e_compress.metrics.differences import PairedDifference
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.metrics.route_summary import RouteSummary
-from me2e_compress.metrics.route_values import DS, RouteColumn, RouteValues
+from me2e_compress.metrics.route_summary import (
+    DS,
+    RouteColumn,
+    RouteSummary,
+    RouteValues,
+)
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_bytes

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from me2e_compress.display import in_markdown
 from me2e_compress.errors import StudyError
-from me2e_compress.registry import drafts, marks
+from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_bytes, write_document
 from me2e_compress.study.report.page import Section
 from me2e_compress.study.report.study_page import study_page
@@ -48,7 +48,7 @@ def write_study(
     # paths, and all tables as Markdown
     folder = Path(folder)
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
-    heading = f"{marks.IN_MARKDOWN}# {in_markdown(outcome.title)}\n\n"
+    heading = f"{drafts.IN_MARKDOWN}# {in_markdown(outcome.title)}\n\n"
     text = heading + "\n".join(table.markdown() for table in outcome.tables())
     page = study_page(outcome, command, sections)
     # all files are written, or none

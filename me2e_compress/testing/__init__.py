@@ -2,10 +2,9 @@
 
 from me2e_compress.testing.check_evaluator import check_evaluator
 from me2e_compress.testing.check_observer import check_observer
-from me2e_compress.testing.check_operator import check_operator
+from me2e_compress.testing.check_operator import DrawnCall, check_operator
 from me2e_compress.testing.check_pass import check_pass
 from me2e_compress.testing.check_policy import check_policy
-from me2e_compress.testing.drawn_calls import DrawnCall
 from me2e_compress.testing.form import check_form
 
 __all__ = [

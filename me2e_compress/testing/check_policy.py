@@ -6,7 +6,6 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import (
     Answer,
     Observation,
@@ -14,6 +13,7 @@ from me2e_compress.driving.contract import (
     Policy,
     RouteInfo,
     Trajectory,
+    checked,
 )
 from me2e_compress.driving.policies import POLICIES, Driver
 from me2e_compress.errors import VerificationError

@@ -20,7 +20,7 @@ from me2e_compress.calibration.sample import FrameSubset, draw
 from me2e_compress.errors import FramesError
 from me2e_compress.manager import recipe
 from me2e_compress.quantization.plan.overrides import keep_readers, overrides_text
-from me2e_compress.registry import drafts, marks
+from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.workflows.calibrate_options import (
     CalibrateOptions,
@@ -159,7 +159,7 @@ def _import(
     overrides = overrides_beside(output) if missing else None
     if overrides is not None:
         floats = (keep_readers(name, f"not in {path.name}") for name in missing)
-        text = marks.IN_TOML + overrides_text(floats)
+        text = drafts.IN_TOML + overrides_text(floats)
         write_bytes(overrides, text.encode())
     return dataclasses.replace(
         made, findings=(*not_in(path, missing), *made.findings), overrides=overrides

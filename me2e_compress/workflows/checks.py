@@ -9,7 +9,7 @@ from typing import TypeAlias
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.driving.adapter.stated import adapted
+from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import FORMER, GraphError, RecipeError
 from me2e_compress.graph.modules import ModuleMap, map_of
 from me2e_compress.graph.opset import lowered

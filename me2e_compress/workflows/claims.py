@@ -1,7 +1,7 @@
 """Check outputs before any work: no user file is lost, one run works in a folder.
 
 One rule holds for every command: an existing file is replaced only if it says that
-me2e-compress wrote it (:mod:`me2e_compress.registry.marks`), unless forced. A command
+me2e-compress wrote it (:mod:`me2e_compress.registry.drafts`), unless forced. A command
 that works in a folder which later runs resume holds a lock on that folder. The system
 releases it when the process dies, and nothing of it lies in the folder.
 """
@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from me2e_compress.errors import GraphError
-from me2e_compress.registry.marks import is_marked
+from me2e_compress.registry.drafts import is_marked
 from me2e_compress.shipped import drivers as shipped
 from me2e_compress.workflows.checks import Given, check_output
 

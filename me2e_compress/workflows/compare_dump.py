@@ -10,10 +10,9 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
-from me2e_compress.driving.adapter.stated import adapted
+from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.fidelity.engine_loss import OutputLoss, losses
-from me2e_compress.fidelity.engine_run import EngineRun
+from me2e_compress.fidelity.engine_loss import EngineRun, OutputLoss, losses
 from me2e_compress.fidelity.first_difference import (
     FirstDifference,
     first_difference_of_engine,

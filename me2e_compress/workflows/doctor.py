@@ -13,9 +13,8 @@ import pynvml
 
 from me2e_compress.manager.report import versions
 from me2e_compress.operators.kernels import KERNELS, why_not
-from me2e_compress.runtime.energy.energy_counter import open_counter
-from me2e_compress.runtime.energy.energy_recording import EnergyRecording
-from me2e_compress.runtime.energy.reader import Absent
+from me2e_compress.runtime.energy.energy_counter import EnergyRecording, open_counter
+from me2e_compress.runtime.energy.energy_result import Absent
 from me2e_compress.workflows.result import Result, Table, table
 
 _EXTRAS = (

@@ -18,7 +18,7 @@ import onnxruntime as ort
 import platformdirs
 
 from me2e_compress import graph
-from me2e_compress.calibration.archives import archive_of
+from me2e_compress.calibration.dataset import archive_of
 from me2e_compress.errors import GraphError
 from me2e_compress.operators.kernels import why_not
 from me2e_compress.runtime.atomic import write_bytes

@@ -5,10 +5,12 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
-from me2e_compress.calibration.logs import LOGS, DriveLog, LogRequest
-from me2e_compress.calibration.pixels import PixelInput
+from me2e_compress.calibration.dataset import PixelInput
 from me2e_compress.calibration.recording import (
+    LOGS,
     Begin,
+    DriveLog,
+    LogRequest,
     Source,
     partial_of,
     write_recording,

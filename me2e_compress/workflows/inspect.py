@@ -8,7 +8,7 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.driving.adapter.stated import adapted
+from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import Item, ModuleMap, assign, itemise

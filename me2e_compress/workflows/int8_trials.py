@@ -9,7 +9,7 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import draw
-from me2e_compress.driving.adapter.stated import adapted
+from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.fidelity.sensitivity import Int8Choice, Trials, write_recipe
 from me2e_compress.manager import recipe
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS

@@ -13,9 +13,9 @@ from matplotlib.style import context
 from matplotlib.ticker import PercentFormatter
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.percentiles import percentile, too_few
+from me2e_compress.metrics.measure import percentile, too_few
 from me2e_compress.registry import drafts
-from me2e_compress.registry.marks import MARK
+from me2e_compress.registry.drafts import MARK
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.latency_trace import LatencyTrace, Microseconds
 

@@ -9,8 +9,8 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from me2e_compress.calibration.logs import LOGS
 from me2e_compress.calibration.observers import OBSERVERS
+from me2e_compress.calibration.recording import LOGS
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.input_sources import INPUT_SOURCES
 from me2e_compress.driving.latency import LATENCY_SOURCES

@@ -9,16 +9,15 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.driving.adapter.stated import adapted
+from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import EvaluationError, MissingExtraError
 from me2e_compress.graph.modules import assign
 from me2e_compress.metrics.deadlines import BUDGET_MS
 from me2e_compress.registry import drafts
 from me2e_compress.runtime.breakdown import Breakdown, break_down
 from me2e_compress.runtime.energy import EnergyResult
-from me2e_compress.runtime.energy.energy_counter import check_counter
+from me2e_compress.runtime.energy.energy_counter import EnergySchedule, check_counter
 from me2e_compress.runtime.energy.models import measure_energy
-from me2e_compress.runtime.energy.schedule import EnergySchedule
 from me2e_compress.runtime.latency_trace import LatencyTrace, Microseconds
 from me2e_compress.runtime.others_load import OthersLoad
 from me2e_compress.runtime.profile import WARM_UP

@@ -6,10 +6,17 @@ from pathlib import Path
 from typing import Any
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.eer import MEASURES, EerResult, EerScale, eer, rankings
+from me2e_compress.metrics.eer import (
+    MEASURES,
+    EerResult,
+    EerScale,
+    RouteMeasures,
+    eer,
+    rankings,
+    route_measures,
+)
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.workflows.eer_weights import SavedWeights, save_weights

@@ -11,7 +11,7 @@ from me2e_compress import graph
 from me2e_compress.errors import RecipeError
 from me2e_compress.fidelity.sensitivity import Budget, Candidate, Int8Choice, Trials
 from me2e_compress.fidelity.sensitivity import search as find
-from me2e_compress.runtime.interleaved import time_interleaved
+from me2e_compress.runtime.profile import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows.budgets import check_budgets, joules_of, need_counter

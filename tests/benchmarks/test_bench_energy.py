@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.bench_energy import COUNTER, FRAMES_MS, Held, conditions, held
-from me2e_compress.runtime.energy.schedule import EnergySchedule
+from me2e_compress.runtime.energy.energy_counter import EnergySchedule
 
 SCHEDULE = EnergySchedule(windows=8)
 

@@ -16,7 +16,7 @@ from benchmarks.bench_gpu import ROWS, Bench, provider_or_reason
 from benchmarks.gpu_table import Found, table
 from benchmarks.runtime_files import REFERENCE
 from benchmarks.subject import Subject
-from me2e_compress.runtime.energy.reader import Absent
+from me2e_compress.runtime.energy.energy_result import Absent
 from me2e_compress.runtime.providers import (
     CPU,
     CpuProvider,

@@ -9,8 +9,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.pixels import PixelInput
+from me2e_compress.calibration.dataset import CalibrationSet, PixelInput
 from me2e_compress.calibration.recording import write_recording
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Frame

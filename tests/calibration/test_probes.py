@@ -5,9 +5,8 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.calibrator import Calibrator, Extremes
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.probes import Extremes
 from me2e_compress.calibration.statistics import BINS
 from me2e_compress.calibration.stream import probed_session, schedule_probes
 from me2e_compress.runtime.probing import READINGS, insert_probes

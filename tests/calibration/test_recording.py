@@ -10,7 +10,7 @@ import pytest
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.recording import Begin, Source, write_recording
 from me2e_compress.errors import FramesError
-from me2e_compress.registry.marks import IN_JSON
+from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.runtime.frames import Frame
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.registry.marks import IN_JSON
+from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.simulator.routes import load_routes, save_routes

@@ -8,10 +8,8 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.logs import LOGS, DriveLog, LogRequest
-from me2e_compress.calibration.pixels import PixelInput
-from me2e_compress.calibration.recording import Begin
+from me2e_compress.calibration.dataset import CalibrationSet, PixelInput
+from me2e_compress.calibration.recording import LOGS, Begin, DriveLog, LogRequest
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.testing import check_form

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from me2e_compress.errors import GraphError
-from me2e_compress.registry.marks import IN_JSON
+from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.shipped import drivers as shipped
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.workflows.checks import model_path

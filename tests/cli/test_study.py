@@ -10,7 +10,7 @@ import me2e_compress.study.run
 from me2e_compress.cli.commands.study import study
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway import evaluator
-from me2e_compress.registry.marks import IN_JSON
+from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.study import Study, load_study

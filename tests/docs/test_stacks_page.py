@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import me2e_compress as me2e
-from me2e_compress.driving.answer import checked
-from me2e_compress.driving.contract import Observation, Trajectory
+from me2e_compress.driving.contract import Observation, Trajectory, checked
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.cameras import CameraRig

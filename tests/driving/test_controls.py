@@ -6,7 +6,7 @@ import numpy as np
 import pydantic
 import pytest
 
-from me2e_compress.driving.adapter.controls import ControlAdapter
+from me2e_compress.driving.adapter.adapter import ControlAdapter
 from me2e_compress.driving.contract import PedalsAndWheel
 from me2e_compress.errors import EvaluationError
 

@@ -10,9 +10,9 @@ from me2e_compress.driving.adapter.image_inputs import (
     ImageInput,
     ImageNormalization,
     ImagePort,
+    InputImages,
     rendered_size,
 )
-from me2e_compress.driving.adapter.input_images import InputImages
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.cameras import CAMERA_NAMES as RIG_NAMES
 from me2e_compress.simulator.cameras import CameraRig

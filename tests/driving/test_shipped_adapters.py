@@ -8,8 +8,7 @@ import pytest
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.inputs import ModelInputs
-from me2e_compress.driving.answer import checked
-from me2e_compress.driving.contract import Answer, Trajectory
+from me2e_compress.driving.contract import Answer, Trajectory, checked
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import EvaluationError

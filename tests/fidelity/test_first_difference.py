@@ -8,7 +8,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
-from me2e_compress.fidelity.engine_run import EngineRun
+from me2e_compress.fidelity.engine_loss import EngineRun
 from me2e_compress.fidelity.first_difference import (
     FirstDifference,
     find_first_difference,

@@ -10,8 +10,7 @@ from onnx import TensorProto, helper
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.carried import can_carry
-from me2e_compress.graph.shapes import infer_shapes, static_shape
+from me2e_compress.graph.shapes import can_carry, infer_shapes, static_shape
 from me2e_compress.graph.summary import macs
 from me2e_compress.manager.equivalence import random_outputs
 from tests.calls import calls

@@ -11,7 +11,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.registry.marks import BYTES
+from me2e_compress.registry.drafts import BYTES
 from tests.graph.test_files import weighted
 
 

@@ -9,7 +9,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import files
-from me2e_compress.registry.marks import BYTES
+from me2e_compress.registry.drafts import BYTES
 
 
 def weighted(rows: int = 64) -> ir.Model:

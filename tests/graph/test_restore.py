@@ -2,7 +2,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import Provenance
-from me2e_compress.graph.restore import restore
+from me2e_compress.graph.surgeon import restore
 
 
 def read(body: str, **modules: str) -> ir.Model:

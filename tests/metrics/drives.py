@@ -4,9 +4,9 @@ import dataclasses
 import math
 from collections.abc import Callable
 
-from me2e_compress.metrics.conflict_record import ConflictRecord
 from me2e_compress.metrics.episode import (
     FRAME_US,
+    ConflictRecord,
     EgoFrame,
     Ending,
     Episode,

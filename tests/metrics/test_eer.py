@@ -14,13 +14,14 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.eer import (
     EerScale,
     Normalization,
+    RouteMeasures,
     eer,
     rankings,
+    route_measures,
     scale_of,
 )
 from me2e_compress.metrics.episode import Ending, Episode, Given
 from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
 from me2e_compress.metrics.route_summary import RouteSummary
 from tests.metrics.drives import cruise, drive, infraction
 

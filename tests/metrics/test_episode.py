@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.metrics.conflict_record import ConflictRecord, Encounter
 from me2e_compress.metrics.episode import (
     LARGEST,
+    ConflictRecord,
     EgoFrame,
+    Encounter,
     Ending,
     Episode,
     Given,

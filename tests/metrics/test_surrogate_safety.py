@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from me2e_compress.metrics.conflict_record import ConflictRecord, Encounter
-from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.episode import ConflictRecord, Encounter, Episode
 from me2e_compress.metrics.infraction import Infraction, InfractionKind
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.metrics.route_summary import RouteSummary

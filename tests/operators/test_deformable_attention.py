@@ -17,8 +17,10 @@ from me2e_compress.operators import (
     score_inputs,
     translate,
 )
-from me2e_compress.operators.attention_layouts import RawAttention
-from me2e_compress.operators.deformable_attention import DeformableAttention
+from me2e_compress.operators.deformable_attention import (
+    DeformableAttention,
+    RawAttention,
+)
 from me2e_compress.operators.raw_attention import RawOwnForm
 from tests.operators.running import body_and_reference, graph_of, run
 from tests.profiles import scaled

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.graph.summary import weight_bytes
-from me2e_compress.passes.fold_constants import FoldConstants
-from me2e_compress.passes.fold_constants.choice import ENTRY_BYTES
+from me2e_compress.passes.fold_constants import ENTRY_BYTES, FoldConstants
 from tests.passes.small import NO_MODULES, apply, ops, read
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 
 from me2e_compress import graph
-from me2e_compress.passes.fold_constants import FoldConstants
-from me2e_compress.passes.fold_constants.choice import ENTRY_BYTES
+from me2e_compress.passes.fold_constants import ENTRY_BYTES, FoldConstants
 from tests.passes.small import apply, compute, ops, read
 from tests.profiles import scaled
 

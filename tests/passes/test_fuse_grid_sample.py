@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.operators.grid_positions import grid_sample_array
+from me2e_compress.operators.grid_sampler import grid_sample_array
 from me2e_compress.passes.fuse_kernels import FuseKernels
 from me2e_compress.passes.fused_nodes import ExpandOperators
 from tests.passes.small import apply, compute, ops, read

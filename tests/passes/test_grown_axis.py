@@ -7,7 +7,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError
-from me2e_compress.passes.grown_axis import carry
+from me2e_compress.passes.edges import carry
 from tests.passes.hoisted import integers
 from tests.passes.small import read
 

@@ -8,7 +8,7 @@ import onnx_ir as ir
 import onnxruntime as ort
 import pytest
 
-from me2e_compress.runtime.float_products import write_float_products
+from me2e_compress.runtime.int8_values import write_float_products
 from me2e_compress.runtime.optimized import optimized
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.runtime.runnable import runnable

@@ -7,7 +7,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError, FramesError
-from me2e_compress.runtime.interleaved import BLOCK, record_traces
+from me2e_compress.runtime.profile import BLOCK, record_traces
 from tests.command import write_frames
 
 TEXT = """<ir_version: 8, opset_import: ["" : 17]>

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.runtime.interleaved import describe_machine
+from me2e_compress.runtime.profile import describe_machine
 from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.study import Study, Timing, run_study
 from tests.study.conftest import IDEAL, ROUTES, Here, Make

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from me2e_compress.errors import StudyError
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.registry.marks import IN_JSON, IN_MARKDOWN, is_marked
+from me2e_compress.registry.drafts import IN_JSON, IN_MARKDOWN, is_marked
 from me2e_compress.runtime.others_load import Load
 from me2e_compress.study import Condition, StudyResult
 from me2e_compress.study.cells import MINUS

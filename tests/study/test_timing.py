@@ -11,8 +11,8 @@ from me2e_compress.driving.latency import NoLatency, TraceLatency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.measure import Measure
-from me2e_compress.runtime.interleaved import describe_machine
 from me2e_compress.runtime.latency_trace import LatencyTrace
+from me2e_compress.runtime.profile import describe_machine
 from me2e_compress.study import Condition, Listener, Study, Timing, Variant, timing
 from me2e_compress.study.prepared import prepare_variant
 from me2e_compress.study.timing import Clock, time_all

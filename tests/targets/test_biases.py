@@ -13,17 +13,15 @@ from me2e_compress.graph.nodes import numbers_of
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
-from me2e_compress.targets.biases import (
+from me2e_compress.targets.weights import (
     BIAS_MAX,
+    QuantizedWeight,
     bias_by_channel,
     least_scales,
-    with_room,
-)
-from me2e_compress.targets.weights import (
-    QuantizedWeight,
     quantize_weight,
     requantized,
     scales_in,
+    with_room,
 )
 from tests.nets import MODULES, PAPER, net
 from tests.profiles import scaled

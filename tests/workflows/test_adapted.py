@@ -9,7 +9,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.adapter.stated import adapted
+from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.runtime.plan_adapter import PlanAdapter

@@ -13,7 +13,7 @@ import pytest
 
 from me2e_compress.calibration.recording import partial_of, write_recording
 from me2e_compress.errors import GraphError
-from me2e_compress.registry.marks import MARK
+from me2e_compress.registry.drafts import MARK
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.shipped import drivers as shipped
 from me2e_compress.workflows.claims import check_ours, writing

@@ -9,7 +9,7 @@ import pytest
 
 import me2e_compress as me2e
 from me2e_compress.manager import recipe
-from me2e_compress.registry.marks import IN_JSON
+from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.workflows.export import export_stack
 from me2e_compress.workflows.result import Result

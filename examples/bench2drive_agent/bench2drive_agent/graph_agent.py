@@ -20,8 +20,12 @@ from bench2drive_agent import sensors as mounted
 from bench2drive_agent.route_follower import GeoReference, RouteFollower
 from bench2drive_agent.sensors import Images, Pictures, Triple
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.answer import checked
-from me2e_compress.driving.contract import EgoKinematics, Observation, PedalsAndWheel
+from me2e_compress.driving.contract import (
+    EgoKinematics,
+    Observation,
+    PedalsAndWheel,
+    checked,
+)
 from me2e_compress.driving.ego_track import can_bus_between
 from me2e_compress.driving.latency import DecisionFacts, parse_latency
 from me2e_compress.driving.onnx_policy import OnnxPolicy

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from agent_files import options, straight_on
-from me2e_compress.driving.answer import six_waypoints
+from me2e_compress.driving.contract import six_waypoints
 from small_leaderboard import SAVE_NAME, Leaderboard, RoadOption, World
 
 IMAGE = json.dumps({"mean": [10, 20, 30], "std": [1, 1, 1], "order": "bgr"})

@@ -7,9 +7,8 @@ from driving_logs.adapted_inputs import AdaptedInputs
 from driving_logs.model_forms import inputs_of_model
 from driving_logs.model_inputs import LoggedInputs, log_frames
 from driving_logs.moments import CameraLog
-from me2e_compress.calibration.logs import LogRequest
-from me2e_compress.calibration.pixels import PixelInput
-from me2e_compress.calibration.recording import Begin
+from me2e_compress.calibration.dataset import PixelInput
+from me2e_compress.calibration.recording import Begin, LogRequest
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.runtime.frames import Frame

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from driving_logs.moments import Floats
-from me2e_compress.calibration.pixels import PixelInput
+from me2e_compress.calibration.dataset import PixelInput
 from me2e_compress.errors import FramesError
 from me2e_compress.registry.documents import MalformedError, check_regular
 

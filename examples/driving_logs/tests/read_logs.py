@@ -8,8 +8,8 @@ from driving_logs.model_inputs import (
     log_frames,
 )
 from driving_logs.moments import CameraLog
-from me2e_compress.calibration.logs import LOGS
-from me2e_compress.calibration.pixels import PixelInput
+from me2e_compress.calibration.dataset import PixelInput
+from me2e_compress.calibration.recording import LOGS
 from me2e_compress.runtime.frames import Frame
 from small_logs import LIDAR_M
 

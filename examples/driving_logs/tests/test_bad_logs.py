@@ -20,7 +20,7 @@ from driving_logs.model_inputs import (
 )
 from driving_logs.nuscenes_tables import rows
 from driving_logs.pictures import read_picture
-from me2e_compress.calibration.pixels import PixelInput
+from me2e_compress.calibration.dataset import PixelInput
 from me2e_compress.errors import FramesError
 from read_logs import opened
 from small_logs import (

@@ -11,7 +11,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.logs import LOGS
+from me2e_compress.calibration.recording import LOGS
 from me2e_compress.errors import FramesError
 from me2e_compress.workflows.frames import FramesOptions, record_frames
 from small_logs import MAKERS, SPEED, car_at, pixel, seen_point, write_nuscenes

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from me2e_compress.errors import EnergyError
 from me2e_compress.runtime.energy.energy_counter import EnergyCounter
-from me2e_compress.runtime.energy.reader import Absent, Reader
+from me2e_compress.runtime.energy.energy_result import Absent, Reader
 from me2e_counters import text_in
 
 INPUTS = ("VDD_IN", "POM_5V_IN")

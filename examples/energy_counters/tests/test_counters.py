@@ -6,7 +6,7 @@ import pytest
 
 from me2e_compress.errors import EnergyError
 from me2e_compress.runtime.energy.energy_counter import ENERGY_COUNTERS
-from me2e_compress.runtime.energy.reader import Absent, Reader
+from me2e_compress.runtime.energy.energy_result import Absent, Reader
 from me2e_compress.testing import check_form
 from me2e_counters.ina3221 import Ina3221, counted
 from me2e_counters.rapl import Rapl

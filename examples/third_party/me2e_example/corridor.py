@@ -6,8 +6,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from me2e_compress.driving.answer import six_waypoints
-from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation, RouteInfo
+from me2e_compress.driving.contract import (
+    CAN_BUS_SIZE,
+    Observation,
+    RouteInfo,
+    six_waypoints,
+)
 from me2e_compress.driving.policies import driver_named
 from me2e_compress.metrics.episode import (
     FRAME_US,

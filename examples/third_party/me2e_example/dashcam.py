@@ -7,9 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from me2e_compress.calibration.logs import DriveLog, LogRequest
-from me2e_compress.calibration.pixels import PixelInput
-from me2e_compress.calibration.recording import Begin
+from me2e_compress.calibration.dataset import PixelInput
+from me2e_compress.calibration.recording import Begin, DriveLog, LogRequest
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Frame
 

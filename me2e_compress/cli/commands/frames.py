@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from me2e_compress.calibration.logs import LOGS
+from me2e_compress.calibration.recording import LOGS
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.runtime.providers import provider_named

@@ -1,24 +1,260 @@
 """The TOML file that adapts a model."""
 
 import json
+import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self, TypeAlias
+from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from me2e_compress.driving.adapter.controls import ControlAdapter
-from me2e_compress.driving.adapter.feeds import Feed
 from me2e_compress.driving.adapter.image_inputs import ImageInput, ImageNormalization
 from me2e_compress.driving.adapter.recurrent import RecurrentEntry
 from me2e_compress.driving.axes import Axes
+from me2e_compress.driving.contract import PedalsAndWheel
+from me2e_compress.driving.input_sources import INPUT_SOURCES, InputSource, Observed
+from me2e_compress.driving.input_sources.navigation import NavigationCommand
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph.files import sha256_of
 from me2e_compress.graph.recurrence import RECURRENT, declared_pairs
 from me2e_compress.registry import documents
+from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
+
+# Read throttle, steering and brake from a model's outputs.
+
+
+Pair: TypeAlias = tuple[float, float]
+Outputs: TypeAlias = Mapping[str, Array]
+
+_ELEMENT = re.compile(r"(?P<output>.+)\[(?P<index>\d+)\]")
+_PEDALS = ("throttle", "brake", "acceleration")
+_NUMBERS = ("steer", *_PEDALS)
+_FORMS = (
+    {"throttle", "steer"},
+    {"throttle", "steer", "brake"},
+    {"acceleration", "steer"},
+)
+
+
+class ControlAdapter(BaseModel):
+    """How to read controls from a model's outputs.
+
+    Each number is an output with one element, ``steer``, or an element of a larger one,
+    ``action[1]``, indexed over the flattened output. Give throttle and steer, with or
+    without a brake; or one acceleration, which brakes below 0, and steer.
+
+    Attributes:
+        throttle: The output or element that holds the throttle.
+        brake: The output or element that holds the brake.
+        acceleration: The output or element that replaces throttle and brake.
+        steer: The output or element that holds the steering.
+        throttle_range: The model's values at no and at full throttle.
+        brake_range: The model's values at no and at full brake.
+        acceleration_range: The model's values at full brake and at full throttle.
+        steer_range: The model's values at full left and at full right.
+        clip: Whether values beyond their range are clipped; else they end the route.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    throttle: str | None = None
+    brake: str | None = None
+    acceleration: str | None = None
+    steer: str | None = None
+    throttle_range: Pair = (0.0, 1.0)
+    brake_range: Pair = (0.0, 1.0)
+    acceleration_range: Pair = (-1.0, 1.0)
+    steer_range: Pair = (-1.0, 1.0)
+    clip: bool = False
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Self:
+        # exactly one way to read the controls
+        named = {name for name in _NUMBERS if getattr(self, name) is not None}
+        if named not in _FORMS:
+            raise ValueError(
+                "either throttle, steer and brake, or acceleration and steer"
+            )
+        # ranges that can be divided by
+        for name in _NUMBERS:
+            nothing, full = getattr(self, f"{name}_range")
+            if nothing == full:
+                raise ValueError(f"{name}_range: both ends are {full:g}")
+        return self
+
+    @property
+    def outputs(self) -> dict[str, str]:
+        """The output or element of each quantity, by its name in the document."""
+        said = ((name, getattr(self, name)) for name in _NUMBERS)
+        return {where: name for name, where in said if where is not None}
+
+    def read(self, outputs: Outputs) -> PedalsAndWheel:
+        """Return the model's controls."""
+        steer = self._number("steer", outputs, -1.0)
+        if self.acceleration is not None:
+            said = self._number("acceleration", outputs, -1.0)
+            # NaN stays NaN, on the throttle
+            return PedalsAndWheel(max(said, 0.0), steer, max(0.0, -said))
+        throttle = self._number("throttle", outputs, 0.0)
+        brake = 0.0 if self.brake is None else self._number("brake", outputs, 0.0)
+        return PedalsAndWheel(throttle, steer, brake)
+
+    def _number(self, name: str, outputs: Outputs, least: float) -> float:
+        """Return a number from ``least`` to 1, the ends of its range."""
+        said = element(outputs, getattr(self, name))
+        begin, end = getattr(self, f"{name}_range")
+        share = (said - begin) / (end - begin)
+        value: float = least + (1.0 - least) * share
+        return min(max(value, least), 1.0) if self.clip else value
+
+
+def output_named(text: str, outputs: Mapping[str, object]) -> tuple[str, int | None]:
+    """Split ``name`` or ``name[k]`` into the output's name and k."""
+    found = None if text in outputs else _ELEMENT.fullmatch(text)
+    if found is None:
+        return text, None
+    return found["output"], int(found["index"])
+
+
+def element(outputs: Outputs, text: str) -> float:
+    """Return the number that ``name`` or ``name[k]`` refers to."""
+    name, index = output_named(text, outputs)
+    row = np.asarray(outputs[name], np.float64).reshape(-1)
+    if index is None and len(row) != 1:
+        raise EvaluationError(
+            f"{name} has {len(row)} numbers: say which, {name}[0] for the first"
+        )
+    if index is not None and index >= len(row):
+        raise EvaluationError(f"{name} has {len(row)} numbers: there is no {text}")
+    return float(row[index or 0])
+
+
+# One input of a graph, made of input sources.
+
+
+Levels = float | tuple[float, ...]
+
+LARGEST = 1e30
+"""The largest mean or std: within float32."""
+
+
+@dataclass(frozen=True)
+class FeedPart:
+    """A source, normalised: (value - mean) / std.
+
+    ``mean`` and ``std`` are one number, or as many as the last dimension has.
+    """
+
+    source: InputSource
+    mean: Levels = 0.0
+    std: Levels = 1.0
+
+    @classmethod
+    def read(cls, table: dict[str, Any]) -> Self:
+        """Read a table: source, mean, std, and the source's own options."""
+        options = dict(table)
+        name = options.pop("source", None)
+        if not isinstance(name, str):
+            names = ", ".join(INPUT_SOURCES.names())
+            raise ValueError(f"no source is named; there are {names}")
+        # what is left of the table are the source's options
+        mean = _levels("mean", options.pop("mean", 0.0))
+        std = _levels("std", options.pop("std", 1.0))
+        if not np.all(std):
+            raise ValueError(f"{name}: std is zero")
+        try:
+            return cls(INPUT_SOURCES.build(name, options), mean, std)
+        except EvaluationError as error:
+            raise ValueError(str(error)) from error
+
+    def value(self, seen: Observed) -> Array:
+        """Return the normalised value, of the source's shape."""
+        array = self.source.value(seen)
+        if self.mean == 0.0 and self.std == 1.0:
+            return array
+        try:
+            scaled: Array = (array - np.array(self.mean)) / np.array(self.std)
+        except ValueError as error:
+            raise EvaluationError(
+                f"{self.source.name}: mean or std: {error}"
+            ) from error
+        # numpy may have broadcast to a larger shape
+        if scaled.shape != array.shape:
+            raise EvaluationError(
+                f"{self.source.name}: mean and std make {list(scaled.shape)} of its "
+                f"shape {list(array.shape)}"
+            )
+        return scaled
+
+
+class Feed(BaseModel):
+    """How one input is made: of a source, or of parts in a row.
+
+    As a table: ``source`` and its options, ``mean``, ``std``; or ``parts``, a list of
+    such tables, whose numbers are flattened and concatenated (``joined``).
+    """
+
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
+
+    parts: tuple[FeedPart, ...]
+    joined: bool = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_table(cls, table: Any) -> Any:
+        if not isinstance(table, dict):
+            raise ValueError("it must be a table with a source, or with parts")
+        if "parts" not in table:
+            return {"parts": (FeedPart.read(table),)}
+        # parts, each a table of its own
+        listed = table["parts"]
+        if not (isinstance(listed, list) and listed) or len(table) > 1:
+            raise ValueError("parts must be a list of tables, and stand alone")
+        if not all(isinstance(each, dict) for each in listed):
+            raise ValueError("each of parts must be a table with a source")
+        return {"parts": tuple(map(FeedPart.read, listed)), "joined": True}
+
+    @classmethod
+    def by(cls, source: InputSource) -> Self:
+        """Return the feed of one source without normalisation."""
+        return cls.model_construct(parts=(FeedPart(source),))
+
+    def value(self, seen: Observed) -> Array:
+        """Return the input's value, without a batch dimension."""
+        arrays = [part.value(seen) for part in self.parts]
+        if not self.joined:
+            return arrays[0]
+        return np.concatenate([each.reshape(-1) for each in arrays])
+
+    def sizes(self, seen: Observed) -> str:
+        """Name the sources with their element counts, for messages."""
+        found = ((p.source.name, p.source.value(seen).size) for p in self.parts)
+        return ", ".join(f"{name} {size}" for name, size in found)
+
+    @property
+    def command(self) -> NavigationCommand | None:
+        """The navigation command, if the feed is nothing else."""
+        source = self.parts[0].source
+        if len(self.parts) > 1 or not isinstance(source, NavigationCommand):
+            return None
+        return source
+
+
+def _levels(name: str, value: Any) -> Levels:
+    numbers = value if isinstance(value, list) else [value]
+    if not numbers or not all(
+        isinstance(each, int | float)
+        and not isinstance(each, bool)
+        and abs(each) <= LARGEST
+        for each in numbers
+    ):
+        raise ValueError(f"{name} must be a finite number, or a list of such")
+    return tuple(map(float, value)) if isinstance(value, list) else float(value)
+
 
 Contract: TypeAlias = Literal["img", "lidar2img", "can_bus", "command", "timestamp"]
 

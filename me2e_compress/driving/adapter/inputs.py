@@ -6,20 +6,26 @@ from typing import Literal, Self
 
 import numpy as np
 
-from me2e_compress.driving.adapter.adapter import Adapter
-from me2e_compress.driving.adapter.feeds import Feed
+from me2e_compress.driving.adapter.adapter import Adapter, Feed
 from me2e_compress.driving.adapter.image_inputs import (
     CAMERA_NAMES,
     ImageInput,
     ImageNormalization,
     ImagePort,
+    InputImages,
     rendered_size,
 )
-from me2e_compress.driving.adapter.input_images import InputImages
-from me2e_compress.driving.contract import CAN_BUS_SIZE, EgoKinematics, Observation
+from me2e_compress.driving.contract import (
+    CAN_BUS_SIZE,
+    DEFAULT_IMAGE_SIZE,
+    EgoKinematics,
+    Observation,
+    Shape,
+    fed,
+    fits,
+)
 from me2e_compress.driving.ego_track import EgoTrack
 from me2e_compress.driving.input_sources import INPUT_SOURCES, Observed
-from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE, Shape, fed, fits
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import DTYPES, Session, SessionPort

@@ -4,15 +4,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
 
-from me2e_compress.driving.adapter.adapter import Adapter
-from me2e_compress.driving.adapter.controls import ControlAdapter, output_named
-from me2e_compress.driving.adapter.feeds import Feed
+from me2e_compress.driving.adapter.adapter import (
+    Adapter,
+    ControlAdapter,
+    Feed,
+    output_named,
+)
 from me2e_compress.driving.adapter.image_inputs import ImageInput
 from me2e_compress.driving.adapter.inputs import ModelInputs
 from me2e_compress.driving.adapter.outputs import ModelOutputs
 from me2e_compress.driving.adapter.recurrent import ZEROS
+from me2e_compress.driving.contract import Shape, zeros
 from me2e_compress.driving.input_sources import INPUT_SOURCES
-from me2e_compress.driving.ports import Shape, zeros
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.runtime.plan_adapter import CONTRACT_STEP_S, PlanAdapter
 from me2e_compress.runtime.session import DTYPES, Session, SessionPort

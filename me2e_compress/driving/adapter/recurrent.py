@@ -16,7 +16,7 @@ from pydantic import (
 )
 
 from me2e_compress.display import reason
-from me2e_compress.driving.ports import fed, fits, zeros
+from me2e_compress.driving.contract import fed, fits, zeros
 from me2e_compress.errors import EvaluationError
 from me2e_compress.registry.documents import UNREADABLE, check_regular
 from me2e_compress.runtime.frames import Array

@@ -17,14 +17,14 @@ from me2e_compress.evaluators.highway.rectangles import (
     gaps,
     overlaps,
 )
-from me2e_compress.metrics.conflict_record import (
+from me2e_compress.metrics.episode import (
     CROSSING_RAD,
+    FRAME_US,
     PET_HORIZON_S,
     TTC_HORIZON_S,
     ConflictRecord,
     Encounter,
 )
-from me2e_compress.metrics.episode import FRAME_US
 from me2e_compress.metrics.infraction import Contact
 from me2e_compress.simulator.plane_geometry import Lane, Roadmap
 from me2e_compress.simulator.scene import Actor, ActorKind, Ego, Scene

@@ -30,8 +30,7 @@ import numpy as np
 from scipy.interpolate import PPoly
 from scipy.linalg.lapack import dgtsv
 
-from me2e_compress.driving.answer import timed
-from me2e_compress.driving.contract import PedalsAndWheel, Plan, Trajectory
+from me2e_compress.driving.contract import PedalsAndWheel, Plan, Trajectory, timed
 from me2e_compress.simulator.bicycle import (
     advance,
     slip_of,

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from me2e_compress.driving.contract import Policy
+from me2e_compress.driving.contract import DEFAULT_IMAGE_SIZE, Policy
 from me2e_compress.driving.host_stage import HOST_STAGES, HostStage
 from me2e_compress.driving.policies import POLICIES, Driver, SizedPolicy
-from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import load, sha256_of
@@ -98,7 +97,7 @@ class OnnxDriver(Driver):
 
     def said(self) -> dict[str, str]:
         """Return what the map says, as metadata of the graph."""
-        from me2e_compress.driving.adapter.stated import adapted
+        from me2e_compress.driving.adapter.outputs import adapted
 
         if self.module_map is None:
             return {}

@@ -13,7 +13,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.worker import Driven, Job
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.registry import documents
-from me2e_compress.registry.marks import IN_JSON
+from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.simulator.routes import (
     ROAD_VERSION,

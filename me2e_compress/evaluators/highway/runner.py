@@ -11,12 +11,12 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import (
     HostedPolicy,
     PedalsAndWheel,
     Policy,
     Trajectory,
+    checked,
 )
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import control_clock

@@ -1,13 +1,16 @@
 """Which modules and nodes int8 hurts, and which assignment fits a budget."""
 
 from me2e_compress.fidelity.sensitivity.analysis import (
+    Int8Choice,
     ModuleSensitivity,
+    Score,
     Sensitivity,
+    Trials,
+    advise,
     analyse,
+    write_recipe,
 )
-from me2e_compress.fidelity.sensitivity.recipes import advise, write_recipe
 from me2e_compress.fidelity.sensitivity.search import Budget, Candidate, search
-from me2e_compress.fidelity.sensitivity.trials import Int8Choice, Score, Trials
 
 __all__ = [
     "Budget",

@@ -9,8 +9,12 @@ import onnx_ir as ir
 
 from me2e_compress.display import significant
 from me2e_compress.errors import EvaluationError
-from me2e_compress.fidelity.sensitivity.analysis import names_of
-from me2e_compress.fidelity.sensitivity.trials import Int8Choice, Score, Trials
+from me2e_compress.fidelity.sensitivity.analysis import (
+    Int8Choice,
+    Score,
+    Trials,
+    names_of,
+)
 
 MOST_MODULES = 16
 """All 2^16 assignments are weighed; a map of more modules must be coarser."""

@@ -1,8 +1,12 @@
 """Modules: which node of a graph belongs to which part of the driving stack."""
 
-from me2e_compress.graph.modules.assign import assign
-from me2e_compress.graph.modules.assignment import Assignment, Placement
-from me2e_compress.graph.modules.detect import detect, map_of
+from me2e_compress.graph.modules.assign import (
+    Assignment,
+    Placement,
+    assign,
+    detect,
+    map_of,
+)
 from me2e_compress.graph.modules.inventory import Item, itemise
 from me2e_compress.graph.modules.module_map import (
     Module,

@@ -42,11 +42,12 @@ from me2e_compress.graph.rewrite.fusion import (
     fuse,
     needs_opset,
 )
-from me2e_compress.graph.rewrite.match import Match, match
 from me2e_compress.graph.rewrite.pattern import (
+    Match,
     Pattern,
     constant,
     either,
+    match,
     moved,
     op,
     product,

@@ -19,8 +19,7 @@ from me2e_compress.graph.rewrite.edits import (
     replace_value,
     value_names,
 )
-from me2e_compress.graph.rewrite.match import Match, match
-from me2e_compress.graph.rewrite.pattern import Pattern
+from me2e_compress.graph.rewrite.pattern import Match, Pattern, match
 
 ROUNDS = 16
 """A fusion can complete the pattern of another: real graphs need two or three."""

@@ -6,7 +6,7 @@ from typing import Any
 from numba import types
 
 from me2e_compress.operators.kernels import abi
-from me2e_compress.operators.kernels.call_context import (
+from me2e_compress.operators.kernels.abi import (
     ADDRESS,
     EACH,
     TYPE,

@@ -8,8 +8,8 @@ read at run time.
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from me2e_compress.operators.kernels.abi import ADDRESS, EACH
 from me2e_compress.operators.kernels.attention_call import functions_of
-from me2e_compress.operators.kernels.call_context import ADDRESS, EACH
 from me2e_compress.operators.kernels.intrinsics import Word, compiled, floats, words
 from me2e_compress.operators.kernels.sampling import (
     OTHERS,

@@ -10,7 +10,7 @@ import numpy as np
 from numba import types
 
 from me2e_compress.operators.kernels import abi
-from me2e_compress.operators.kernels.call_context import EACH, TYPE
+from me2e_compress.operators.kernels.abi import EACH, TYPE
 from me2e_compress.operators.kernels.intrinsics import (
     Word,
     compiled,

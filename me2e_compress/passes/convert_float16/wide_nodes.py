@@ -13,7 +13,7 @@ from me2e_compress.calibration.stream import Recording
 from me2e_compress.graph import is_standard, provenance, static_shape
 from me2e_compress.graph.nodes import LAYOUT_OPERATORS, Numbers, constant_values
 from me2e_compress.passes.convert_float16.element_types import ElementTypes
-from me2e_compress.quantization.coordinates import position_arithmetic
+from me2e_compress.quantization.geometry import position_arithmetic
 from me2e_compress.runtime.providers import CPU, Provider
 
 LARGEST = float(np.finfo(np.float16).max)

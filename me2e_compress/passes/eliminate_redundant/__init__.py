@@ -26,7 +26,7 @@ from me2e_compress.graph.rewrite import (
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.eliminate_redundant.identities import identity_of
 from me2e_compress.passes.eliminate_redundant.merges import MergeSite, merge
-from me2e_compress.passes.fold_constants.inference import branch_fits
+from me2e_compress.passes.fold_constants.knowledge import branch_fits
 
 COMMUTATIVE = frozenset({"Add", "And", "Equal", "Mul", "Or", "Xor"})
 

@@ -10,8 +10,8 @@ import onnx_ir as ir
 
 from me2e_compress.errors import PassError, RecipeError
 from me2e_compress.graph import digest, load, node_count, save
-from me2e_compress.graph.restore import restore
 from me2e_compress.graph.rewrite import lift_constants, sweep
+from me2e_compress.graph.surgeon import restore
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.runtime.children import run_script
 

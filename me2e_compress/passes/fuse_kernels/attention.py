@@ -8,7 +8,7 @@ import onnx_ir as ir
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph.nodes import maker, permutation_of, sole_reader
 from me2e_compress.graph.rewrite import bypass
-from me2e_compress.graph.rewrite.products import factors_of
+from me2e_compress.graph.rewrite.pattern import factors_of
 from me2e_compress.graph.shapes import static_shape
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.operators.kernels.kernel import ATTENTION

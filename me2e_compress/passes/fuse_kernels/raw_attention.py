@@ -15,13 +15,17 @@ from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.operators.raw_attention import RAW_ATTENTION, raw_own_form
 from me2e_compress.passes.digits import Digit, Layout, flat, merged, whole
 from me2e_compress.passes.digits import sizes as sizes_of
-from me2e_compress.passes.fuse_operators.laid_out import combined, laid_out
+from me2e_compress.passes.fuse_operators.fused_form import (
+    combined,
+    cost_of,
+    laid_out,
+    whole_views,
+)
 from me2e_compress.passes.fuse_operators.numeric_check import (
     Proofs,
     nodes_between,
     take_back,
 )
-from me2e_compress.passes.fuse_operators.operand_sources import cost_of, whole_views
 from me2e_compress.passes.fuse_operators.views import View, aligned, sources, terms
 
 BATCH, QUERY, HEAD, LEVEL, POINT = "batch", "query", "head", "level", "point"

@@ -9,7 +9,16 @@ import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
-from me2e_compress.passes.digits import Digit, Layout, flat, sizes, split_like, whole
+from me2e_compress.passes.digits import (
+    Digit,
+    Layout,
+    flat,
+    merged,
+    runs,
+    sizes,
+    split_like,
+    whole,
+)
 from me2e_compress.passes.fuse_operators.decomposed import (
     BATCH,
     CHANNEL,
@@ -18,18 +27,250 @@ from me2e_compress.passes.fuse_operators.decomposed import (
     XY,
     Decomposed,
 )
-from me2e_compress.passes.fuse_operators.laid_out import combined, laid_out
-from me2e_compress.passes.fuse_operators.operand_sources import (
-    Source,
-    cheapest,
-    cost_of,
-    join_levels,
-    join_pixels,
-    options_of,
-    sums_of,
-    whole_views,
+from me2e_compress.passes.fuse_operators.views import (
+    Selection,
+    View,
+    joined,
+    sources,
+    terms,
 )
-from me2e_compress.passes.fuse_operators.views import View
+
+# Find where an operand of the fused node can be read, and what its layout costs.
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """The views of an operand: one, or one per level, or the two terms of a sum."""
+
+    views: tuple[View, ...]
+    total: bool = False
+
+
+def join_pixels(selections: Sequence[Selection]) -> View | None:
+    """Join feature maps that were cut from one row of pixels, level after level."""
+    for each in selections:
+        digits = merged(each.view.layout[each.axis])
+        if digits != whole(PIXEL, each.size):
+            return None
+    return joined(selections, whole(PIXEL, sum(each.size for each in selections)))
+
+
+def join_levels(selections: Sequence[Selection]) -> View | None:
+    """Join positions that were cut from one row of levels."""
+    first = selections[0]
+    digits = first.view.layout[first.axis]
+    if any(each.view.layout[each.axis] != digits for each in selections):
+        return None
+    return joined(selections, (*whole(LEVEL, len(selections)), *digits))
+
+
+def options_of(
+    views: Sequence[View], join: Callable[[Sequence[Selection]], View | None]
+) -> list[Source]:
+    """Return where an operand can be read: per level, then from all levels together."""
+    # Walk back from each level
+    walks = [list(sources(view)) for view in views]
+    ends = [walk[-1] for walk in walks]
+    options = [
+        Source(option)
+        for option in zip(
+            *([each for each in walk if isinstance(each, View)] for walk in walks),
+            strict=False,  # a level may be read from further away than another
+        )
+    ]
+    # Where all levels are selections of one value, read that
+    selections = [each for each in ends if isinstance(each, Selection)]
+    if len(selections) < len(ends):
+        return options
+    first = selections[0]
+    together = (
+        joined(selections, first.view.layout[first.axis])
+        if len(selections) == 1
+        else join(selections)
+    )
+    return options if together is None else [*options, *options_of([together], join)]
+
+
+def whole_views(view: View) -> list[View]:
+    """Return where a value can be read as a whole and unscaled."""
+    found = (each for each in sources(view) if isinstance(each, View))
+    return [each for each in found if _same(each, view)]
+
+
+def sums_of(option: Source) -> list[Source]:
+    """Return where the two terms of an operand can be read, if it is an unscaled sum.
+
+    Positions are often the sum of few reference points and offsets, cheaper to move.
+    """
+    if len(option.views) != 1 or scaling(option.views[0]) != (1.0, 0.0):
+        return []
+    parts = terms(option.views[0])
+    if parts is None:
+        return []
+    first, second = (
+        [v for v in sources(part) if isinstance(v, View) and v.shift == part.shift]
+        for part in parts
+    )
+    return [Source((a, b), total=True) for a in first for b in second]
+
+
+def _same(view: View, other: View) -> bool:
+    return (view.scale, view.shift) == (other.scale, other.shift)
+
+
+def cheapest(
+    options: Sequence[Source],
+    form: Callable[[int | None], Layout],
+    covered: tuple[Digit, ...] = (),
+) -> tuple[float, Source]:
+    """Return the lowest cost of laying out a source, and the last such source.
+
+    ``covered`` are digits that another operator repeats the operand over anyway.
+    """
+
+    def cost(option: Source) -> float:
+        if option.total:
+            return sum(cost_of(v, form(None), part=True) for v in option.views)
+        if len(option.views) == 1:
+            return cost_of(option.views[0], form(None), covered=covered)
+        joint = sum(_bytes(view) for view in option.views)
+        return joint + sum(cost_of(v, form(i)) for i, v in enumerate(option.views))
+
+    best = min(reversed(options), key=cost)
+    return cost(best), best
+
+
+def _bytes(view: View) -> float:
+    return 4.0 * math.prod(sizes(view.layout))
+
+
+def cost_of(
+    view: View,
+    form: Layout,
+    *,
+    covered: tuple[Digit, ...] = (),
+    part: bool = False,
+) -> float:
+    """Return the bytes written to bring a view to a layout.
+
+    The view need not be repeated over ``covered`` digits, nor at all as a ``part`` of a
+    sum or product, which repeats it and is scaled elsewhere.
+    """
+    have, wanted = flat(view.layout), flat(form)
+    have, wanted = split_like(have, wanted), split_like(wanted, have)
+    present = tuple(digit for digit in wanted if digit in have)
+    if set(have) - set(present):
+        return math.inf
+    scaled = not part and scaling(view) != (1.0, 0.0)
+    steps = int(present != have) + 2 * int(scaled)
+    lacking = set(wanted) - set(have) - set(split_like(covered, wanted))
+    more = 4.0 * math.prod(sizes(form)) if lacking and not part else 0.0
+    return steps * _bytes(view) + more
+
+
+def scaling(view: View) -> tuple[float, float]:
+    """Return the factor and then the summand of a view's elements.
+
+    Those of a grid are taken from -1..1, between the outer edges, to 0..1.
+    """
+    if not any(digit.axis == XY for digit in flat(view.layout)):
+        return view.scale, view.shift
+    return view.scale / 2, (view.shift + 1) / 2
+
+
+# Write the operators that bring views of values to the layout of an operand.
+
+
+def laid_out(call: FusedCall, view: View, form: Layout) -> ir.Value:
+    """Write the operators from a view to a layout, repeating over missing digits."""
+    value, (scale, shift) = view.value, scaling(view)
+    if scale != 1.0:
+        value = call.add("Mul", [value, call.numbers(scale, value)])
+    if shift != 0.0:
+        value = call.add("Add", [value, call.numbers(shift, value)])
+    # Split digits on both sides so that they match
+    have, wanted = flat(view.layout), flat(form)
+    have, wanted = split_like(have, wanted), split_like(wanted, have)
+    present = tuple(digit for digit in wanted if digit in have)
+    shape = sizes(view.layout)
+    if present != have:
+        # Reorder runs of digits by one Transpose
+        pieces, order = runs(have, present)
+        value = call.transpose(_shaped(call, value, shape, sizes(tuple(pieces))), order)
+        shape = tuple(sizes(tuple(pieces))[place] for place in order)
+    if len(present) < len(wanted):
+        # Repeat along the missing digits
+        ones = [digit.size if digit in have else 1 for digit in wanted]
+        value = _shaped(call, value, shape, ones)
+        return _expanded(call, value, ones, wanted, form)
+    return _shaped(call, value, shape, sizes(form))
+
+
+def combined(
+    call: FusedCall, op_type: str, views: Sequence[View], form: Layout
+) -> ir.Value:
+    """Write an Add or Mul of views in a layout, each repeated by broadcasting."""
+    if len(views) == 1:
+        return laid_out(call, views[0], form)
+    # Group the digits so that a view has or lacks each group as a whole
+    digits = [digit for view in views for digit in flat(view.layout)]
+    every = split_like(flat(form), digits)
+    have = [set(split_like(flat(view.layout), every)) for view in views]
+    groups = _groups(form, digits, have)
+    # Combine the views by broadcasting
+    value: ir.Value | None = None
+    for view, mine in zip(views, have, strict=True):
+        own = tuple(run if run[0] in mine else () for run in groups)
+        part = laid_out(call, view, own)
+        value = part if value is None else call.add(op_type, [value, part])
+    assert value is not None
+    # Expand along digits that no view has
+    found = [run if any(run[0] in each for each in have) else () for run in groups]
+    shape = sizes(tuple(found))
+    if shape != sizes(tuple(groups)):
+        wanted = tuple(digit for run in groups for digit in run)
+        ones = [
+            digit.size if any(digit in each for each in have) else 1 for digit in wanted
+        ]
+        value = _shaped(call, value, shape, ones)
+        return _expanded(call, value, ones, wanted, form)
+    return _shaped(call, value, shape, sizes(form))
+
+
+def _groups(
+    form: Layout, digits: Sequence[Digit], have: Sequence[set[Digit]]
+) -> list[tuple[Digit, ...]]:
+    """Split each dimension into runs that every view has or lacks as a whole."""
+    groups: list[tuple[Digit, ...]] = []
+    for dimension in form:
+        last: tuple[bool, ...] | None = None
+        for digit in split_like(dimension, digits):
+            who = tuple(digit in each for each in have)
+            if who == last:
+                groups[-1] = (*groups[-1], digit)
+            else:
+                groups.append((digit,))
+            last = who
+    return groups
+
+
+def _expanded(
+    call: FusedCall,
+    value: ir.Value,
+    ones: Sequence[int],
+    wanted: Sequence[Digit],
+    form: Layout,
+) -> ir.Value:
+    full = [digit.size for digit in wanted]
+    value = call.add("Expand", [value, call.integers(full)])
+    return _shaped(call, value, full, sizes(form))
+
+
+def _shaped(
+    call: FusedCall, value: ir.Value, have: Sequence[int], wanted: Sequence[int]
+) -> ir.Value:
+    return value if tuple(have) == tuple(wanted) else call.reshape(value, list(wanted))
+
 
 OP_TYPE = "MultiScaleDeformableAttention"
 

@@ -16,12 +16,13 @@ from me2e_compress.quantization.plan.decision import (
     save_plan,
     stamp_plan,
 )
-from me2e_compress.quantization.plan.groups import (
+from me2e_compress.quantization.plan.make import (
     SharingCost,
+    make_plan,
     share_scales,
     sharing_costs,
+    tensors_of,
 )
-from me2e_compress.quantization.plan.make import make_plan, tensors_of
 from me2e_compress.quantization.plan.overrides import Overrides
 
 __all__ = [

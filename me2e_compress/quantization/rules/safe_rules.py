@@ -140,7 +140,7 @@ class Coordinates(Rule):
     name: ClassVar[str] = "coordinates"
 
     def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
-        """Object to what :func:`~me2e_compress.quantization.coordinates` found."""
+        """Object to what :func:`~me2e_compress.quantization.geometry` found."""
         return facts.coordinates.get(node)
 
 
@@ -155,7 +155,7 @@ class EgoInput(Rule):
     name: ClassVar[str] = "ego-input"
 
     def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
-        """Object to what :func:`~me2e_compress.quantization.ego_inputs` found."""
+        """Object to what :func:`~me2e_compress.quantization.rules.base` found."""
         source = facts.ego_layers.get(node)
         return None if source is None else f"encodes the ego status {source}"
 

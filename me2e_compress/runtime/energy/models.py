@@ -7,12 +7,13 @@ from pathlib import Path
 
 from me2e_compress.errors import EnergyError
 from me2e_compress.graph import sha256_of
-from me2e_compress.runtime.energy.energy_counter import open_counter
-from me2e_compress.runtime.energy.energy_recording import EnergyRecording
-from me2e_compress.runtime.energy.energy_result import EnergyResult
+from me2e_compress.runtime.energy.energy_counter import (
+    EnergyRecording,
+    EnergySchedule,
+    open_counter,
+)
+from me2e_compress.runtime.energy.energy_result import Absent, EnergyResult, Reader
 from me2e_compress.runtime.energy.meter import EnergyMeter
-from me2e_compress.runtime.energy.reader import Absent, Reader
-from me2e_compress.runtime.energy.schedule import EnergySchedule
 from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay

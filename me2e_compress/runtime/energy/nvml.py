@@ -8,7 +8,7 @@ import pynvml
 
 from me2e_compress.errors import EnergyError
 from me2e_compress.runtime.energy.energy_counter import EnergyCounter
-from me2e_compress.runtime.energy.reader import Absent, DeviceState, Reader
+from me2e_compress.runtime.energy.energy_result import Absent, DeviceState, Reader
 
 T = TypeVar("T")
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from me2e_compress.errors import EnergyError
 from me2e_compress.registry import documents
-from me2e_compress.runtime.energy.energy_counter import EnergyCounter
-from me2e_compress.runtime.energy.energy_recording import EnergyRecording
-from me2e_compress.runtime.energy.power import Floats, integrated
+from me2e_compress.runtime.energy.energy_counter import EnergyCounter, EnergyRecording
+from me2e_compress.runtime.energy.meter import Floats, integrated
 
 _COLUMNS = "time_s, frames, and joules or watts"
 

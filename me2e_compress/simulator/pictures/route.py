@@ -14,19 +14,17 @@ from PIL import Image
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.cameras import CAMERA_NAMES, GroundTexture
-from me2e_compress.simulator.pictures.canvas import (
-    Colour,
-    Text,
-    text_width,
-    write,
-)
 from me2e_compress.simulator.pictures.top_view import (
     EGO,
     INK,
     OTHER,
     PAPER,
     BirdsEye,
+    Colour,
     OtherDrive,
+    Text,
+    text_width,
+    write,
 )
 from me2e_compress.simulator.scene import INFRACTIONS, Event, Scene
 

@@ -1,26 +1,30 @@
-"""The setup of a scenario, and what its scripts see while it runs."""
+"""The setup of a scenario, and what its scripts see while it runs.
+
+What is drawn before a route begins: arrivals and signals.
+
+Nothing here looks at the ego, except that who would appear on top of somebody stays
+away.
+"""
 
 import math
+import zlib
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 
+import numpy as np
 from highway_env.vehicle.objects import RoadObject
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import Floats, Point, RoutePath
-from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.routes import Parameter, Route
 from me2e_compress.simulator.scene import (
     ActorKind,
     Event,
     EventKind,
     SignalKind,
 )
-from me2e_compress.simulator.traffic.bodies import (
-    EgoVehicle,
-    StaticObject,
-    Walker,
-)
+from me2e_compress.simulator.traffic.bodies import EgoVehicle, StaticObject, Walker
 from me2e_compress.simulator.traffic.cars import Behaviour, Car
-from me2e_compress.simulator.traffic.draws import Draws
 from me2e_compress.simulator.traffic.legs import Leg, build_path
 from me2e_compress.simulator.traffic.network import (
     LANE_WIDTH_M,
@@ -28,9 +32,181 @@ from me2e_compress.simulator.traffic.network import (
     Network,
     Pose,
 )
-from me2e_compress.simulator.traffic.schedule import Schedule
-from me2e_compress.simulator.traffic.signals import Regulator
+from me2e_compress.simulator.traffic.signals import Regulator, SignalPlan
 from me2e_compress.simulator.weather import DRAWN, drawn_weather
+
+# Parameters of a route, drawn by name.
+
+
+class Draws:
+    """Draws the parameters of a route, each by its name.
+
+    A value depends on the route's seed and the name alone, not on what was drawn
+    before, and a value in the route's manifest wins.
+    """
+
+    def __init__(self, route: Route) -> None:
+        self.route = route
+        self.parameters: dict[str, Parameter] = {}
+        self.lead_m = 0.0
+        """Metres of route before the places of a scenario."""
+        self._traffic, self._complete = 0, False
+
+    def place(self, name: str, low: float, high: float) -> float:
+        """Draw an arc length of the route, after the metres that come before."""
+        return self.uniform(name, low + self.lead_m, high + self.lead_m)
+
+    def random(self, name: str) -> np.random.Generator:
+        """Return a generator of traffic: another ``traffic`` gives other numbers."""
+        key = [self.route.seed, self._traffic, zlib.crc32(name.encode())]
+        return np.random.default_rng(key)
+
+    def uniform(self, name: str, low: float, high: float) -> float:
+        """Draw a parameter between two bounds, to the millimetre."""
+        drawn = round(float(self._random(name).uniform(low, high)), 3)
+        return float(self._given(name, drawn))
+
+    def integer(self, name: str, low: int, high: int) -> int:
+        """Draw an integer parameter between two bounds, both included."""
+        return int(self._given(name, int(self._random(name).integers(low, high + 1))))
+
+    def choice(self, name: str, options: Sequence[str]) -> str:
+        """Draw one of several words."""
+        drawn = options[int(self._random(name).integers(len(options)))]
+        value = str(self._given(name, drawn))
+        if value not in options:
+            raise EvaluationError(
+                f"route {self.route.id}: parameter {name} is {value!r}; "
+                f"there are {', '.join(options)}"
+            )
+        return value
+
+    def complete(self) -> None:
+        """Check that the route gives no parameter that nothing drew."""
+        self._complete = True
+        unasked = [
+            name for name in self.route.parameters if name not in self.parameters
+        ]
+        if unasked:
+            raise EvaluationError(
+                f"route {self.route.id}: {self.route.scenario} has no parameter "
+                f"{', '.join(unasked)} here; there are {', '.join(self.parameters)}"
+            )
+
+    def _given(self, name: str, drawn: Parameter) -> Parameter:
+        if self._complete:
+            raise EvaluationError(
+                f"{self.route.scenario}: parameter {name} is drawn after the setup"
+            )
+        value = self.route.parameters.get(name, drawn)
+        if isinstance(value, str) != isinstance(drawn, str):
+            raise EvaluationError(
+                f"route {self.route.id}: parameter {name} is {value!r}, "
+                f"expected a value like {drawn!r}"
+            )
+        self.parameters[name] = value
+        return value
+
+    def _random(self, name: str) -> np.random.Generator:
+        return np.random.default_rng([self.route.seed, zlib.crc32(name.encode())])
+
+
+Body = Car | Walker | StaticObject | EgoVehicle
+HORIZON_S = 200.0
+"""Arrivals are drawn for as long as a route may last (the leaderboard's 4000 ticks)."""
+SHORTEST_S = 1.6
+"""Two cars of one lane do not arrive closer to each other."""
+PLATOON_S = (1.6, 2.6)
+PLATOON = 4
+"""Most followers in a platoon."""
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """A body and when it appears."""
+
+    time_us: int
+    body: Car | Walker
+
+
+@dataclass
+class Schedule:
+    """Arrivals and signal plans of one route.
+
+    Attributes:
+        claimed: Lanes into the map whose traffic a script has drawn.
+        lines: Lights by the lane that they stop, with the arc length of the line.
+        arrivals: In order of time, once closed.
+    """
+
+    plans: list[SignalPlan] = field(default_factory=list)
+    claimed: list[LaneIndex] = field(default_factory=list)
+    lines: dict[LaneIndex, list[tuple[float, Regulator]]] = field(default_factory=dict)
+    arrivals: list[Arrival] = field(default_factory=list)
+    _next: int = 0
+
+    def add(self, time_s: float, body: Car | Walker) -> None:
+        """Let a body appear at a time."""
+        self.arrivals.append(Arrival(round(time_s * 1e6), body))
+
+    def close(self) -> None:
+        """Put the arrivals in order; none is added afterwards."""
+        self.arrivals.sort(key=lambda each: (each.time_us, each.body.id))
+
+    def show(self, time_us: int) -> None:
+        """Set all lights."""
+        for plan in self.plans:
+            plan.show(time_us)
+
+    def due(self, time_us: int, present: Sequence[Body]) -> list[Car | Walker]:
+        """Return who appears now; who finds the place taken stays away for good."""
+        found = list[Car | Walker]()
+        while self._next < len(self.arrivals):
+            arrival = self.arrivals[self._next]
+            if arrival.time_us > time_us:
+                break
+            self._next += 1
+            if is_free(arrival.body, [*present, *found]):
+                found.append(arrival.body)
+        return found
+
+
+def is_free(body: Body, present: Sequence[Body], room_m: float = 2.0) -> bool:
+    """Return whether a body has room where it is: bumper to bumper, and to react."""
+    x, y = body.position
+    if isinstance(body, Car):
+        room_m += 0.8 * float(body.speed)
+    for other in present:
+        ox, oy = other.position
+        needed = (body.LENGTH + other.LENGTH) / 2 + room_m
+        if isinstance(body, Walker):
+            needed = 1.5
+        if math.hypot(ox - x, oy - y) < needed:
+            return False
+    return True
+
+
+def arrival_times(
+    random: np.random.Generator, mean_s: float, begin_s: float, platoons: float
+) -> list[float]:
+    """Draw arrivals of one lane from ``begin_s`` to `HORIZON_S`.
+
+    Gaps are exponential beyond the shortest; with the probability ``platoons`` a car
+    leads a platoon. The mean gap is the same either way.
+    """
+    at, found = begin_s + float(random.uniform(0.0, mean_s)), list[float]()
+    while at < HORIZON_S:
+        found.append(at)
+        followers = 0
+        if random.random() < platoons:
+            followers = int(random.integers(1, PLATOON))
+        for _ in range(followers):
+            at += float(random.uniform(*PLATOON_S))
+            found.append(at)
+        rest = mean_s * (1 + followers) - followers * sum(PLATOON_S) / 2 - SHORTEST_S
+        at += SHORTEST_S + float(random.exponential(max(rest, 0.5)))
+    return found
+
 
 Script = Iterator[None]
 """One actor script: resumed at every decision, it yields until the next one."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-from me2e_compress.registry.marks import MARK
+from me2e_compress.registry.drafts import MARK
 from me2e_compress.workflows.result import Table
 
 

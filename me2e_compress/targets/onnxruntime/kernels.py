@@ -12,7 +12,7 @@ from me2e_compress.graph.shapes import (
     open_shape,
     static_shape,
 )
-from me2e_compress.targets.biases import is_bias
+from me2e_compress.targets.weights import is_bias
 
 MOVES = frozenset(
     {

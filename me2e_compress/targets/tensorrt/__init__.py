@@ -26,14 +26,16 @@ from me2e_compress.quantization.plan import (
     tensors_of,
 )
 from me2e_compress.targets.base import LintRule, Target
-from me2e_compress.targets.biases import bias_by_channel, least_scales, with_room
 from me2e_compress.targets.tensorrt.lint import rules
-from me2e_compress.targets.tensorrt.lint.support_matrix import version_of
+from me2e_compress.targets.tensorrt.lint.support import version_of
 from me2e_compress.targets.weights import (
     QuantizedWeight,
+    bias_by_channel,
+    least_scales,
     requantized,
     scales_in,
     weights_of,
+    with_room,
 )
 from me2e_compress.targets.writer import Writer
 

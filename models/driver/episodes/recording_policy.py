@@ -10,13 +10,14 @@ from zlib import crc32
 
 import numpy as np
 
-from me2e_compress.driving.answer import PLAN_TIMES_S, six_waypoints
 from me2e_compress.driving.contract import (
     PLAN_SHAPE,
+    PLAN_TIMES_S,
     Observation,
     Plan,
     Policy,
     RouteInfo,
+    six_waypoints,
 )
 from me2e_compress.evaluators.highway.expert.expert_policy import (
     ExpertDecision,

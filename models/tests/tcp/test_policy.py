@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from me2e_compress.driving.answer import checked
-from me2e_compress.driving.contract import Answer, PedalsAndWheel
+from me2e_compress.driving.contract import Answer, PedalsAndWheel, checked
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions

@@ -3,8 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.answer import checked
-from me2e_compress.driving.contract import Observation, Policy, Trajectory
+from me2e_compress.driving.contract import Observation, Policy, Trajectory, checked
 from me2e_compress.simulator.cameras import CameraRig
 
 RIG = CameraRig(16, 24)

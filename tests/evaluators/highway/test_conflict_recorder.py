@@ -13,8 +13,7 @@ from me2e_compress.evaluators.highway.conflict_recorder import (
     contact_of,
 )
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
-from me2e_compress.metrics.conflict_record import ConflictRecord
-from me2e_compress.metrics.episode import Ending
+from me2e_compress.metrics.episode import ConflictRecord, Ending
 from me2e_compress.metrics.infraction import Contact, Infraction
 from me2e_compress.simulator.plane_geometry import Lane, LaneMarking, Roadmap
 from me2e_compress.simulator.routes import Route

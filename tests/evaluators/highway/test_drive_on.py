@@ -15,8 +15,7 @@ from me2e_compress.metrics.driving_score import route_score, score_to_first_coll
 from me2e_compress.metrics.episode import Ending, Episode
 from me2e_compress.metrics.infraction import COLLISIONS
 from me2e_compress.simulator.routes import Route
-from me2e_compress.simulator.traffic.bodies import EgoVehicle
-from me2e_compress.simulator.traffic.contacts import Contacts, depth
+from me2e_compress.simulator.traffic.bodies import Contacts, EgoVehicle, depth
 from me2e_compress.simulator.traffic.network import Pose
 from tests.simulator.world.driving import route_of
 

@@ -19,7 +19,7 @@ from me2e_compress.evaluators.highway.evaluator import (
 )
 from me2e_compress.evaluators.highway.results import ResultsFolder
 from me2e_compress.evaluators.highway.worker import Job
-from me2e_compress.registry.marks import is_marked
+from me2e_compress.registry.drafts import is_marked
 from me2e_compress.simulator.routes import Route
 from tests.command import contents
 from tests.evaluators.highway.drivers import CROSSING, EXIT, GREEN, PARKED, ROUTES

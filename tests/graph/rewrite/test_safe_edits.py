@@ -13,7 +13,7 @@ from onnx.reference import ReferenceEvaluator
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import rewrite
-from me2e_compress.manager.pass_contract import check_valid
+from me2e_compress.manager.attempt import check_valid
 
 X = np.array([[-2.0, 0.5, 3.0]], np.float32)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from me2e_compress.runtime.energy.energy_counter import EnergyCounter
-from me2e_compress.runtime.energy.reader import Reader
+from me2e_compress.runtime.energy.energy_result import Reader
 
 
 @dataclass(frozen=True)

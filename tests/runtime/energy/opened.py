@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pynvml
 import pytest
 
-from me2e_compress.runtime.energy.reader import Absent, Reader
+from me2e_compress.runtime.energy.energy_result import Absent, Reader
 
 
 def answered(found: object) -> Reader:

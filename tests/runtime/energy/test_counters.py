@@ -13,7 +13,7 @@ from me2e_compress.runtime.energy.energy_counter import (
     EnergyCounter,
     open_counter,
 )
-from me2e_compress.runtime.energy.reader import Absent
+from me2e_compress.runtime.energy.energy_result import Absent
 from me2e_compress.testing import check_form
 from tests.runtime.energy.opened import Driver, reason
 

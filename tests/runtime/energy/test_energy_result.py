@@ -8,9 +8,12 @@ import pytest
 
 from me2e_compress.errors import EnergyError
 from me2e_compress.runtime.energy import EnergyResult
-from me2e_compress.runtime.energy.energy_result import CountedBy, summarise
-from me2e_compress.runtime.energy.estimate import Window
-from me2e_compress.runtime.energy.reader import DeviceState
+from me2e_compress.runtime.energy.energy_result import (
+    CountedBy,
+    DeviceState,
+    Window,
+    summarise,
+)
 
 NONE = EnergyResult(reason="no energy counter answers")
 FOUND = EnergyResult(

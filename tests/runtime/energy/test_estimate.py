@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from me2e_compress.errors import EnergyError
-from me2e_compress.runtime.energy.estimate import Window, estimate, student_t
+from me2e_compress.runtime.energy.energy_result import Window, estimate, student_t
 
 
 def windows(*joules: float, length: float = 10.0) -> list[Window]:

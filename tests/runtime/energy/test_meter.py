@@ -6,9 +6,9 @@ from itertools import groupby
 import pytest
 
 from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.energy.energy_counter import EnergySchedule
 from me2e_compress.runtime.energy.energy_result import EnergyResult
 from me2e_compress.runtime.energy.meter import EnergyMeter
-from me2e_compress.runtime.energy.schedule import EnergySchedule
 from tests.runtime.energy.world import World
 
 SCHEDULE = EnergySchedule(

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.energy.energy_counter import EnergySchedule
 from me2e_compress.runtime.energy.recorded_energy import Recorded
-from me2e_compress.runtime.energy.schedule import EnergySchedule
 
 SCHEDULE = EnergySchedule(warm_up_s=5, window_s=4, window_frames=10, idle_s=4)
 

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterator
 
-from me2e_compress.runtime.energy.reader import DeviceState, Reader
+from me2e_compress.runtime.energy.energy_result import DeviceState, Reader
 
 STEP_S = 0.1
 

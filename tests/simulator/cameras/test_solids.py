@@ -12,7 +12,7 @@ from me2e_compress.simulator.cameras import (
     PixelClass,
 )
 from me2e_compress.simulator.cameras.classes import ACTOR_CLASSES
-from me2e_compress.simulator.cameras.ordering import painting_order
+from me2e_compress.simulator.cameras.painter import painting_order
 from me2e_compress.simulator.cameras.solids import TEMPLATES
 from me2e_compress.simulator.scene import (
     DIMENSIONS,

@@ -11,13 +11,12 @@ from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from me2e_compress.simulator.scenarios.scripts.streams import TRIGGERED
 from me2e_compress.simulator.scene import Control, EventKind, SignalKind, SignalState
 from me2e_compress.simulator.traffic.cars import Car
-from me2e_compress.simulator.traffic.schedule import HORIZON_S, arrival_times
 from me2e_compress.simulator.traffic.signals import (
     ALL_RED_S,
     YELLOW_S,
     SignalPlan,
 )
-from me2e_compress.simulator.traffic.stage import Stage
+from me2e_compress.simulator.traffic.stage import HORIZON_S, Stage, arrival_times
 from me2e_compress.simulator.weather import CLEAR, DRAWN, drawn_weather
 from me2e_compress.simulator.world import World
 from tests.simulator.world.driving import trace

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.targets.onnxruntime.image_blocks import (
+from me2e_compress.targets.onnxruntime.lower import (
     blocks_of,
     filter_of_blocks,
     read_blocks,

@@ -6,7 +6,7 @@ import pytest
 
 from me2e_compress.targets import TARGETS, LintFinding
 from me2e_compress.targets.tensorrt import TensorRT
-from me2e_compress.targets.tensorrt.lint.support_matrix import (
+from me2e_compress.targets.tensorrt.lint.support import (
     LATER,
     SUPPORTED,
     UNSUPPORTED,

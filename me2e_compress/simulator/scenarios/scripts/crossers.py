@@ -6,13 +6,11 @@ import numpy as np
 
 from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
 from me2e_compress.simulator.scenarios.layouts.road import Street
-from me2e_compress.simulator.scenarios.scripts.streams import encounter
-from me2e_compress.simulator.scenarios.scripts.synchronise import steps_out
+from me2e_compress.simulator.scenarios.scripts.streams import encounter, steps_out
 from me2e_compress.simulator.scene import ActorKind
 from me2e_compress.simulator.traffic.bodies import Walker
 from me2e_compress.simulator.traffic.network import LANE_WIDTH_M
-from me2e_compress.simulator.traffic.schedule import HORIZON_S
-from me2e_compress.simulator.traffic.stage import Script, Stage
+from me2e_compress.simulator.traffic.stage import HORIZON_S, Script, Stage
 
 HALF_LANE_M = LANE_WIDTH_M / 2
 

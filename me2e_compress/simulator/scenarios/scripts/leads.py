@@ -8,14 +8,12 @@ from me2e_compress.simulator.scenarios.layouts.road import BEFORE_M, Street
 from me2e_compress.simulator.scenarios.scripts.streams import (
     Traffic,
     encounter,
-    near,
-    stream,
-)
-from me2e_compress.simulator.scenarios.scripts.synchronise import (
     hold,
     keep_clear,
+    near,
     release,
     stand,
+    stream,
 )
 from me2e_compress.simulator.scene import ActorKind
 from me2e_compress.simulator.traffic.cars import Car

@@ -1,11 +1,13 @@
 """Things in the way: accidents, road works, parked cars, doors, slow cyclists."""
 
 from me2e_compress.simulator.scenarios.layouts.road import BEFORE_M, Street
-from me2e_compress.simulator.scenarios.scripts.streams import Traffic, near, stream
-from me2e_compress.simulator.scenarios.scripts.synchronise import (
+from me2e_compress.simulator.scenarios.scripts.streams import (
     NEAR_M,
+    Traffic,
     keep_clear,
     met,
+    near,
+    stream,
 )
 from me2e_compress.simulator.scene import ActorKind
 from me2e_compress.simulator.traffic.cars import Behaviour, Car

@@ -2,7 +2,7 @@
 
 from me2e_compress.targets.base import LintRule, of_opset, valid
 from me2e_compress.targets.tensorrt.lint import qdq, support
-from me2e_compress.targets.tensorrt.lint.support_matrix import Version
+from me2e_compress.targets.tensorrt.lint.support import Version
 
 _RULES: tuple[LintRule, ...] = (
     support.one_type,
