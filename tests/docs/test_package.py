@@ -1,30 +1,29 @@
-"""What the index shows, what the wheel holds, what a source distribution needs."""
+"""What the README shows and prints, what the wheel and a source distribution hold."""
 
 import re
+import shlex
 import tomllib
 from pathlib import Path
 
 import pytest
 
 from me2e_compress.shipped.drivers import SHIPPED
-from tests.docs.pages import ROOT
+from tests.command import Cli, cli, command
+from tests.docs.pages import ROOT, blocks
 
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+__all__ = ["cli", "command"]
+
+README = ROOT / "README.md"
 MOST_BYTES = 15_000_000
 """Of the wheel: two drivers of 6.7 MB are most of it."""
 
 
 def test_the_page_of_the_index_needs_no_checkout() -> None:
-    text = (ROOT / PROJECT["readme"]).read_text(encoding="utf-8")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    text = (ROOT / project["readme"]).read_text(encoding="utf-8")
 
     links = re.findall(r"\]\(([^)]+)\)|<img[^>]+src=\"([^\"]+)", text)
     assert [link for link in links if not link[0].startswith("https://")] == []
-
-
-def test_the_project_says_who_and_for_whom() -> None:
-    assert PROJECT["authors"] == [{"name": PROJECT["name"]}]
-    assert "Typing :: Typed" in PROJECT["classifiers"]
-    assert "urls" not in PROJECT, "a URL must lead somewhere: try it, then name it here"
 
 
 @pytest.mark.xdist_group("installed")
@@ -36,11 +35,30 @@ def test_the_wheel_is_small_and_brings_the_driver(site: Path) -> None:
     assert wheel.stat().st_size < MOST_BYTES
 
 
-@pytest.mark.parametrize(
-    "needed", ["Makefile", "constraints.txt", "README.md", "docs", "tests", "examples"]
-)
-def test_a_source_distribution_takes_what_make_needs(needed: str) -> None:
-    listed = (ROOT / "MANIFEST.in").read_text(encoding="utf-8").split()
+def test_a_source_distribution_takes_what_make_needs() -> None:
+    listed = set((ROOT / "MANIFEST.in").read_text(encoding="utf-8").split())
+    needed = {"Makefile", "constraints.txt", "README.md", "docs", "tests", "examples"}
+    assert needed <= listed
+    assert all((ROOT / name).exists() for name in needed)
 
-    assert needed in listed
-    assert (ROOT / needed).exists()
+
+def test_the_readme_is_read_in_five_minutes() -> None:
+    text = README.read_text(encoding="utf-8")
+    assert len(text.split()) <= 700
+    assert len(text.splitlines()) <= 100
+
+
+@pytest.mark.slow
+def test_the_six_commands_run_and_print_what_the_readme_says(cli: Cli) -> None:
+    (block,) = blocks(README, "console")
+    _, *six = block.text.split("$ me2e-compress ")
+    assert len(six) == 6
+    for line, *printed in map(str.splitlines, six):
+        name, *words = shlex.split(line)
+        shown = _without_figures(cli.done(name, *words).out)
+        assert [p for p in printed if _without_figures(p) not in shown] == []
+
+
+def _without_figures(text: str) -> str:
+    """Leave out what differs from machine to machine, and where lines are broken."""
+    return " ".join(re.sub(r"[\d.,]+", "#", text).split())

@@ -13,83 +13,40 @@ import pytest
 
 import me2e_compress
 from me2e_compress.cli.app import COMMANDS
-from tests.docs.pages import ROOT
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import recipe
+from me2e_compress.passes import PASSES
+from tests.docs.pages import PAGES, ROOT, blocks
 
+DOCS = ROOT / "docs"
 LIST = Path(__file__).with_name("public_names.txt")
-ROOMS = (
-    "me2e_compress",
-    "me2e_compress.calibration.observers",
-    "me2e_compress.driving.contract",
-    "me2e_compress.driving.input_sources",
-    "me2e_compress.driving.latency",
-    "me2e_compress.driving.policies",
-    "me2e_compress.errors",
-    "me2e_compress.evaluators",
-    "me2e_compress.graph",
-    "me2e_compress.manager",
-    "me2e_compress.metrics.episode",
-    "me2e_compress.graph.modules",
-    "me2e_compress.operators",
-    "me2e_compress.passes",
-    "me2e_compress.quantization.plan",
-    "me2e_compress.quantization.rules",
-    "me2e_compress.manager.recipe",
-    "me2e_compress.registry",
-    "me2e_compress.graph.rewrite",
-    "me2e_compress.fidelity.sensitivity",
-    "me2e_compress.study",
-    "me2e_compress.targets",
-    "me2e_compress.testing",
-)
-
-
-def public_names(room: str) -> list[str]:
-    return sorted(importlib.import_module(room).__all__)
-
-
-def held() -> dict[str, list[str]]:
-    lines = LIST.read_text(encoding="utf-8").splitlines()
-    found = dict[str, list[str]]()
-    for line in lines:
-        room, _, name = line.partition(": ")
-        found.setdefault(room, []).append(name)
-    return found
+LINES = LIST.read_text(encoding="utf-8").splitlines()
+ROOMS = tuple(dict.fromkeys(line.partition(": ")[0] for line in LINES))
 
 
 @pytest.mark.parametrize("room", ROOMS)
 def test_the_public_names_of_a_room_are_those_of_the_list(room: str) -> None:
-    assert public_names(room) == held()[room]
-
-
-@pytest.mark.parametrize("room", ROOMS)
-def test_every_public_name_is_there(room: str) -> None:
     module = importlib.import_module(room)
-    missing = [name for name in public_names(room) if not hasattr(module, name)]
-    assert missing == []
-
-
-@pytest.mark.parametrize("room", ROOMS)
-def test_a_signature_shows_no_address(room: str) -> None:
-    module = importlib.import_module(room)
-    shown = {
-        name: str(inspect.signature(each))
-        for name in public_names(room)
-        if inspect.isroutine(each := getattr(module, name))
+    assert [f"{room}: {name}" for name in sorted(module.__all__)] == [
+        line for line in LINES if line.startswith(f"{room}: ")
+    ]
+    # they are there, and no signature shows an address
+    objects = [getattr(module, name) for name in module.__all__]
+    shown = [
+        str(inspect.signature(each))
+        for each in objects
+        if inspect.isroutine(each)
         or (inspect.isclass(each) and not issubclass(each, Enum | Exception))
-    }
-    assert [name for name, text in shown.items() if " at 0x" in text] == []
+    ]
+    assert [text for text in shown if " at 0x" in text] == []
 
 
-def test_the_package_page_tells_the_function_of_every_command() -> None:
-    page = (ROOT / "docs" / "package.md").read_text(encoding="utf-8")
-    (told,) = (line for line in page.splitlines() if line.startswith("In Python "))
-    functions, others = told.split(" are commands alone")[0].rsplit(". ", 1)
-    names = set(re.findall(r"`(\w+)`", functions))
-    without = set(re.findall(r"`(\w+)`", others))
+def test_completion_offers_every_public_name_and_room() -> None:
+    offered = dir(me2e_compress)
 
-    assert {*names, *without} >= COMMANDS.keys()
-    assert names - {"frames", "sensitivity", "study"} <= set(me2e_compress.__all__)
-    assert not without & set(me2e_compress.__all__)
+    assert set(me2e_compress.__all__) <= set(offered)
+    assert {"passes", "errors", "testing", "__doc__", "__file__"} <= set(offered)
+    assert all(getattr(me2e_compress, name) is not None for name in offered if name)
 
 
 def test_a_name_that_is_none_is_an_error() -> None:
@@ -98,6 +55,50 @@ def test_a_name_that_is_none_is_an_error() -> None:
         _ = me2e_compress.nothing  # type: ignore[attr-defined]
 
 
+def test_the_package_page_tells_the_function_of_every_command() -> None:
+    page = (DOCS / "package.md").read_text(encoding="utf-8")
+    (line,) = (line for line in page.splitlines() if line.startswith("In Python "))
+    functions, others = line.split(" are commands alone")[0].rsplit(". ", 1)
+    names = set(re.findall(r"`(\w+)`", functions))
+    without = set(re.findall(r"`(\w+)`", others))
+
+    assert {*names, *without} >= COMMANDS.keys()
+    assert names - {"frames", "sensitivity", "study"} <= set(me2e_compress.__all__)
+    assert not without & set(me2e_compress.__all__)
+
+
+@pytest.mark.parametrize("name", PASSES.names())
+def test_every_pass_is_documented_and_shows_before_and_after(name: str) -> None:
+    text = PASSES.get(name).__doc__ or ""
+    assert "Given:" in text
+    assert "Result:" in text
+    assert f"`{name}`" in (DOCS / "passes.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", recipe.shipped())
+def test_every_recipe_is_documented(name: str) -> None:
+    assert f"`{name}`" in (DOCS / "recipes.md").read_text(encoding="utf-8")
+
+
+def test_the_map_and_the_pipeline_of_the_documents_parse() -> None:
+    (block,) = blocks(DOCS / "modules.md", "toml")
+    assert ModuleMap.parse(block.text, "documents").names() == ("backbone", "map")
+    text = (DOCS / "recipes.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"--passes '([^']+)'", text)
+    assert [current.name for current in recipe.parse(line)][1] == "ablate-modules"
+
+
+def test_the_links_of_the_documents_lead_somewhere_and_to_every_page() -> None:
+    linked = set[str]()
+    for page in PAGES:
+        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8")):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+            linked |= {target} if page == DOCS / "README.md" else set()
+    pages = {page.name for page in DOCS.glob("*.md")}
+    assert pages - linked == {"README.md", "package.md"}  # the latter is the wheel's
+
+
 if __name__ == "__main__":
-    lines = [f"{room}: {name}\n" for room in ROOMS for name in public_names(room)]
+    names = {room: sorted(importlib.import_module(room).__all__) for room in ROOMS}
+    lines = [f"{room}: {name}\n" for room, listed in names.items() for name in listed]
     LIST.write_text("".join(lines), encoding="utf-8")

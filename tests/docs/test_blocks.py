@@ -1,0 +1,145 @@
+"""Code, commands and TOML of the documents, run with installed packages."""
+
+import contextlib
+import dataclasses
+import importlib
+import re
+import shlex
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import typer
+from typer.main import get_command
+
+from me2e_compress.cli.app import LazyGroup, app
+from me2e_compress.errors import GraphError
+from me2e_compress.registry import Registry
+from me2e_compress.testing import check_form
+from me2e_compress.workflows import listing
+from tests.docs.conftest import run
+from tests.docs.pages import EXAMPLE, PAGES, ROOT, WRITING, Block, blocks
+
+pytestmark = pytest.mark.xdist_group("installed")
+# the script of engine-dumps runs where an engine does; it has a test of its own
+CODE = [p for p in PAGES if blocks(p, "python") and p.stem != "engine-dumps"]
+
+BEFORE = {
+    "cameras": """
+from me2e_compress.simulator.routes import load_routes
+from me2e_compress.simulator.world import World
+world = World(load_routes()[0])
+""",
+    "driver": f"""
+import sys, types
+sys.path.append({str(ROOT)!r})  # it is no part of the package
+from models.driver import course
+won = types.SimpleNamespace(driver="driver.onnx", scores=types.SimpleNamespace())
+won.scores.driving_score = 0.0
+course.run = lambda asked, folder, workers: (won,)  # days of work
+""",
+}
+"""What a page takes for granted: a world to look at; not to train for days."""
+
+
+def entry_points(text: str) -> dict[str, dict[str, str]]:
+    """Read the additions that a project file names, by group."""
+    found: dict[str, dict[str, str]] = tomllib.loads(text)["project"]["entry-points"]
+    return found
+
+
+ADDED = entry_points((EXAMPLE / "pyproject.toml").read_text(encoding="utf-8"))
+writing = pytest.mark.parametrize("page", WRITING, ids=lambda page: page.stem)
+
+
+@pytest.mark.parametrize("page", CODE, ids=lambda page: page.stem)
+def test_the_code_of_a_page_runs(page: Path, folder: Path, site: Path) -> None:
+    code = "".join(block.text for block in blocks(page, "python"))
+    (folder / "page.py").write_text(BEFORE.get(page.stem, "") + code)
+    if page in WRITING:
+        run([sys.executable, "-W", "error", "page.py"], folder, site)
+    else:
+        cells = "exec(open('page.py', encoding='utf-8').read())"  # has no main guard
+        run([sys.executable, "-c", cells], folder, site)
+
+
+@writing
+def test_the_commands_of_a_page_run(page: Path, folder: Path, site: Path) -> None:
+    for block in blocks(page, "sh"):
+        assert run(["bash", "-e", "-c", block.text], folder, site)
+
+
+@pytest.mark.parametrize(
+    "block",
+    [block for page in PAGES for block in blocks(page, "toml")],
+    ids=lambda block: block.text.splitlines()[0][:30],
+)
+def test_toml_is_toml(block: Block) -> None:
+    assert tomllib.loads(block.text)
+
+
+def commands() -> list[str]:
+    """List every command line of the documents, continued lines joined."""
+    found = []
+    for page in PAGES:
+        for block in blocks(page, "", "sh", "console"):
+            text = block.text.replace("\\\n", " ")
+            found += re.findall(r"^(?:\$ )?(me2e-compress .*)$", text, re.MULTILINE)
+        found += re.findall(r"`(me2e-compress [^`]+)`", page.read_text("utf-8"))
+    return list(dict.fromkeys(found))
+
+
+@pytest.mark.parametrize("line", commands())
+def test_a_command_of_the_documents_is_one(line: str) -> None:
+    """Its options exist and its values are of their types; nothing is run."""
+    words = shlex.split(re.split(r"\s{3,}", line)[0], comments=True)[1:]
+    group = get_command(app)
+    assert isinstance(group, LazyGroup)
+    name, command, rest = group.resolve_command(typer.Context(group), words)
+    if rest and "..." not in line and "…" not in line:
+        with contextlib.suppress(GraphError):  # the model is not there
+            command.make_context(name, rest)
+
+
+@writing
+def test_the_example_package_is_what_the_page_shows_or_names(page: Path) -> None:
+    shown = [block for block in blocks(page, "python") if block.file]
+    named = re.findall(r"\.\./(examples/third_party/\w+/\w+\.py)", page.read_text())
+    assert shown or named
+    assert all((ROOT / each).is_file() for each in named)
+    for block in shown:
+        assert block.body == (EXAMPLE / str(block.file)).read_text(encoding="utf-8")
+    for block in blocks(page, "toml"):
+        for group, names in entry_points(block.text).items():
+            assert names == ADDED[group]
+
+
+def test_every_addition_of_the_example_is_listed(folder: Path, site: Path) -> None:
+    listed = run(["me2e-compress", "list"], folder, site)
+    names = [name for group in ADDED.values() for name in group]
+    assert [name for name in names if not re.search(rf"\b{name}\b", listed)] == []
+
+
+@pytest.mark.parametrize(
+    ("group", "where"),
+    [(group, where) for group, names in ADDED.items() for where in names.values()],
+)
+def test_every_addition_of_the_example_has_the_form_of_ours(
+    group: str, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLE)
+    module, _, name = where.partition(":")
+    added = getattr(importlib.import_module(module), name)
+    needed = {
+        each.name: Path("rides")
+        for each in dataclasses.fields(added)
+        if each.default is dataclasses.MISSING
+        and each.default_factory is dataclasses.MISSING
+    }
+    (registry,) = (
+        each
+        for each in vars(listing).values()
+        if isinstance(each, Registry) and each.group == group
+    )
+    check_form(added(**needed), registry)
