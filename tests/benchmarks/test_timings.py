@@ -1,0 +1,279 @@
+"""What is timed answers right; what is missing is said, and what is done is kept."""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+import torch
+
+from benchmarks import bench_gpu, bench_uniad, run_on_provider
+from benchmarks.bench_energy import COUNTER, FRAMES_MS, conditions, held
+from benchmarks.bench_gpu import ROWS, Bench, provider_or_reason
+from benchmarks.bench_int8_shapes import FORMS as INT8_FORMS
+from benchmarks.bench_int8_shapes import Convolution, product, session
+from benchmarks.bench_levers import LEVERS, Feeds, Lever, first_frame, measured, opened
+from benchmarks.bench_runtime import Row, table
+from benchmarks.gpu_table import Found
+from benchmarks.gpu_table import table as gpu_table
+from benchmarks.original_patterns import FORMS, restored
+from benchmarks.runtime_files import ENTRIES, REFERENCE, TORCH, made, static
+from benchmarks.subject import Subject
+from me2e_compress.runtime.energy.energy_counter import EnergySchedule
+from me2e_compress.runtime.energy.energy_result import Absent
+from me2e_compress.runtime.providers import (
+    CPU,
+    CpuProvider,
+    Provider,
+    TensorRtProvider,
+)
+from models.stacks import UNIAD_TINY
+from models.tests.vad.sizes import SIZES
+from models.vad.stack import VadTiny
+from tests.frames import record
+from tests.nets import save_text
+
+
+@pytest.fixture
+def given() -> argparse.Namespace:
+    words: dict[str, Any] = {"plugins": [], "dialect": "tensorrt", "energy": False}
+    return argparse.Namespace(runs=6, seconds=60, warm_up=1, threads=1, **words)
+
+
+@pytest.fixture
+def subject(tmp_path: Path) -> Subject:
+    """A small graph in the place of the driver."""
+    found = Subject("highway", tmp_path / "highway")
+    found.folder.mkdir()
+    save_text(
+        found.source,
+        "m (float[1,4] x, float[1,4] prev_x) => (float[1,4] plan, float[1,4] next_x)"
+        " { plan = Add(x, prev_x) next_x = Identity(plan) }",
+    )
+    record(found.held_out, [{"x": np.ones((1, 4), np.float32)}])
+    return found
+
+
+def test_a_row_is_measured_once(
+    subject: Subject, given: argparse.Namespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = Bench(subject, 1, given).found(CPU, REFERENCE, ROWS[REFERENCE])
+    monkeypatch.setattr(subprocess, "run", None)
+
+    assert Bench(subject, 1, given).found(CPU, REFERENCE, ROWS[REFERENCE]) == first
+    assert len(first.measured["wall_s"]) == 6
+    assert first.measured["sqnr_db"] == {"plan": None, "next_x": None}
+    assert first.measured["gpu_reason"] == "runs on the CPU"
+    *_, line, _, _, joules = gpu_table([first]).splitlines()
+    assert joules == "J/frame, cpu: not asked."
+    cells = line.split("|")
+    assert [each.strip() for each in cells[-4:-1]] == ["∞", "∞", "-"]
+
+
+def test_a_provider_that_is_missing_is_a_row_that_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(ort, "get_available_providers", lambda: [CpuProvider.native])
+
+    reason = provider_or_reason("tensorrt")
+
+    assert isinstance(reason, str)
+    shown = gpu_table([Found("highway", "tensorrt", "every file", reason)])
+    assert "pip install onnxruntime-gpu, and TensorRT 10" in shown
+
+
+@pytest.mark.parametrize(
+    ("provider", "name", "reason"),
+    [
+        (TensorRtProvider(), "fused, as plugins", "needs --plugins LIB"),
+        (CPU, "exact", "not made: a pass refused it"),
+    ],
+)
+def test_a_file_that_cannot_be_made_is_a_row(
+    subject: Subject,
+    given: argparse.Namespace,
+    monkeypatch: pytest.MonkeyPatch,
+    provider: Provider,
+    name: str,
+    reason: str,
+) -> None:
+    monkeypatch.setattr(bench_gpu, "made", lambda *words: "a pass refused it")
+
+    found = Bench(subject, 1, given).found(provider, name, ROWS[name])
+
+    assert found.reason.startswith(reason)
+
+
+MISSING = "examples/energy_counters is not installed"
+
+
+@pytest.mark.parametrize(
+    ("provider", "reason"),
+    [
+        (CPU, f"rapl: {MISSING}"),
+        (TensorRtProvider(device=1), f"nvml:1 is silent; ina3221: {MISSING}"),
+    ],
+)
+def test_energy_is_that_of_the_device_which_runs(
+    provider: Provider, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        run_on_provider, "open_counter", lambda name: Absent(f"{name} is silent")
+    )
+
+    assert run_on_provider.energy(lambda: None, provider).reason == reason
+
+
+@pytest.mark.slow
+def test_the_driver_on_the_cpu(tmp_path: Path) -> None:
+    words = "--providers cpu --subjects highway --frames 2 --runs 5 --warm-up 1"
+    command = [sys.executable, "-m", "benchmarks.bench_gpu", tmp_path, "--no-energy"]
+
+    subprocess.run([*command, *words.split()], check=True, capture_output=True)
+
+    rows = json.loads((tmp_path / "results.json").read_text())["rows"]
+    names = [name for name, row in ROWS.items() if not row.on]
+    assert [(each["name"], each["reason"]) for each in rows] == [(n, "") for n in names]
+    assert "## highway" in (tmp_path / "table.md").read_text()
+
+
+def test_intervals_of_energy_hold_the_truth() -> None:
+    """Of two thousand measurements on simulated counters, but for frames of 5 ms."""
+    frames = [frame_ms for frame_ms in FRAMES_MS if frame_ms > 5]
+    found = [
+        held(load, COUNTER, EnergySchedule(windows=8), simulations=84, seed=seed)
+        for seed, (_, _, load) in enumerate(conditions(frames))
+    ]
+
+    assert sum(each.simulations for each in found) >= 2_000
+    assert 0.93 <= np.mean([each.taken for each in found]) <= 0.98
+    assert 0.93 <= np.mean([each.mean for each in found]) <= 0.98
+    assert min(each.taken for each in found) >= 0.87  # 84 of 95 %: 3 deviations
+    assert np.median([each.width for each in found]) <= 0.1
+
+
+def test_layers_run_in_every_form_with_their_own_macs() -> None:
+    layer = Convolution("strided", 2, 6, 4, 8, 16, kernel=3, stride=2)
+    pixels = np.ones((2, 6, 4, 8), np.uint8)
+
+    found: Any = session(layer.text(), (16, 8, 3, 3), 0).run(None, {"x": pixels})[0]
+
+    assert found.shape == (2, 3, 2, 16)
+    assert layer.macs == found.size * 8 * 9
+    for form in INT8_FORMS:
+        rows = np.ones((5, 8), np.uint8)
+        answer: Any = product(form, 5, (8, 16)).run(None, {"x": rows})[0]
+        assert answer.shape == (5, 16)
+
+
+def test_every_lever_answers_as_none_does(tmp_path: Path) -> None:
+    model = save_text(
+        tmp_path / "m.onnx",
+        """m (float[1,2,4] x, float[1,2,4] prev_x)
+            => (float[1,2,4] y, float[1,2,4] next_x) <float[4] s = {1, 2, 3, 4}> {
+        a = Add(x, prev_x) y = LayerNormalization(a, s, s) next_x = Identity(a) }""",
+    )
+
+    def answer(feeds: Feeds, lever: Lever) -> Any:
+        return opened(model, 1, lever).run(["y"], dict(feeds))[0]
+
+    x = np.ones((1, 2, 4), np.float32)
+    feeds = first_frame(model, record(tmp_path / "frames", [{"x": x}]))
+    assert not feeds["prev_x"].any()  # the state of a first frame
+    taken = measured(model, feeds, LEVERS["IO binding"], threads=1, rounds=1)
+    assert all(each.run >= 0 for each in taken)
+    feeds = {"x": x, "prev_x": x}
+    for lever in LEVERS.values():
+        assert np.allclose(answer(feeds, Lever()), answer(feeds, lever), atol=1e-5)
+
+
+def test_files_of_constant_matrices_are_made_of_the_folded_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran = list[list[str]]()
+
+    def noted(command: list[str], **_: object) -> object:
+        ran.append(command)
+        at = command.index("-o") + 1 if "-o" in command else -1
+        Path(command[at]).touch()
+        return SimpleNamespace(returncode=0, stderr="")
+
+    monkeypatch.setattr(subprocess, "run", noted)
+    frozen = static(ENTRIES)
+
+    assert [n for n in ENTRIES if frozen[n] == ENTRIES[n]] == [
+        name for name, entry in ENTRIES.items() if entry.engine in TORCH
+    ]
+    subject = Subject("vad-tiny", tmp_path)
+    assert made(subject, frozen["onnxsim + onnxruntime"], 1) is None
+    folded, simplified = ran
+    assert "import-normalize,freeze-inputs,fold-constants" in folded
+    assert simplified[-2:] == [
+        str(tmp_path / name) for name in ("static-source.onnx", "static-onnxsim.onnx")
+    ]
+
+
+def test_the_table_compares_with_the_first_row() -> None:
+    ours = Row([1.0, 2.0], [0.5], 900.0, {"ego_fut_preds": 30.0, "bev": 20.0})
+    eager = Row([10.0, 9.0], [5.0], 1700.0, {"ego_fut_preds": 99.0, "bev": 99.0})
+
+    rows = {"PyTorch, eager": eager, "ours": ours}
+    line = table(rows, {"ours": 0.4}, "ego_fut_preds").splitlines()[-1]
+
+    assert line.split(" | ")[1:4] == ["1.00", "1.50", "9.00"]
+    assert line.endswith("20.0 | 30.0 | 40% |")
+
+
+def test_frames_that_uniad_has_run_are_kept_on_request_and_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran = list[bench_uniad.Outputs]()
+
+    def runtime(feeds: bench_uniad.Outputs) -> bench_uniad.Outputs:
+        ran.append(feeds)
+        seen = np.float32(feeds["timestamp"].item())
+        return dict.fromkeys(UNIAD_TINY.outputs, np.array([seen]))
+
+    def drive(frames: int, name: str, *, resume: bool) -> int:
+        words = {"out": tmp_path, "frames": frames, "resume": resume}
+        given = argparse.Namespace(stack=UNIAD_TINY.name, **words)
+        before = len(ran)
+        bench_uniad.drive(given, name, runtime)
+        return len(ran) - before
+
+    def frames(_: object, count: int) -> list[bench_uniad.Outputs]:
+        return [{"timestamp": np.array([each + 1.0])} for each in range(count)]
+
+    monkeypatch.setattr(bench_uniad, "_frames", frames)
+
+    assert drive(2, "torch", resume=True) == 2
+    drive(3, "onnxruntime", resume=True)
+    said = bench_uniad.errors_of(tmp_path, UNIAD_TINY, 3)  # as far as both have run
+    assert [(each["frame"], each["error"]) for each in said] == [(0, 0.0), (1, 0.0)]
+    assert drive(5, "torch", resume=True) == 3
+    assert drive(5, "torch", resume=False) == 5
+
+
+def test_the_forms_of_the_original_compute_what_those_of_models_do() -> None:
+    size = SIZES["small"]
+    draws = torch.Generator().manual_seed(0)
+    model = VadTiny("nuscenes", "operator", size.config).requires_grad_(False).eval()
+    for weight in model.parameters():
+        weight.normal_(0.0, 0.1, generator=draws)
+    img, lidar2img, can_bus, bev = (
+        torch.randn(shape, generator=draws) for shape in size.stack.inputs.values()
+    )
+    lidar2img = torch.eye(4) + lidar2img / 10  # some pillars are seen
+    inputs = img, lidar2img, can_bus, bev
+    with torch.no_grad():
+        wanted = model(*inputs)
+        found = restored(model)(*inputs)
+    assert set(map(type, model.modules())) >= set(FORMS.values())
+    for name, one, two in zip(size.stack.outputs, wanted, found, strict=True):
+        assert (one - two).abs().max() < 1e-4 * one.abs().max(), name

@@ -1,0 +1,275 @@
+"""Tools of the project: mutations of the code, files entered, files written."""
+
+import hashlib
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import seven_nodes, written_files
+from benchmarks.files_entered import Entered
+from benchmarks.masks import MASKS, Mask, masked, masked_name
+from benchmarks.mutate import Fate, main, run, table
+from benchmarks.mutations import mutations
+from benchmarks.written_files import differences, manifest
+from tests.command import Cli, cli, command
+
+__all__ = ["cli", "command"]
+
+
+@pytest.mark.parametrize(
+    ("source", "changed"),
+    [
+        ("a = b < c", ["a = (b <= c)"]),
+        ("a = b is None", ["a = (b is not None)"]),
+        ("a = b and c and d", ["a = (b or c or d)"]),
+        ("a = b + c * d", ["a = (b - c * d)", "a = b + (c / d)"]),
+        ("a = 'text' + b", []),
+        ("a = f'{b + 1}'", []),
+        ("a: Literal[1] = True", ["a: Literal[1] = (False)"]),
+        ("a = 2.5, None, ''", ["a = (6.0), None, ''"]),
+        ("if TYPE_CHECKING:\n    a = 1", []),
+        ("if a == b:\n    c()", ["if (a != b):\n    c()", "if a == b:\n    pass"]),
+        ("a = b if c else d", ["a = b if (not (c)) else d"]),
+        ("a = [b for b in c if b]", ["a = [b for b in c if (not (b))]"]),
+        ("assert a > 1", []),
+        ("def f():\n    '''1 < 2'''\n    return a, b, 'µ'",
+         ["def f():\n    '''1 < 2'''\n    return (b, a, 'µ')"]),
+        ("def f():\n    return a, a", []),
+        ("a.b = c\nd = e\ndel a[f]", ["pass\nd = e\ndel a[f]", "a.b = c\nd = e\npass"]),
+        ("a -= b", ["pass"]),
+        ("'µ' if a(\n) else 1; b = 1",
+         ["'µ' if (not (a())\n) else 1; b = 1", "'µ' if a(\n) else (2); b = 1",
+          "'µ' if a(\n) else 1; b = (2)"]),
+    ],
+)  # fmt: skip
+def test_every_single_change(source: str, changed: list[str]) -> None:
+    raw = source.encode()
+    assert [m.applied(raw).decode() for m in mutations(Path("a.py"), raw)] == changed
+
+
+@pytest.fixture
+def toy(tmp_path: Path) -> Path:
+    """A file of a package; its test, of one room, looks at one side of a border."""
+    file, test = tmp_path / "toy/room/sign.py", tmp_path / "tests/room/test_sign.py"
+    file.parent.mkdir(parents=True)
+    test.parent.mkdir(parents=True)
+    file.write_text("def positive(x):\n    return x > 0\n")
+    test.write_text(
+        "from toy.room.sign import positive\n\n"
+        "def test_one():\n    assert positive(1) and not positive(-1)\n"
+    )
+    return file
+
+
+WORDS = ("room", "--seed", "1", "--package", "toy")
+
+
+def test_what_survives_is_told(
+    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = toy.read_bytes()
+
+    main(WORDS, tmp_path)
+
+    assert capsys.readouterr().out.splitlines() == [
+        "survived   toy/room/sign.py:2: x > 0  ->  x >= 0",
+        "killed     toy/room/sign.py:2: 0  ->  1",
+        "",
+        "room, seed 1",
+        "survived   toy/room/sign.py:2: x > 0  ->  x >= 0",
+        "2 changes: killed 1, survived 1, timed out 0; 50 % killed",
+    ]
+    assert toy.read_bytes() == before
+
+
+def test_tests_that_fail_anyway_or_are_not_there_prove_nothing(
+    toy: Path, tmp_path: Path
+) -> None:
+    toy.write_text("def positive(x):\n    return x\n")
+    with pytest.raises(SystemExit, match="tests/room: fails without any change"):
+        main(WORDS, tmp_path)
+    (tmp_path / "tests/room/test_sign.py").unlink()
+    with pytest.raises(SystemExit, match="tests/room: no tests"):
+        main(WORDS, tmp_path)
+
+
+def test_what_takes_too_long_is_ended(tmp_path: Path) -> None:
+    with pytest.raises(subprocess.TimeoutExpired):
+        run((sys.executable, "-c", "while True: pass"), tmp_path, 0.2, {})
+
+
+def test_the_table_ends_with_the_share() -> None:
+    (change,) = mutations(Path("a.py"), b"a = 1")
+
+    assert list(table([(change, Fate.KILLED)] * 3 + [(change, Fate.TIMED_OUT)])) == [
+        "timed out  a.py:1: 1  ->  2",
+        "4 changes: killed 3, survived 0, timed out 1; 75 % killed",
+    ]
+
+
+TRIP = {
+    "__init__": "",
+    "called": """
+import trip.imported
+
+def run():
+    return list(map(lambda x: x, trip.imported.NUMBERS))
+""",
+    "imported": """
+def count():
+    return [0, 1]
+
+class Body:
+    x = count()
+
+NUMBERS = count()
+""",
+}
+"""A package of two files, one of which is only imported."""
+
+
+def test_functions_that_ran_count_and_files_executed_at_import_are_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "trip"
+    package.mkdir()
+    for name, text in TRIP.items():
+        (package / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    entered = Entered(package)
+
+    entered.during(lambda: importlib.import_module("trip.called").run())
+
+    for name in ("trip", "trip.called", "trip.imported"):
+        del sys.modules[name]
+    assert entered.functions() == {Path("called.py"): 2}
+    assert {path.stem for path in entered.imported} == TRIP.keys()
+
+
+def compressed(cli: Cli, name: str, frames: int) -> dict[str, str]:
+    """Compress the seven nodes in a new folder; give the manifest of it."""
+    folder = cli.folder / name
+    folder.mkdir()
+    seven_nodes.write_model(folder / "m.onnx")
+    seven_nodes.write_frames(folder / "frames", frames)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        options = "-r full --target tensorrt --frames frames -o o.onnx"
+        cli.done(f"compress m.onnx {options}")
+    return manifest(folder, Path(written_files.__file__).parents[1] / "me2e_compress")
+
+
+def test_the_same_run_writes_the_same_files_and_one_more_frame_shows(cli: Cli) -> None:
+    before, same, more = (
+        compressed(cli, name, frames) for name, frames in (("a", 2), ("b", 2), ("c", 3))
+    )
+    assert differences(before, same) == []
+    assert differences(before, more) == [
+        "new      frames/000002.npz",
+        "changed  o.onnx",
+        "changed  o.report.json",
+    ]
+
+
+def test_compare_lists_what_differs_and_fails(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, after = tmp_path / "a.json", tmp_path / "b.json"
+    before.write_text(json.dumps({"gone": "1", "same": "2", "other": "3"}))
+    after.write_text(json.dumps({"new": "1", "same": "2", "other": "4"}))
+
+    assert written_files.main(["compare", str(before), str(before)]) == 0
+    capsys.readouterr()
+    assert written_files.main(["compare", str(before), str(after)]) == 1
+    assert capsys.readouterr().out.splitlines() == [
+        "gone     gone",
+        "new      new",
+        "changed  other",
+        "3 of 4 files differ",
+    ]
+
+
+PACKAGE = Path("/somewhere/me2e_compress")
+KEPT_MODEL = "out/models/full.0123456789abcdef.report.json"
+VARY = [
+    ("o.report.json", '"seconds": 0.25,', '"seconds": 1.5e-05,'),
+    ("expert.log", '"seconds": 4.387, "a": 1', '"seconds": 12, "a": 1'),
+    ("expert.log", '"memory_mb": 302.9', '"memory_mb": 98'),
+    ("o.report.json", '"onnx-ir": "1.0.2"', '"onnx-ir": "1.1.0rc1"'),
+    ("out/study.json", '"python": "3.11.7"', '"python": "3.13.0"'),
+    ("expert/evaluation.json", '"version": "0.1.0"', '"version": "0.2.0"'),
+    ("r.html", "<dt>Versions</dt><dd>onnx 1.2", "<dt>Versions</dt><dd>onnx 1.3"),
+    ("out/study.json", '"machine": "Orin"', '"machine": "EPYC, 2 threads"'),
+    ("r.html", "<dt>Machine</dt><dd>Orin</dd>", "<dt>Machine</dt><dd>EPYC</dd>"),
+    (KEPT_MODEL, '"file": "full.0123456789abcdef.onnx"',
+     '"file": "full.89abcdef01234567.onnx"'),
+    ("out/study.json", f'"policy": "{PACKAGE}/shipped/weights/highway.onnx"',
+     f'"policy": "{PACKAGE}/weights/highway.onnx"'),
+]  # fmt: skip
+"""File, and two texts of it that are the same to us."""
+
+TELL = [
+    ("o.report.json", '"seconds": 0.25', '"seconds": null'),
+    ("o.report.json", '"seconds": 0.25', '"seconds":  0.25'),
+    ("o.report.json", '"changes": 3', '"changes": 4'),
+    ("o.report.json", '"file": "a.onnx"', '"file": "b.onnx"'),
+    ("o.report.json", '"onnx": "1.0"', '"onnx": "not installed as a package"'),
+    ("o.plan.json", '"version": "1"', '"version": "2"'),
+    ("expert/routes/A_0.json", '"seconds": 1.0', '"seconds": 2.0'),
+    ("expert.log", '"decisions": 151', '"decisions": 152'),
+    ("out/study.json", '"p50": {"value": 120.0', '"p50": {"value": 121.0'),
+    ("out/study.json", '"policy": "/a/highway.onnx"', '"policy": "/b/highway.onnx"'),
+    ("r.html", "<dt>Seed</dt><dd>0</dd>", "<dt>Seed</dt><dd>1</dd>"),
+    ("tables.md", "| float | 100.0 |", "| float | 99.9 |"),
+    ("o.onnx", '"seconds": 1.0', '"seconds": 2.0'),
+]
+"""File, and two texts of it that differ."""
+
+
+def seen(folder: Path, file: str, text: str) -> bytes:
+    path = folder / file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return masked(folder, file, PACKAGE)
+
+
+@pytest.mark.parametrize(
+    ("same", "file", "one", "other"),
+    [*((True, *each) for each in VARY), *((False, *each) for each in TELL)],
+)
+def test_clock_versions_machine_and_paths_are_hidden_and_all_else_shows(
+    tmp_path: Path, same: bool, file: str, one: str, other: str
+) -> None:
+    assert (seen(tmp_path, file, one) == seen(tmp_path, file, other)) is same
+
+
+@pytest.mark.parametrize("mask", MASKS, ids=lambda mask: f"{mask.name} {mask.files}")
+def test_a_mask_has_an_example(mask: Mask) -> None:
+    assert any(mask.hide(file, one) != one for file, one, _ in VARY)
+
+
+def route(folder: Path, version: str, fingerprint: str | None = None) -> bytes:
+    """Write an evaluation and a route of it, sealed unless a fingerprint is given."""
+    made_by = {"version": version, "policy": "expert"}
+    seal = hashlib.sha256(json.dumps(made_by, sort_keys=True).encode()).hexdigest()
+    seen(folder, "expert/evaluation.json", json.dumps(made_by))
+    text = json.dumps({"fingerprint": fingerprint or seal, "episode": {}})
+    return seen(folder, "expert/routes/A_0.json", text)
+
+
+def test_the_seal_of_a_route_follows_the_version_and_a_wrong_one_shows(
+    tmp_path: Path,
+) -> None:
+    right = route(tmp_path, "0.1.0")
+    assert right == route(tmp_path, "0.2.0")
+    assert right != route(tmp_path, "0.1.0", "0" * 64)
+
+
+def test_the_key_of_a_studys_model_is_hidden_in_its_name_alone() -> None:
+    assert masked_name(KEPT_MODEL) == "out/models/full.<key>.report.json"
+    other = "out/results/full.0123456789abcdef.json"
+    assert masked_name(other) == other
