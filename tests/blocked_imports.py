@@ -9,93 +9,62 @@ be had, and what `--help` of every command ends with: its exit code, and the tex
 
 import contextlib
 import importlib
-import importlib.abc
-import importlib.machinery
 import io
 import json
 import os
 import pkgutil
 import sys
 import tempfile
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection
 from pathlib import Path
 from types import ModuleType
 
 
-class NotInstalled(importlib.abc.MetaPathFinder):
-    """Finds nothing below some names, as if they had never been installed."""
-
-    def __init__(self, theirs: object, gone: Collection[str]) -> None:
-        self.theirs, self.gone = theirs, frozenset(gone)
-
-    def find_spec(
-        self,
-        fullname: str,
-        path: Sequence[str] | None,
-        target: ModuleType | None = None,
-    ) -> importlib.machinery.ModuleSpec | None:
-        """Ask the finder in whose place this one stands, unless the name is gone."""
-        if fullname.partition(".")[0] in self.gone:
-            return None
-        found: importlib.machinery.ModuleSpec | None = self.theirs.find_spec(  # type: ignore[attr-defined]
-            fullname, path, target
-        )
-        return found
-
-    def __getattr__(self, name: str) -> object:
-        """Be the other finder in all else: metadata of packages is found by it."""
-        return getattr(self.theirs, name)
+def error_of(action: Callable[[], object]) -> str:
+    """Say how an action fails, whatever it is: the test names it; empty if it works."""
+    try:
+        action()
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return ""
 
 
-def unimportable(package: ModuleType) -> Iterator[tuple[str, str]]:
-    """Import every module below a package; yield those that fail, and how."""
+def unimportable(package: ModuleType) -> dict[str, str]:
+    """Import every module below a package; return those that fail, and how."""
+    found = dict[str, str]()
     for each in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
         if each.name.endswith("__main__"):
             continue
-        try:
-            module = importlib.import_module(each.name)
-        except Exception as error:  # whatever it is, the test names it
-            yield each.name, f"{type(error).__name__}: {error}"
-            continue
-        if each.ispkg:
-            yield from unimportable(module)
-
-
-def unusable(package: ModuleType) -> Iterator[tuple[str, str]]:
-    """Ask for every public name; yield those that cannot be had, and why."""
-    for name in package.__all__:
-        try:
-            getattr(package, name)
-        except Exception as error:  # whatever it is, the test names it
-            yield name, f"{type(error).__name__}: {error}"
+        if error := error_of(lambda name=each.name: importlib.import_module(name)):
+            found[each.name] = error
+        elif each.ispkg:
+            found |= unimportable(sys.modules[each.name])
+    return found
 
 
 def helped(command: str) -> tuple[int, str]:
     """Ask a command for its options."""
     from me2e_compress.cli import main
 
-    said = io.StringIO()
+    said, codes = io.StringIO(), list[int]()
     sys.argv = ["me2e-compress", command, "--help"]
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-        try:
-            code = main()
-        except Exception as error:  # whatever it is, the test names it
-            return 1, f"{type(error).__name__}: {error}"
-    return code, said.getvalue()
+        error = error_of(lambda: codes.append(main()))
+    return (1, error) if error else (codes[0], said.getvalue())
 
 
-def found(gone: Collection[str]) -> dict[str, object]:
-    """Look for what fails without some modules."""
+def failures(gone: Collection[str]) -> dict[str, object]:
+    """Look for what fails without some modules, as if they were not installed."""
     for name in [each for each in sys.modules if each.partition(".")[0] in gone]:
         del sys.modules[name]  # a base package takes it where it is there
-    sys.meta_path[:] = [NotInstalled(each, gone) for each in sys.meta_path]
+    sys.modules |= dict.fromkeys(gone)  # type: ignore[arg-type]  # None: not to be had
     package = importlib.import_module("me2e_compress")
     app = importlib.import_module("me2e_compress.cli.app")
-    helps = {command: helped(command) for command in app.COMMANDS}
+    names = {n: error_of(lambda n=n: getattr(package, n)) for n in package.__all__}
     return {
-        "modules": dict(unimportable(package)),
-        "help": helps,
-        "names": dict(unusable(package)),
+        "help": {command: helped(command) for command in app.COMMANDS},
+        "modules": unimportable(package),
+        "names": {name: error for name, error in names.items() if error},
     }
 
 
@@ -113,7 +82,7 @@ def main() -> None:
         for name, gone in cases.items():
             answer = Path(folder) / name
             if (child := os.fork()) == 0:
-                answer.write_text(json.dumps(found(gone)))
+                answer.write_text(json.dumps(failures(gone)))
                 os._exit(0)
             os.waitpid(child, 0)
             answers[name] = json.loads(answer.read_text())

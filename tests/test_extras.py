@@ -1,15 +1,22 @@
-"""What is said where an extra is not installed, or only half."""
+"""What is there, and what is said, where an extra is not installed or only half."""
 
+import json
 import pickle
 import re
 import subprocess
 import sys
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Iterator, Mapping
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires
 from pathlib import Path
+from typing import Any
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from me2e_compress.cli import main
+from me2e_compress.cli.app import COMMANDS
 from me2e_compress.errors import (
     BrokenPackageError,
     MissingExtraError,
@@ -18,6 +25,129 @@ from me2e_compress.errors import (
 from me2e_compress.extras import MODULES, explained, need_extra
 
 ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+EXTRAS: Mapping[str, list[str]] = PROJECT["optional-dependencies"]
+TOOLS = ("bench", "docs", "test")
+"""Extras whose own packages no module of ours imports: they are blocked together."""
+ALL, EVERY_TOOL = "all at once", "+".join(TOOLS)
+
+ROOMS: Mapping[str, tuple[str, ...]] = {
+    "highway": ("evaluators.highway", "simulator", "study", "workflows.latency_figure"),
+    "fast": ("operators.kernels",),
+    "trt-check": ("targets.tensorrt.rtx.rtx_main",),
+}
+"""Rooms, or modules, in which something cannot be imported without an extra."""
+
+
+def distributions(wanted: Iterator[Requirement]) -> set[str]:
+    """Return the packages that some requirements bring, with all that those need."""
+    found, ahead = set[tuple[str, str]](), list(wanted)
+    while ahead:
+        each = ahead.pop()
+        name = canonicalize_name(each.name)
+        for extra in ("", *each.extras):
+            if (name, extra) in found:
+                continue
+            found.add((name, extra))
+            try:
+                needs = requires(name) or []
+            except PackageNotFoundError:
+                continue
+            ahead += [
+                need
+                for need in map(Requirement, needs)
+                if need.marker is None or need.marker.evaluate({"extra": extra})
+            ]
+    return {name for name, _ in found}
+
+
+def modules_of(packages: set[str]) -> set[str]:
+    """Return what packages are imported as; of one that is not there, its name."""
+    homes = packages_distributions()
+    known = {canonicalize_name(name) for names in homes.values() for name in names}
+    imported = {
+        module
+        for module, names in homes.items()
+        if packages & {canonicalize_name(name) for name in names}
+    }
+    return imported | {name.replace("-", "_") for name in packages - known}
+
+
+def blocked() -> dict[str, list[str]]:
+    """Return the modules that are missing without each extra, and without any.
+
+    Without one it is what the extra names, and what none of the others needs.
+    """
+    needs = {extra: list(map(Requirement, listed)) for extra, listed in EXTRAS.items()}
+    base = distributions(map(Requirement, PROJECT["dependencies"]))
+    closed = {extra: distributions(iter(listed)) for extra, listed in needs.items()}
+    gone = dict[str, list[str]]()
+    for extra in [each for each in needs if each not in TOOLS]:
+        named = {canonicalize_name(each.name) for each in needs[extra]}
+        others = base.union(*(closed[each] for each in closed if each != extra))
+        gone[extra] = sorted(modules_of((closed[extra] - others) | (named - base)))
+    used = base.union(*(closed[each] for each in gone))
+    tools = set[str]().union(*(closed[each] for each in TOOLS))
+    gone[EVERY_TOOL] = sorted(modules_of(tools - used))
+    gone[ALL] = sorted(modules_of(set[str]().union(*closed.values()) - base))
+    return gone
+
+
+CASES = blocked()
+
+
+@pytest.fixture(scope="module")
+def without(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What fails without each extra: modules, public names, `--help` of commands."""
+    cases = tmp_path_factory.mktemp("bare") / "cases.json"
+    cases.write_text(json.dumps(CASES))
+    script = Path(__file__).with_name("blocked_imports.py")
+    done = subprocess.run(
+        [sys.executable, script, cases],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+        env={"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "COLUMNS": "80"},
+    )
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+@pytest.mark.xdist_group("bare")
+@pytest.mark.parametrize("case", CASES)
+def test_without_an_extra_its_rooms_fail_and_nothing_else(
+    without: dict[str, Any], case: str
+) -> None:
+    failing, helps, lacking = (without[case][k] for k in ("modules", "help", "names"))
+    may = {room for extra in ROOMS if case in (extra, ALL) for room in ROOMS[extra]}
+    homes = {
+        name: {room for room in may if f"{name}.".startswith(f"me2e_compress.{room}.")}
+        for name in failing
+    }
+    assert {name: failing[name] for name, home in homes.items() if not home} == {}
+    assert may == set().union(*homes.values())
+    # every command shows its options
+    assert helps.keys() == COMMANDS.keys()
+    assert {n: s for n, (code, s) in helps.items() if code or "--json" not in s} == {}
+    # a public name says what to install
+    assert all(each.startswith("MissingExtraError: ") for each in lacking.values())
+    assert bool(lacking) == (case in ("highway", ALL))
+
+
+def test_modules_of_extras_are_what_the_project_says() -> None:
+    brought = {
+        extra: modules_of({canonicalize_name(Requirement(each).name) for each in needs})
+        for extra, needs in EXTRAS.items()
+    }
+    strangers = {
+        (extra, module)
+        for extra, modules in MODULES.items()
+        for module in modules
+        if module not in brought[extra] and module not in CASES.get(extra, ())
+    }
+    assert strangers == set()
+    assert MODULES.keys() == EXTRAS.keys() - {"docs", "test"}
 
 
 def commands() -> Mapping[str, tuple[str, ...]]:
