@@ -16,17 +16,6 @@ from me2e_compress.quantization.plan.decision import Decision
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frame
 
-COUNT = 400
-"""Nodes of a plan."""
-
-
-def plan() -> QuantPlan:
-    made = (
-        Decision(f"n<{at}>", f"o{at}", "MatMul", "head", "int8", "layer", "it is", ())
-        for at in range(COUNT)
-    )
-    return QuantPlan(QuantScheme("full", ("head",)), tuple(made))
-
 
 def test_a_frame_does_not_show_its_pictures() -> None:
     frame = Frame(3, True, {"img": np.zeros((6, 3, 48, 80), np.float32)})
@@ -35,7 +24,11 @@ def test_a_frame_does_not_show_its_pictures() -> None:
 
 
 def test_a_plan_is_told_by_module_and_rule() -> None:
-    (shown,) = plan().tables()
+    decisions = tuple(
+        Decision(f"n<{at}>", f"o{at}", "MatMul", "head", "int8", "layer", "it is", ())
+        for at in range(400)
+    )
+    (shown,) = QuantPlan(QuantScheme("full", ("head",)), decisions).tables()
 
     assert [cell.text for cell in shown.rows[0]] == ["head", "int8", "layer", "400"]
 

@@ -1,5 +1,6 @@
 """The recipes that take one module from the driver, on a small one like it."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,25 +17,17 @@ from me2e_compress.graph.modules import detect
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.runtime.session import Session, replay
-from tests.stand_in import record_driver, write_model
+from tests.stand_in import OUTPUTS, record_driver, write_model
 
-DROPPED = {
-    "track": ("agents",),
-    "map": ("lanes",),
-    "motion": ("motions",),
-    "occ": ("occupancy",),
+OUTPUT = {
+    "track": "agents",
+    "map": "lanes",
+    "motion": "motions",
+    "occ": "occupancy",
 }
-SCHEMES = {
-    "-".join(names): sum((DROPPED[name] for name in names), ())
-    for names in (
-        *(("map", "motion"), ("occ", "motion"), ("occ", "map")),
-        ("occ", "map", "motion"),
-    )
-}
-OUTPUTS = (
-    *("plan", "agents", "lanes", "motions", "occupancy"),
-    *("prev_bev_out", "prev_memory_out"),
-)
+SCHEMES = (*OUTPUT, "map-motion", "occ-motion", "occ-map", "occ-map-motion")
+
+Without = Callable[[str, int], tuple[ir.Model, CalibrationSet]]
 
 
 @pytest.fixture(scope="module")
@@ -42,74 +35,52 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_model(tmp_path_factory.mktemp("driver") / "m.onnx")
 
 
-def recording(folder: Path, count: int) -> CalibrationSet:
-    return CalibrationSet(record_driver(folder, count))
+@pytest.fixture
+def without(model: Path, tmp_path: Path) -> Without:
+    """Take modules from it by the recipe, after so many frames."""
 
+    def run(modules: str, count: int) -> tuple[ir.Model, CalibrationSet]:
+        frames = CalibrationSet(record_driver(tmp_path / "f", count))
+        loaded = graph.load(model)
+        context = Context(detect(loaded), frames)
+        passes = recipe.load(f"minus-{modules}")
+        return PassManager(passes).run(loaded, context).model, frames
 
-def without(module: str, model: Path, frames: CalibrationSet) -> ir.Model:
-    loaded = graph.load(model)
-    context = Context(detect(loaded), frames)
-    return PassManager(recipe.load(f"minus-{module}")).run(loaded, context).model
-
-
-def plans(
-    model: ir.Model | Path, frames: CalibrationSet
-) -> list[npt.NDArray[np.float32]]:
-    return [
-        np.asarray(found["plan"], np.float32)
-        for found in replay(Session(model), frames, ["plan"])
-    ]
-
-
-@pytest.mark.parametrize("module", DROPPED)
-def test_the_module_is_gone_with_its_outputs(
-    model: Path, tmp_path: Path, module: str
-) -> None:
-    made = without(module, model, recording(tmp_path / "f", 3))
-
-    assert module not in {provenance.module_of(node) for node in made.graph}
-    left = tuple(name for name in OUTPUTS if name not in DROPPED[module])
-    assert tuple(value.name for value in made.graph.outputs) == left
-    inputs, _ = graph.interface(made)
-    assert inputs == graph.interface(graph.load(model))[0]
+    return run
 
 
 @pytest.mark.parametrize("modules", SCHEMES)
-def test_several_modules_go_together(model: Path, tmp_path: Path, modules: str) -> None:
-    made = without(modules, model, recording(tmp_path / "f", 1))
-
-    left = tuple(name for name in OUTPUTS if name not in SCHEMES[modules])
-    assert tuple(value.name for value in made.graph.outputs) == left
-
-
-@pytest.mark.parametrize("module", DROPPED)
-def test_on_the_only_frame_nothing_moves(
-    model: Path, tmp_path: Path, module: str
+def test_modules_are_gone_with_their_outputs(
+    model: Path, without: Without, modules: str
 ) -> None:
-    """The mean over one frame is that frame: the plan must be the same."""
-    frames = recording(tmp_path / "f", 1)
+    made, _ = without(modules, 3)
 
-    (before,), (after,) = (
-        plans(each, frames) for each in (model, without(module, model, frames))
-    )
-    np.testing.assert_allclose(after, before, rtol=1e-5, atol=1e-6)
+    gone = modules.split("-")
+    assert not {provenance.module_of(node) for node in made.graph} & {*gone}
+    left = OUTPUTS.keys() - {OUTPUT[module] for module in gone}
+    assert [v.name for v in made.graph.outputs] == [n for n in OUTPUTS if n in left]
+    assert graph.interface(made)[0] == graph.interface(graph.load(model))[0]
 
 
-@pytest.mark.parametrize("module", DROPPED)
-def test_on_many_frames_the_plan_moves(
-    model: Path, tmp_path: Path, module: str
+def plans(model: ir.Model | Path, frames: CalibrationSet) -> npt.NDArray[np.float32]:
+    answers = replay(Session(model), frames, ["plan"])
+    return np.array([each["plan"] for each in answers], np.float32)
+
+
+@pytest.mark.parametrize(("count", "least", "most"), [(1, 0, 1e-5), (4, 1e-3, 10)])
+@pytest.mark.parametrize("module", OUTPUT)
+def test_the_plan_moves_with_the_frames_the_mean_is_taken_over(
+    model: Path, without: Without, module: str, count: int, least: float, most: float
 ) -> None:
-    frames = recording(tmp_path / "f", 4)
-    before = np.array(plans(model, frames))
-    after = np.array(plans(without(module, model, frames), frames))
+    """The mean over one frame is that frame: there nothing moves."""
+    made, frames = without(module, count)
 
-    assert np.abs(after - before).max() > 1e-3
-    assert np.abs(after - before).max() < 10
+    assert least <= np.abs(plans(made, frames) - plans(model, frames)).max() < most
 
 
-def test_what_is_left_still_drives(model: Path, tmp_path: Path) -> None:
+def test_what_is_left_still_drives(without: Without, tmp_path: Path) -> None:
     path = tmp_path / "minus-occ.onnx"
-    graph.save(without("occ", model, recording(tmp_path / "f", 2)), path)
+    graph.save(without("occ", 2)[0], path)
 
     policy = OnnxPolicy.open(path)
     assert policy.recurrent == {
