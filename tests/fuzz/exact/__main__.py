@@ -5,7 +5,7 @@ import concurrent.futures
 import multiprocessing
 import sys
 
-from tests.fuzz.exact.findings import findings
+from tests.fuzz.exact.judging import findings
 
 TOLD_EVERY = 1000
 

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 
 import onnx
+import pytest
 
 from me2e_compress.manager import recipe
 from me2e_compress.passes import PASSES, Pass, flatten_matmul, hoist_linear, work
@@ -100,6 +101,34 @@ def some_for(model: onnx.ModelProto, seed: int, taken: int = SHORT) -> tuple[str
     return (*found[seed % step :: step], *always)
 
 
+def has_modules(model: onnx.ModelProto) -> bool:
+    """Say whether nodes have paths, by which a map gives them modules."""
+    return any(node.name.startswith("/") for node in model.graph.node)
+
+
+METHODS = ("max-min", "percentile:99.9", "mse")
+SCHEMES = ("full", "full", "feature-ext", "prediction")
+RULES = ("paper", "paper", "safe")
+EACH = 2
+"""How many ways a graph is quantized for each target."""
+
+
+def int8_ways(model: onnx.ModelProto, seed: int) -> Iterator[str]:
+    """Draw how a graph is quantized; schemes go by modules."""
+    draw, named = random.Random(seed), has_modules(model)
+    for target in ("tensorrt", "onnxruntime", "lowered"):
+        for _ in range(EACH):
+            options = {
+                "scheme": draw.choice(SCHEMES) if named else "full",
+                "method": draw.choice(METHODS),
+                "rules": draw.choice(RULES),
+                "target": "onnxruntime" if target == "onnxruntime" else "tensorrt",
+            }
+            given = ", ".join(f"{key}={value}" for key, value in options.items())
+            lowered = ", lower-int8" if target == "lowered" else ""
+            yield f"quantize-int8{{{given}}}{lowered}"
+
+
 @contextlib.contextmanager
 def dear_work() -> Iterator[None]:
     """Let work count a thousandfold for a while.
@@ -113,17 +142,9 @@ def dear_work() -> Iterator[None]:
         if name in (work.__name__, flatten_matmul.__name__)
         or name.startswith(f"{hoist_linear.__name__}.")
     ]
-    before = [
-        (module, name, getattr(module, name))
-        for module in homes
-        for name in PRICES
-        if hasattr(module, name)
-    ]
-    assert before
-    try:
-        for module, name, price in before:
-            setattr(module, name, price / 1000)
+    priced = [(home, name) for home in homes for name in PRICES if hasattr(home, name)]
+    assert priced
+    with pytest.MonkeyPatch.context() as patch:
+        for home, name in priced:
+            patch.setattr(home, name, getattr(home, name) / 1000)
         yield
-    finally:
-        for module, name, price in before:
-            setattr(module, name, price)

@@ -5,10 +5,9 @@ import collections
 import pytest
 
 from me2e_compress.passes import PASSES
-from tests.fuzz.exact import int8
 from tests.fuzz.exact.drawing import MOTIFS, draw, drawing
 from tests.fuzz.exact.judging import Case, judged, report
-from tests.fuzz.exact.pipelines import SLOW, some_for
+from tests.fuzz.exact.pipelines import SLOW, int8_ways, some_for
 
 FIRST, GRAPHS, PARTS = 1000, 200, 4
 SEARCHED = 300
@@ -72,5 +71,6 @@ def test_a_seed_gives_the_same_bytes() -> None:
 @pytest.mark.parametrize("seed", [21, 58, 128, 169])
 def test_int8_keeps_the_graph(seed: int) -> None:
     """Of graphs that have something to quantize, each way."""
-    for found in int8.judged(seed, draw(seed)):
+    model = draw(seed)
+    for found in judged(seed, model, list(int8_ways(model, seed))):
         assert found.kind == "right", found

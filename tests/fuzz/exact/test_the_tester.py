@@ -14,7 +14,7 @@ from numpy import array, float32
 from me2e_compress.graph import provenance
 from me2e_compress.passes import Context, Pass, PassResult
 from tests.fuzz.exact.int8 import StrippingError, stripped
-from tests.fuzz.exact.judging import Case, Kind, judge, shrunk
+from tests.fuzz.exact.judging import Case, Kind, judged, shrunk
 from tests.fuzz.exact.running import RefusedError
 
 TEXT = """
@@ -84,7 +84,8 @@ def test_a_pass_that_is_wrong_is_caught_and_shrunk(how: str, kind: Kind) -> None
 def test_what_does_not_run_is_an_invalid_draw() -> None:
     model = onnx.parser.parse_model(TEXT)
     model.graph.node[0].op_type = "NoSuchOperator"
-    assert judge(model, "fold-constants").kind == "invalid-draw"
+    (verdict,) = judged(0, model, ["fold-constants"])
+    assert verdict.kind == "invalid-draw"
 
 
 def test_what_rounding_moves_as_far_is_unstable() -> None:
@@ -94,7 +95,7 @@ def test_what_rounding_moves_as_far_is_unstable() -> None:
         s = Div(x, x)  t = Mul(s, a)  u = Tanh(t)  v = Div(t, t)
         w = Sub(v, one)  r = Sign(w)  y = Add(r, u)
     }"""
-    verdict = judge(onnx.parser.parse_model(text), "fuse-basic")
+    (verdict,) = judged(0, onnx.parser.parse_model(text), ["fuse-basic"])
     assert verdict.kind in ("right", "unchanged", "unstable")
 
 
