@@ -76,15 +76,15 @@ class Cli:
         return lines[0]
 
 
-@pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch) -> Command:
+def run(*words: str | Path) -> int:
     """Run ``me2e-compress`` with these words; give its exit code."""
-
-    def run(*words: str | Path) -> int:
-        argv = ["me2e-compress", *(str(word) for word in words)]
-        monkeypatch.setattr(sys, "argv", argv)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["me2e-compress", *map(str, words)])
         return main()
 
+
+@pytest.fixture
+def command() -> Command:
     return run
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from tests.fuzz import frames, graphs, texts
@@ -15,61 +15,63 @@ class Case:
 
     Attributes:
         name: of the fault.
-        words: of the command; good files are ``../good/...``.
+        line: the command; good files are ``../good/...``.
         files: that are broken, by name.
+        more: words that may hold spaces.
     """
 
     name: str
-    words: tuple[str, ...]
-    files: Mapping[str, bytes]
+    line: str
+    files: Mapping[str, bytes] = dataclasses.field(default_factory=dict)
+    more: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The command and its words."""
+        return (*self.line.split(), *self.more)
 
 
-MODEL, FRAMES = "../good/model.onnx", "../good/frames"
+M, F = "../good/model.onnx", "../good/frames"
+UNVERIFIED = f"compress {M} -o out.onnx --verify-frames 0"
 
-OPENERS: Mapping[str, tuple[str, ...]] = {
-    "inspect": ("inspect", "bad.onnx"),
-    "inspect-mapped": (
-        *("inspect", "bad.onnx", "--map", "../good/map.toml", "--json"),
-    ),
-    "plan": ("plan", "bad.onnx", "-v"),
-    "lint": ("lint", "bad.onnx"),
-    "unchecked": (
-        *("compress", "bad.onnx", "-r", "exact", "-o", "out.onnx"),
-        *("--verify-frames", "0"),
-    ),
+OPENERS = {
+    "inspect": "inspect bad.onnx",
+    "inspect-mapped": "inspect bad.onnx --map ../good/map.toml --json",
+    "plan": "plan bad.onnx -v",
+    "lint": "lint bad.onnx",
+    "unchecked": "compress bad.onnx -r exact -o out.onnx --verify-frames 0",
 }
 """Commands that open a graph, and no session of onnxruntime with it."""
 
-RUNNERS: Mapping[str, tuple[str, ...]] = {
-    "calibrate": ("calibrate", "bad.onnx", FRAMES, "-o", "out.json"),
-    "compare": ("compare", MODEL, "bad.onnx", FRAMES),
-    "profile": ("profile", "bad.onnx", FRAMES, "-o", "out.json", "--samples", "2"),
-    "evaluate": ("evaluate", "bad.onnx", "-o", "out", "--routes", "1"),
+RUNNERS = {
+    "calibrate": f"calibrate bad.onnx {F} -o out.json",
+    "compare": f"compare {M} bad.onnx {F}",
+    "profile": f"profile bad.onnx {F} -o out.json --samples 2",
+    "evaluate": "evaluate bad.onnx -o out --routes 1",
 }
 
 
-def graph_cases(drawn: int) -> Iterator[Case]:
+def graph_cases(_: Path) -> Iterator[Case]:
     """Yield every broken graph and file, and drawn ones; the commands take turns."""
-    turn = itertools.cycle(OPENERS)
-    found = itertools.chain(
+    turn = itertools.cycle(OPENERS.items())
+    for name, content in itertools.chain(
         graphs.broken_graphs(),
         graphs.broken_files(),
-        map(graphs.drawn_graph, range(drawn)),
-    )
-    for name, content in found:
-        opener = next(turn)
-        yield Case(f"{opener}-{name}", OPENERS[opener], {"bad.onnx": content})
+        map(graphs.drawn_graph, range(80)),
+    ):
+        opener, line = next(turn)
+        yield Case(f"{opener}-{name}", line, {"bad.onnx": content})
 
 
-def frame_cases() -> Iterator[Case]:
+def frame_cases(_: Path) -> Iterator[Case]:
     """Yield broken frames and indexes of scenes."""
     turn = itertools.cycle(
-        [
-            ("calibrate", MODEL, "bad", "-o", "out.json"),
-            ("compare", MODEL, MODEL, "bad"),
-            ("profile", MODEL, "bad", "-o", "out.json", "--samples", "2"),
-            ("compress", MODEL, "-r", "exact", "--frames", "bad", "-o", "out.onnx"),
-        ]
+        (
+            f"calibrate {M} bad -o out.json",
+            f"compare {M} {M} bad",
+            f"profile {M} bad -o out.json --samples 2",
+            f"compress {M} -r exact --frames bad -o out.onnx",
+        )
     )
     good, index = frames.npz(**frames.GOOD), b'{"scenes": [0]}'
     for name, content in frames.broken_frames():
@@ -78,110 +80,104 @@ def frame_cases() -> Iterator[Case]:
     drawn = texts.broken_json('{"scenes": [0, 1]}', 20)
     for name, content in itertools.chain(texts.neither(), drawn):
         files = {f"bad/{each:06d}.npz": good for each in range(2)}
-        files["bad/scenes.json"] = content
-        yield Case(f"scenes-{name}", next(turn), files)
+        yield Case(f"scenes-{name}", next(turn), {**files, "bad/scenes.json": content})
 
 
-def _json_words(good: Path) -> dict[str, tuple[str, tuple[str, ...]]]:
-    """Return a good document and a command that reads it, by the format's name."""
-    given = ("--frames", FRAMES, "-o", "out.onnx")
-    return {
-        "plan": ("plan.json", ("plan", MODEL, "--against", "bad.json")),
-        "plan-alone": ("plan.json", ("plan", "bad.json", "-v")),
-        "ranges": (
-            "ranges.json",
-            ("compress", MODEL, "--scheme", "full", "--ranges", "bad.json", *given),
-        ),
-        "trace": (
-            "trace.json",
-            ("evaluate", "blind", "--latency", "trace:bad.json", "--routes", "0",
-             "-o", "out"),
-        ),
-        "routes": (
-            "routes.json",
-            ("routes", "--examine", "bad.json", "--routes", "no-such-route"),
-        ),
-    }  # fmt: skip
+JSON = {
+    "plan": ("plan.json", f"plan {M} --against bad.json"),
+    "plan-alone": ("plan.json", "plan bad.json -v"),
+    "ranges": (
+        "ranges.json",
+        f"compress {M} --scheme full --ranges bad.json --frames {F} -o out.onnx",
+    ),
+    "trace": (
+        "trace.json",
+        "evaluate blind --latency trace:bad.json --routes 0 -o out",
+    ),
+    "routes": ("routes.json", "routes --examine bad.json --routes no-such-route"),
+}
+"""A good document and a command that reads it, by the format's name."""
+
+TOML = {
+    "map": (MAP, f"inspect {M} --map bad.toml"),
+    "overrides": (OVERRIDES, f"plan {M} --overrides bad.toml"),
+    "recipe": (RECIPE, f"{UNVERIFIED} -r bad.toml"),
+    "study": (STUDY, "study bad.toml -o out"),
+    "adapter": (ADAPTER, f"evaluate {M} --adapter bad.toml --routes 1 -o out"),
+}
 
 
-def json_cases(good: Path, count: int) -> Iterator[Case]:
+def json_cases(good: Path) -> Iterator[Case]:
     """Yield broken JSON files of every kind."""
-    for turn, (kind, (name, words)) in enumerate(_json_words(good).items()):
-        drawn = texts.broken_json((good / name).read_text(), count)
+    for turn, (kind, (name, line)) in enumerate(JSON.items()):
+        drawn = texts.broken_json((good / name).read_text(), 8)
         none = itertools.islice(texts.neither(), turn % 3, None, 3)
         for which, content in itertools.chain(none, drawn):
-            yield Case(f"{kind}-{which}", words, {"bad.json": content})
+            yield Case(f"{kind}-{which}", line, {"bad.json": content})
 
 
-def toml_cases(count: int) -> Iterator[Case]:
+def toml_cases(_: Path) -> Iterator[Case]:
     """Yield broken TOML files of every kind."""
-    compress = ("compress", MODEL, "-o", "out.onnx", "--verify-frames", "0")
-    kinds = {
-        "map": (MAP, ("inspect", MODEL, "--map", "bad.toml")),
-        "overrides": (OVERRIDES, ("plan", MODEL, "--overrides", "bad.toml")),
-        "recipe": (RECIPE, (*compress, "-r", "bad.toml")),
-        "study": (STUDY, ("study", "bad.toml", "-o", "out")),
-        "adapter": (
-            ADAPTER,
-            ("evaluate", MODEL, "--adapter", "bad.toml", "--routes", "1", "-o", "out"),
-        ),
-    }
-    for turn, (kind, (text, words)) in enumerate(kinds.items()):
-        drawn = texts.broken_toml(text, count)
+    for turn, (kind, (text, line)) in enumerate(TOML.items()):
         none = itertools.islice(texts.neither(), turn % 2, None, 2)
         beside = {"overrides.toml": OVERRIDES.encode()} if kind == "recipe" else {}
-        for which, content in itertools.chain(none, drawn):
-            yield Case(f"{kind}-{which}", words, {**beside, "bad.toml": content})
+        for which, content in itertools.chain(none, texts.broken_toml(text, 10)):
+            yield Case(f"{kind}-{which}", line, {**beside, "bad.toml": content})
 
 
-def result_cases(good: Path, count: int) -> Iterator[Case]:
+def result_cases(good: Path) -> Iterator[Case]:
     """Yield folders of results with a broken manifest or route."""
-    files = {"evaluation.json": "evaluation.json", "routes/r1.json": "routes/r1.json"}
-    whole = {f"bad/{name}": (good / "results" / name).read_bytes() for name in files}
-    for name in files:
-        text = whole[f"bad/{name}"].decode()
-        drawn = texts.broken_json(text, count)
+    names = ("evaluation.json", "routes/r1.json")
+    whole = {f"bad/{name}": (good / "results" / name).read_bytes() for name in names}
+    for name, text in whole.items():
+        drawn = texts.broken_json(text.decode(), 15)
         for which, content in itertools.chain(texts.neither(), drawn):
-            changed = {**whole, f"bad/{name}": content}
-            yield Case(f"results-{name}-{which}", ("score", "bad"), changed)
+            yield Case(f"{name}-{which}", "score bad", {**whole, name: content})
 
 
-def pipeline_cases() -> Iterator[Case]:
+def pipeline_cases(_: Path) -> Iterator[Case]:
     """Yield texts for ``--passes``."""
-    compress = ("compress", MODEL, "-o", "out.onnx", "--verify-frames", "0")
     for number, text in enumerate(texts.PIPELINES):
-        yield Case(f"pipeline-{number}", (*compress, "--passes", text), {})
+        yield Case(f"pipeline-{number}", f"{UNVERIFIED} --passes", more=(text,))
 
 
-def cache_cases() -> Iterator[Case]:
+def cache_cases(_: Path) -> Iterator[Case]:
     """Yield broken caches of TensorRT."""
-    cache = ("calibrate", MODEL, "--import", "bad.cache", "-o", "out.json")
     for name, content in texts.neither():
-        line = b"TRT-1-A\nx: " if len(name) % 2 else b""
-        yield Case(f"cache-{name}", cache, {"bad.cache": line + content})
+        head = b"TRT-1-A\nx: " if len(name) % 2 else b""
+        line = f"calibrate {M} --import bad.cache -o out.json"
+        yield Case(f"cache-{name}", line, {"bad.cache": head + content})
 
 
-def session_cases() -> Iterator[Case]:
+def session_cases(_: Path) -> Iterator[Case]:
     """Yield names that are not UTF-8, which onnxruntime repeats in its messages."""
     content = graphs.seed_graph().SerializeToString()
     broken = content.replace(b"memory_out", b"memo\xb7y_out")
-    for runner, words in RUNNERS.items():
-        yield Case(f"{runner}-utf-8", words, {"bad.onnx": broken})
+    for runner, line in RUNNERS.items():
+        yield Case(f"{runner}-utf-8", line, {"bad.onnx": broken})
 
 
-def output_cases() -> Iterator[Case]:
+def output_cases(_: Path) -> Iterator[Case]:
     """Yield every command that writes, its output no name of a file."""
     names = ("", ".", "..", "/", "../good", "no/such/x", "a" * 300)
-    commands = (
-        ("compress", MODEL, "-r", "exact"),
-        ("calibrate", MODEL, FRAMES),
-        ("plan", MODEL),
-        ("profile", MODEL, FRAMES),
-        ("search", MODEL, FRAMES, "--max-mb", "1"),
-        ("sensitivity", MODEL, FRAMES),
-        ("frames", MODEL),
-        ("evaluate", MODEL, "--routes", "1"),
-        ("study", "../good/map.toml"),
+    lines = (
+        *(f"compress {M} -r exact", f"calibrate {M} {F}", f"plan {M}"),
+        *(f"profile {M} {F}", f"search {M} {F} --max-mb 1", f"sensitivity {M} {F}"),
+        *(f"frames {M}", f"evaluate {M} --routes 1", "study ../good/map.toml"),
     )
-    for name, words in itertools.product(names, commands):
-        yield Case(f"output-{words[0]}-{name[:20]}", (*words, "-o", name), {})
+    for name, line in itertools.product(names, lines):
+        yield Case(f"output-{line.split()[0]}-{name[:20]}", f"{line} -o", more=(name,))
+
+
+GROUPS: Mapping[str, Callable[[Path], Iterator[Case]]] = {
+    "graphs": graph_cases,
+    "frames": frame_cases,
+    "json": json_cases,
+    "toml": toml_cases,
+    "results": result_cases,
+    "pipelines": pipeline_cases,
+    "caches": cache_cases,
+    "outputs": output_cases,
+    "sessions": session_cases,
+}
+"""Cases, given the folder of good files."""

@@ -19,51 +19,32 @@ from tests.fuzz.exact.values import Val
 Motif = Callable[[Builder], None]
 
 MOTIFS: Mapping[str, tuple[Motif, float]] = {
-    "one-layer": (ln.one_layer, 2),
-    "layers-in-a-row": (ln.layers_in_a_row, 2),
-    "on-positions": (ln.on_positions, 2),
-    "on-columns": (ln.on_columns, 2),
-    "on-points": (ln.on_points, 1.5),
-    "same-source": (ln.same_source, 2),
+    "one-layer": (ln.one_layer, 2), "layers-in-a-row": (ln.layers_in_a_row, 2),
+    "on-positions": (ln.on_positions, 2), "on-columns": (ln.on_columns, 2),
+    "on-points": (ln.on_points, 1.5), "same-source": (ln.same_source, 2),
     "repeated-rows": (rows.repeated_rows, 6),
-    "repeated-layer": (rows.repeated_layer, 3),
-    "layer-norm": (norms.layer_norm, 1.5),
-    "gelu": (norms.gelu, 1.5),
-    "swish": (norms.swish, 1),
-    "hard-swish": (norms.hard_swish, 1),
-    "mish": (norms.mish, 1),
+    "repeated-layer": (rows.repeated_layer, 3), "layer-norm": (norms.layer_norm, 1.5),
+    "gelu": (norms.gelu, 1.5), "swish": (norms.swish, 1),
+    "hard-swish": (norms.hard_swish, 1), "mish": (norms.mish, 1),
     "constant-chain": (norms.constant_chain, 2),
-    "conv-and-norm": (cv.conv_and_norm, 2.5),
-    "shared-kernel": (cv.shared_kernel, 3),
+    "conv-and-norm": (cv.conv_and_norm, 2.5), "shared-kernel": (cv.shared_kernel, 3),
     "shared-square": (cv.shared_square, 2.5),
     "alias-of-a-weight": (cv.alias_of_a_weight, 1),
-    "gathered-batches": (rows.gathered_batches, 0.7),
-    "attention": (at.attention, 3),
+    "gathered-batches": (rows.gathered_batches, 0.7), "attention": (at.attention, 3),
     "shared-operand": (at.shared_operand, 2),
-    "computed-reshape": (sh.computed_reshape, 1.5),
-    "filled": (sh.filled, 1),
-    "counted": (sh.counted, 1),
-    "expanded-by-shape": (sh.expanded_by_shape, 1),
-    "sliced-by-shape": (sh.sliced_by_shape, 1),
-    "given-back": (sh.given_back, 0.5),
-    "no-ops": (oddities.no_ops, 2),
-    "pairs": (oddities.pairs, 2),
-    "twins": (oddities.twins, 1.5),
-    "empty-inputs": (oddities.empty_inputs, 1),
-    "odd-constants": (oddities.odd_constants, 1.5),
-    "branches": (oddities.branches, 1),
+    "computed-reshape": (sh.computed_reshape, 1.5), "filled": (sh.filled, 1),
+    "counted": (sh.counted, 1), "expanded-by-shape": (sh.expanded_by_shape, 1),
+    "sliced-by-shape": (sh.sliced_by_shape, 1), "given-back": (sh.given_back, 0.5),
+    "no-ops": (oddities.no_ops, 2), "pairs": (oddities.pairs, 2),
+    "twins": (oddities.twins, 1.5), "empty-inputs": (oddities.empty_inputs, 1),
+    "odd-constants": (oddities.odd_constants, 1.5), "branches": (oddities.branches, 1),
     "grown-by-a-constant": (oddities.grown_by_a_constant, 1.5),
-    "odd-products": (oddities.odd_products, 1.5),
-    "full-bias": (oddities.full_bias, 1),
-    "cast-about": (oddities.cast_about, 1),
-    "defaults": (oddities.defaults, 1),
-    "if": (bodies.branch, 2.5),
-    "loop": (bodies.loop, 1),
-    "function": (bodies.called, 1),
-    "deformable": (deformable.decomposed, 3),
-    "rotated-view": (deformable.rotated_view, 2),
-    "plugin": (deformable.plugin, 2),
-}
+    "odd-products": (oddities.odd_products, 1.5), "full-bias": (oddities.full_bias, 1),
+    "cast-about": (oddities.cast_about, 1), "defaults": (oddities.defaults, 1),
+    "if": (bodies.branch, 2.5), "loop": (bodies.loop, 1),
+    "function": (bodies.called, 1), "deformable": (deformable.decomposed, 3),
+    "rotated-view": (deformable.rotated_view, 2), "plugin": (deformable.plugin, 2),
+}  # fmt: skip
 """What a graph is composed of, and how often each is drawn beside the others."""
 
 IR_OF_OPSET = ((21, 10), (19, 9), (15, 8), (12, 7), (11, 6))
@@ -155,8 +136,5 @@ def _list_weights(b: Builder, graph: onnx.GraphProto) -> None:
     """Name weights among the inputs too, as old exporters do."""
     for tensor in graph.initializer:
         if b.chance(0.8):
-            graph.input.append(
-                helper.make_tensor_value_info(
-                    tensor.name, tensor.data_type, list(tensor.dims)
-                )
-            )
+            kind, dims = tensor.data_type, list(tensor.dims)
+            graph.input.append(helper.make_tensor_value_info(tensor.name, kind, dims))

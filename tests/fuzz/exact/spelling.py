@@ -38,6 +38,11 @@ def unary(b: Builder, x: Val, kind: str | None = None) -> Val:
     return b.op(kind or b.rng.choice(known), [x], x.shape)
 
 
+def at_times(b: Builder, probability: float, x: Val) -> Val:
+    """Apply a tame operator with some probability."""
+    return unary(b, x) if b.chance(probability) else x
+
+
 def binary(b: Builder, kind: str, left: Val, right: Val) -> Val:
     return b.op(kind, [left, right], broadcast(left.shape, right.shape))
 

@@ -27,11 +27,9 @@ def _body(b: Builder, x: Val, *, steps: int = 1) -> tuple[Builder, Val]:
         body.outer = (*body.outer, x)
     y = x
     for _ in range(steps):
-        if b.chance(0.6) and _is_plain(x):
-            y = _same_shape(body, y)
-        else:
+        if not (b.chance(0.6) and _is_plain(x)):
             (branch if b.chance(0.1) else b.rng.choice(INNER))(body)
-            y = _same_shape(body, y)
+        y = _same_shape(body, y)
     return body, y
 
 
@@ -78,8 +76,7 @@ def branch(b: Builder) -> None:
         graphs[name] = body.graph(outputs, b.fresh("body"))
     results = [Val(b.fresh("v"), x.shape, x.dtype) for _ in range(2 if twin else 1)]
     b.emit("If", [chosen], results, graphs)
-    if b.chance(0.5):
-        sp.unary(b, results[0])
+    sp.at_times(b, 0.5, results[0])
 
 
 def loop(b: Builder) -> None:

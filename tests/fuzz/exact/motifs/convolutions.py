@@ -44,11 +44,9 @@ def convolve(b: Builder, x: Val, with_: Kernel, bias: Val | None = None) -> Val:
     attributes: dict[str, object] = {"kernel_shape": [with_.size] * 2}
     if with_.group > 1 or b.chance(0.2):
         attributes["group"] = with_.group
-    if with_.turned:
-        more = with_.size - 1
-    else:
-        pad = with_.size - 1
-        attributes["pads"] = [pad // 2, pad // 2, pad - pad // 2, pad - pad // 2]
+    more = with_.size - 1
+    if not with_.turned:
+        attributes["pads"] = [*([more // 2] * 2), *([more - more // 2] * 2)]
         more = 0
     kind = "ConvTranspose" if with_.turned else "Conv"
     shape = (x.shape[0], with_.channels, height + more, width + more)
@@ -104,8 +102,7 @@ def conv_and_norm(b: Builder) -> None:
     y = convolve(b, x, used, _bias(b, used.channels))
     for _ in range(b.rng.randint(1, 3)):
         y = follow(b, y)
-        if b.chance(0.15):
-            y = sp.unary(b, y)
+        y = sp.at_times(b, 0.15, y)
 
 
 def shared_kernel(b: Builder) -> None:

@@ -65,16 +65,20 @@ def _sampled(b: Builder, s: _Sizes, value: Val, grids: Val) -> Val:
         index = b.const(np.asarray(at, np.int64))
         grid = sp.transpose(b, sp.gather(b, grids, index, 3), (0, 2, 1, 3, 4))
         grid = sp.reshape(b, grid, (s.n * s.m, s.q, s.p, 2))
-        attributes = {
-            "mode": "bilinear" if b.opset < 20 else "linear",
-            "padding_mode": b.rng.choice(("zeros",) * 5 + ("border",)),
-            "align_corners": 0,
-        }
-        shape = (s.n * s.m, s.d, s.q, s.p)
-        sample = b.op("GridSample", [image, grid], shape, attributes)
-        parts.append(sp.unsqueeze(b, sample, 3))
+        parts.append(sp.unsqueeze(b, _grid_sample(b, image, grid), 3))
     stacked = sp.concat(b, parts, 3)
     return sp.reshape(b, stacked, (s.n * s.m, s.d, s.q, len(s.levels) * s.p))
+
+
+def _grid_sample(b: Builder, image: Val, grid: Val, corners: float = 0.0) -> Val:
+    """Sample an image; corners are aligned with some probability."""
+    attributes = {
+        "mode": "bilinear" if b.opset < 20 else "linear",
+        "padding_mode": b.rng.choice(("zeros",) * 5 + ("border",)),
+        "align_corners": int(corners > 0 and b.chance(corners)),
+    }
+    shape = (*image.shape[:2], *grid.shape[1:3])
+    return b.op("GridSample", [image, grid], shape, attributes)
 
 
 def decomposed(b: Builder) -> None:
@@ -88,9 +92,8 @@ def decomposed(b: Builder) -> None:
     samples = _sampled(b, s, value, grids)
     turned = sp.transpose(b, weights, (0, 2, 1, 3, 4))
     ones = sp.reshape(b, turned, (s.n * s.m, 1, s.q, len(s.levels) * s.p))
-    total = sp.reduce(
-        b, "ReduceSum", sp.binary(b, "Mul", samples, ones), [3], keep=False
-    )
+    weighted = sp.binary(b, "Mul", samples, ones)
+    total = sp.reduce(b, "ReduceSum", weighted, [3], keep=False)
     heads = sp.reshape(b, total, (s.n, s.m * s.d, s.q))
     y = sp.transpose(b, heads, (0, 2, 1))
     if b.chance(0.4):
@@ -103,24 +106,16 @@ def rotated_view(b: Builder) -> None:
     """Sample the last frame's view, [H W, 1, C], where its pixels are now."""
     if b.opset < 16 or b.is_double:
         return
-    channels, (height, width) = (
-        b.rng.choice((3, 16, 16)),
-        b.rng.choice(((4, 5), (3, 1))),
-    )
+    channels = b.rng.choice((3, 16, 16))
+    height, width = b.rng.choice(((4, 5), (3, 1)))
     rows = b.input((height * width, 1, channels))
     turned = sp.transpose(b, rows, (1, 2, 0))
     image = sp.reshape(b, turned, (1, channels, height, width))
-    attributes = {
-        "mode": "bilinear" if b.opset < 20 else "linear",
-        "padding_mode": b.rng.choice(("zeros",) * 5 + ("border",)),
-        "align_corners": int(b.chance(0.1)),
-    }
-    grid, shape = b.input((1, height, width, 2)), (1, channels, height, width)
-    sample = b.op("GridSample", [image, grid], shape, attributes)
+    grid = b.input((1, height, width, 2))
+    sample = _grid_sample(b, image, grid, corners=0.1)
     flat = sp.reshape(b, sample, (1, channels, height * width))
     sp.transpose(b, flat, (0, 2, 1))
-    if b.chance(0.3):
-        sp.unary(b, sample)
+    sp.at_times(b, 0.3, sample)
 
 
 def plugin(b: Builder) -> None:
@@ -132,13 +127,10 @@ def plugin(b: Builder) -> None:
     domain, kind, joined = b.rng.choice(DOMAINS)
     areas = [math.prod(level) for level in s.levels]
     starts = np.cumsum([0, *areas[:-1]])
-    inputs = [
-        value,
-        b.const(np.array(s.levels, np.int32), plain=True),
-        b.const(np.array(starts, np.int32), plain=True),
-        where,
-        weights,
-    ]
+    sizes, first = (
+        b.const(np.array(each, np.int32), plain=True) for each in (s.levels, starts)
+    )
+    inputs = [value, sizes, first, where, weights]
     shape = (s.n, s.q, s.m * s.d) if joined else (s.n, s.q, s.m, s.d)
     y = b.op(kind, inputs, shape, domain=domain)
     sp.unary(b, y)

@@ -10,7 +10,7 @@ def layer(b: Builder, x: Val, width: int | None = None) -> Val:
     columns = width or b.rng.choice((3, 4, 6, 8, 12, 16))
     spellings = [_matmul, _matmul, _turned]
     if x.rank == 2:
-        spellings += [_gemm, _gemm]
+        spellings += [gemm, gemm]
     if x.rank > 2:
         spellings.append(_flat_gemm)
     if x.rank == 3 and not b.is_double:
@@ -38,9 +38,9 @@ def _turned(b: Builder, x: Val, columns: int) -> Val:
     return _biased(b, sp.matmul(b, x, sp.transpose(b, weight, (1, 0))))
 
 
-def gemm(b: Builder, x: Val, columns: int, flip: int | None = None) -> Val:
+def gemm(b: Builder, x: Val, columns: int) -> Val:
     """Write one Gemm on a weight that others may have."""
-    turned = b.rng.randint(0, 1) if flip is None else flip
+    turned = b.rng.randint(0, 1)
     shape = (columns, x.width) if turned else (x.width, columns)
     inputs = [x, b.weight(shape, x.width**-0.5)]
     attributes: dict[str, float | int] = {}
@@ -53,10 +53,6 @@ def gemm(b: Builder, x: Val, columns: int, flip: int | None = None) -> Val:
         if b.chance(0.2):
             attributes["beta"] = b.rng.choice((0.0, 0.5, 2.0))
     return b.op("Gemm", inputs, (*x.shape[:-1], columns), attributes)
-
-
-def _gemm(b: Builder, x: Val, columns: int) -> Val:
-    return gemm(b, x, columns)
 
 
 def _flat_gemm(b: Builder, x: Val, columns: int) -> Val:
@@ -86,8 +82,7 @@ def _einsum(b: Builder, x: Val, columns: int) -> Val:
 def one_layer(b: Builder) -> None:
     """A layer, perhaps with an activation behind it."""
     made = layer(b, b.rows())
-    if b.chance(0.5):
-        sp.unary(b, made)
+    sp.at_times(b, 0.5, made)
 
 
 def layers_in_a_row(b: Builder) -> None:
@@ -165,7 +160,6 @@ def same_source(b: Builder) -> None:
     """Several layers that read one value: queries, keys and values."""
     x = b.rows(2, 3)
     made = [layer(b, x) for _ in range(b.rng.randint(2, 4))]
-    if b.chance(0.3):
-        sp.unary(b, made[0])
+    sp.at_times(b, 0.3, made[0])
     if made[0].shape == made[1].shape and b.chance(0.5):
         sp.binary(b, "Add", made[0], made[1])

@@ -6,7 +6,7 @@ import numpy as np
 
 from tests.fuzz.exact import spelling as sp
 from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.values import BOOL, INT64, Val, is_static, sizes
+from tests.fuzz.exact.values import BOOL, INT64, is_static, sizes
 
 
 def no_ops(b: Builder) -> None:
@@ -17,7 +17,7 @@ def no_ops(b: Builder) -> None:
         if kind == 0:
             x = b.op("Identity", [x], x.shape)
         elif kind == 1:
-            more = [] if b.chance(0.5) or b.opset < 12 else [sp_ratio(b)]
+            more = [] if b.chance(0.5) or b.opset < 12 else [b.const(np.float32(0.5))]
             x = b.op("Dropout", [x, *more], x.shape)
         elif kind == 2:
             to = 11 if b.is_double else 1
@@ -30,12 +30,7 @@ def no_ops(b: Builder) -> None:
             x = sp.transpose(b, x, range(x.rank))
         else:
             x = sp.concat(b, [x], x.rank - 1)
-    if b.chance(0.6):
-        sp.unary(b, x)
-
-
-def sp_ratio(b: Builder) -> Val:
-    return b.const(np.float32(0.5))
+    sp.at_times(b, 0.6, x)
 
 
 def pairs(b: Builder) -> None:
@@ -52,8 +47,7 @@ def pairs(b: Builder) -> None:
             x = sp.reshape(b, flat, x.shape) if b.chance(0.6) else flat
         elif x.rank < 5:
             x = sp.unsqueeze(b, x, b.rng.randint(0, x.rank))
-        if b.chance(0.15):
-            sp.unary(b, x)
+        sp.at_times(b, 0.15, x)
     ones = [axis for axis, dim in enumerate(x.shape) if dim == 1]
     if ones and b.chance(0.6):
         sp.squeeze(b, x, b.rng.choice(ones))
@@ -121,8 +115,7 @@ def branches(b: Builder) -> None:
     x = b.rows(2, 4)
     cut = b.rng.randint(1, x.width - 1)
     first, second = sp.split(b, x, x.rank - 1, [cut, x.width - cut])
-    if b.chance(0.3):
-        first = sp.unary(b, first)
+    first = sp.at_times(b, 0.3, first)
     if b.chance(0.7):
         sp.concat(b, [second, first] if b.chance(0.5) else [first, second], x.rank - 1)
 

@@ -48,9 +48,8 @@ def _unsqueezed(b: Builder, x: Val) -> Val:
     target = [1] * wide.rank
     target[axis] = count
     if is_static(wide.shape) and b.chance(0.5):
-        target = [
-            count if at == axis else size for at, size in enumerate(sizes(wide.shape))
-        ]
+        target = list(sizes(wide.shape))
+        target[axis] = count
     many = sp.expand(b, wide, target) if b.chance(0.7) else sp.tile(b, wide, target)
     return _viewed(b, many)
 
@@ -61,11 +60,8 @@ def _viewed(b: Builder, x: Val) -> Val:
     opened = sum(isinstance(dim, Open) for dim in x.shape)
     if x.rank >= 2 and opened <= 1:
         at = b.rng.randint(0, x.rank - 2)
-        joined: list[Dim] = [
-            *x.shape[:at],
-            product(x.shape[at : at + 2]),
-            *x.shape[at + 2 :],
-        ]
+        both = product(x.shape[at : at + 2])
+        joined: list[Dim] = [*x.shape[:at], both, *x.shape[at + 2 :]]
         views.append(lambda: sp.reshape(b, x, joined))
         views.append(lambda: sp.flatten(b, x, x.rank - 1))
     ones = [axis for axis, dim in enumerate(x.shape) if dim == 1]
@@ -87,11 +83,8 @@ def _stacked(b: Builder, x: Val) -> Val:
 
 
 def _gathered(b: Builder, x: Val) -> Val:
-    axes = [axis for axis in range(x.rank) if isinstance(x.shape[axis], int)]
-    if not axes:
-        return x
-    axis = b.rng.choice(axes)
-    size = sizes(x.shape[axis : axis + 1])[0]
+    known = [(axis, n) for axis, n in enumerate(x.shape) if isinstance(n, int)]
+    axis, size = b.rng.choice(known) if known else (0, 0)
     if not size:
         return x
     shape = b.rng.choice(((), (1,), (7,), (40,), (2, 3)))
@@ -110,11 +103,10 @@ def _gathered_nd(b: Builder, x: Val) -> Val:
 
 
 def _sliced(b: Builder, x: Val) -> Val:
-    axes = [axis for axis, dim in enumerate(x.shape) if isinstance(dim, int) and dim]
-    if not axes:
+    known = [(axis, n) for axis, n in enumerate(x.shape) if isinstance(n, int) and n]
+    if not known:
         return x
-    axis = b.rng.choice(axes)
-    size = sizes(x.shape[axis : axis + 1])[0]
+    axis, size = b.rng.choice(known)
     start = b.rng.randint(0, size - 1)
     return sp.slice_(b, x, axis, start, b.rng.randint(start + 1, size))
 
@@ -214,7 +206,7 @@ def gathered_batches(b: Builder) -> None:
     x = b.input((batch, 5, width))
     chosen = np.asarray(b.draws.integers(0, 5, (batch, count, 1)), np.int64)
     y = b.op("GatherND", [x, b.const(chosen)], (batch, count, width), {"batch_dims": 1})
-    y = sp.unary(b, y) if b.chance(0.5) else y
+    y = sp.at_times(b, 0.5, y)
     layer(b, y, 16)
 
 
@@ -224,9 +216,7 @@ def repeated_layer(b: Builder) -> None:
     if not is_static(x.shape) or elements(x.shape) > 1024:
         x = b.input((1, b.rng.randint(1, 4), b.rng.choice((8, 16))))
     axis = b.rng.randint(0, x.rank - 2)
-    wide = x
-    if b.chance(0.5):
-        wide = sp.unsqueeze(b, x, axis)
+    wide = sp.unsqueeze(b, x, axis) if b.chance(0.5) else x
     repeats = [1] * wide.rank
     repeats[axis] = max(1, min(256, LARGEST // max(1, elements(x.shape))))
     many = sp.tile(b, wide, repeats)

@@ -1,6 +1,7 @@
 """Shapes that are computed: the arithmetic that exporters leave in a graph."""
 
 import numpy as np
+from onnx.numpy_helper import from_array
 
 from tests.fuzz.exact import spelling as sp
 from tests.fuzz.exact.builder import Builder
@@ -12,8 +13,7 @@ def _dim(b: Builder, x: Val, axis: int, *, flat: bool = False) -> Val:
     shape = sp.shape_of(b, x)
     given = axis - x.rank if b.chance(0.3) else axis
     if flat and b.chance(0.3):
-        end = axis + 1
-        return sp.slice_(b, shape, 0, axis, end)
+        return sp.slice_(b, shape, 0, axis, axis + 1)
     index = b.const(np.asarray(given, np.int64))
     scalar = b.op("Gather", [shape, index], (), {"axis": 0})
     if b.chance(0.2):
@@ -28,10 +28,6 @@ def _cast_twice(b: Builder, x: Val) -> Val:
     scaled = b.op("Mul", [wide, one], x.shape)
     whole = b.op("Floor", [scaled], x.shape)
     return b.op("Cast", [whole], x.shape, {"to": 7}, dtype=INT64)
-
-
-def _joined(b: Builder, parts: list[Val]) -> Val:
-    return b.op("Concat", parts, (len(parts),), {"axis": 0})
 
 
 def computed_reshape(b: Builder) -> None:
@@ -58,9 +54,9 @@ def computed_reshape(b: Builder) -> None:
                 parts.append(b.ints(known))
             else:
                 parts.append(_dim(b, x, axis, flat=True))
-    made = b.op("Reshape", [x, _joined(b, parts)], dims)
-    if b.chance(0.5):
-        sp.unary(b, made)
+    shape = b.op("Concat", parts, (len(parts),), {"axis": 0})
+    made = b.op("Reshape", [x, shape], dims)
+    sp.at_times(b, 0.5, made)
 
 
 def filled(b: Builder) -> None:
@@ -68,20 +64,12 @@ def filled(b: Builder) -> None:
     x = b.rows(1, 4)
     shape = sp.shape_of(b, x)
     number = b.rng.choice((0.0, 1.0, 2.5))
-    tensor = np.full(1, number, b.dtype)
     if b.chance(0.3):
         made = sp.binary(b, "Mul", x, sp.scalar(b, 0.0, 0))
     else:
-        attributes = {"value": sp_tensor(tensor)}
+        attributes = {"value": from_array(np.full(1, number, b.dtype))}
         made = b.op("ConstantOfShape", [shape], x.shape, attributes, dtype=b.dtype)
     sp.binary(b, b.rng.choice(("Add", "Mul", "Max")), x, made)
-
-
-def sp_tensor(array: np.ndarray) -> object:
-    """Write an attribute's tensor."""
-    from onnx import numpy_helper
-
-    return numpy_helper.from_array(array)
 
 
 def counted(b: Builder) -> None:
@@ -107,18 +95,15 @@ def expanded_by_shape(b: Builder) -> None:
         b.op("Expand", [y, sp.shape_of(b, x)], x.shape)
         return
     count = b.rng.choice((1, 2, 4))
-    target = np.array([count, *([-1] * x.rank)], np.int64)
-    wanted = b.const(target)
-    fill = np.ones(1, np.int64)
+    wanted = b.ints(count, *([-1] * x.rank))
     length = b.ints(x.rank + 1)
-    attributes = {"value": sp_tensor(fill)}
+    attributes = {"value": from_array(np.ones(1, np.int64))}
     ones = b.op("ConstantOfShape", [length], (x.rank + 1,), attributes, dtype=INT64)
     minus = b.op("Mul", [ones, b.const(np.asarray(-1, np.int64))], ones.shape)
     same = b.op("Equal", [wanted, minus], ones.shape, dtype=BOOL)
     shape = b.op("Where", [same, ones, wanted], ones.shape, dtype=INT64)
     made = b.op("Expand", [x, shape], (count, *sizes(x.shape)))
-    if b.chance(0.6):
-        sp.unary(b, made)
+    sp.at_times(b, 0.6, made)
 
 
 def sliced_by_shape(b: Builder) -> None:
@@ -129,11 +114,8 @@ def sliced_by_shape(b: Builder) -> None:
     end = sp.unsqueeze(b, half, 0)
     given = [x, b.ints(0), end, b.ints(axis)]
     first = b.op("Slice", given, (*x.shape[:-1], x.width // 2))
-    rest = b.op(
-        "Slice",
-        [x, end, b.ints(np.iinfo(np.int64).max), b.ints(axis)],
-        (*x.shape[:-1], x.width - x.width // 2),
-    )
+    given = [x, end, b.ints(np.iinfo(np.int64).max), b.ints(axis)]
+    rest = b.op("Slice", given, (*x.shape[:-1], x.width - x.width // 2))
     sp.concat(b, [rest, first], axis)
 
 
