@@ -7,34 +7,30 @@ from collections.abc import Callable, Mapping, Sequence
 import onnx
 from onnx import helper
 
-from tests.fuzz.exact import values
-from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.motifs import attention as at
-from tests.fuzz.exact.motifs import bodies, deformable, norms, oddities, rows
-from tests.fuzz.exact.motifs import convolutions as cv
-from tests.fuzz.exact.motifs import linear as ln
-from tests.fuzz.exact.motifs import shape_arithmetic as sh
-from tests.fuzz.exact.values import Val
+from tests.fuzz.exact.builder import SCOPES, Builder, TooLargeError, Val, shared
+from tests.fuzz.exact.motifs import attention, bodies, layers, oddities, rows
 
 Motif = Callable[[Builder], None]
 
 MOTIFS: Mapping[str, tuple[Motif, float]] = {
-    "one-layer": (ln.one_layer, 2), "layers-in-a-row": (ln.layers_in_a_row, 2),
-    "on-positions": (ln.on_positions, 2), "on-columns": (ln.on_columns, 2),
-    "on-points": (ln.on_points, 1.5), "same-source": (ln.same_source, 2),
+    "one-layer": (layers.one_layer, 2), "layers-in-a-row": (layers.layers_in_a_row, 2),
+    "on-positions": (layers.on_positions, 2), "on-columns": (layers.on_columns, 2),
+    "on-points": (layers.on_points, 1.5), "same-source": (layers.same_source, 2),
     "repeated-rows": (rows.repeated_rows, 6),
-    "repeated-layer": (rows.repeated_layer, 3), "layer-norm": (norms.layer_norm, 1.5),
-    "gelu": (norms.gelu, 1.5), "swish": (norms.swish, 1),
-    "hard-swish": (norms.hard_swish, 1), "mish": (norms.mish, 1),
-    "constant-chain": (norms.constant_chain, 2),
-    "conv-and-norm": (cv.conv_and_norm, 2.5), "shared-kernel": (cv.shared_kernel, 3),
-    "shared-square": (cv.shared_square, 2.5),
-    "alias-of-a-weight": (cv.alias_of_a_weight, 1),
-    "gathered-batches": (rows.gathered_batches, 0.7), "attention": (at.attention, 3),
-    "shared-operand": (at.shared_operand, 2),
-    "computed-reshape": (sh.computed_reshape, 1.5), "filled": (sh.filled, 1),
-    "counted": (sh.counted, 1), "expanded-by-shape": (sh.expanded_by_shape, 1),
-    "sliced-by-shape": (sh.sliced_by_shape, 1), "given-back": (sh.given_back, 0.5),
+    "repeated-layer": (rows.repeated_layer, 3), "layer-norm": (layers.layer_norm, 1.5),
+    "gelu": (layers.gelu, 1.5), "swish": (layers.swish, 1),
+    "hard-swish": (layers.hard_swish, 1), "mish": (layers.mish, 1),
+    "constant-chain": (layers.constant_chain, 2),
+    "conv-and-norm": (layers.conv_and_norm, 2.5),
+    "shared-kernel": (layers.shared_kernel, 3),
+    "shared-square": (layers.shared_square, 2.5),
+    "alias-of-a-weight": (layers.alias_of_a_weight, 1),
+    "gathered-batches": (rows.gathered_batches, 0.7),
+    "attention": (attention.attention, 3),
+    "shared-operand": (attention.shared_operand, 2),
+    "computed-reshape": (rows.computed_reshape, 1.5), "filled": (rows.filled, 1),
+    "counted": (rows.counted, 1), "expanded-by-shape": (rows.expanded_by_shape, 1),
+    "sliced-by-shape": (rows.sliced_by_shape, 1), "given-back": (rows.given_back, 0.5),
     "no-ops": (oddities.no_ops, 2), "pairs": (oddities.pairs, 2),
     "twins": (oddities.twins, 1.5), "empty-inputs": (oddities.empty_inputs, 1),
     "odd-constants": (oddities.odd_constants, 1.5), "branches": (oddities.branches, 1),
@@ -42,8 +38,8 @@ MOTIFS: Mapping[str, tuple[Motif, float]] = {
     "odd-products": (oddities.odd_products, 1.5), "full-bias": (oddities.full_bias, 1),
     "cast-about": (oddities.cast_about, 1), "defaults": (oddities.defaults, 1),
     "if": (bodies.branch, 2.5), "loop": (bodies.loop, 1),
-    "function": (bodies.called, 1), "deformable": (deformable.decomposed, 3),
-    "rotated-view": (deformable.rotated_view, 2), "plugin": (deformable.plugin, 2),
+    "function": (bodies.called, 1), "deformable": (attention.decomposed, 3),
+    "rotated-view": (attention.rotated_view, 2), "plugin": (attention.plugin, 2),
 }  # fmt: skip
 """What a graph is composed of, and how often each is drawn beside the others."""
 
@@ -69,16 +65,16 @@ def draw(seed: int) -> onnx.ModelProto:
 
 def drawing(seed: int) -> Drawing:
     """Draw a graph and tell its motifs."""
-    b = Builder(values.shared(seed))
+    b = Builder(shared(seed))
     names = list(MOTIFS)
     weights = [MOTIFS[name][1] for name in names]
     for _ in range(b.rng.choice((1, 1, 2, 2, 3, 3, 4, 5))):
         if len(b.nodes) > MOST_NODES:
             break
         (name,) = b.rng.choices(names, weights)
-        b.scope = b.rng.choice(values.SCOPES)
+        b.scope = b.rng.choice(SCOPES)
         before = len(b.nodes)
-        with contextlib.suppress(values.TooLargeError):
+        with contextlib.suppress(TooLargeError):
             MOTIFS[name][0](b)
         if len(b.nodes) > before:
             b.shared.motifs.append(name)

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.values import (
+from tests.fuzz.exact.builder import (
     INT64,
     Attributes,
+    Builder,
     Dim,
     Open,
     Shape,

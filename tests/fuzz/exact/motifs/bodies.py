@@ -7,14 +7,13 @@ import onnx
 from onnx import helper
 
 from tests.fuzz.exact import spelling as sp
-from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.motifs import linear, norms, oddities, rows, shape_arithmetic
-from tests.fuzz.exact.values import BOOL, INT64, Val, is_static
+from tests.fuzz.exact.builder import BOOL, INT64, Builder, Val, is_static
+from tests.fuzz.exact.motifs import layers, oddities, rows
 
 INNER: tuple[Callable[[Builder], None], ...] = (
-    linear.one_layer, linear.layers_in_a_row, linear.same_source, rows.repeated_rows,
-    norms.constant_chain, norms.swish, norms.gelu, norms.layer_norm, oddities.no_ops,
-    oddities.pairs, oddities.twins, shape_arithmetic.computed_reshape,
+    layers.one_layer, layers.layers_in_a_row, layers.same_source, rows.repeated_rows,
+    layers.constant_chain, layers.swish, layers.gelu, layers.layer_norm,
+    oddities.no_ops, oddities.pairs, oddities.twins, rows.computed_reshape,
 )  # fmt: skip
 """Motifs that a body may have: none that must make an input."""
 
@@ -41,7 +40,7 @@ def _same_shape(b: Builder, x: Val) -> Val:
     """Do something that keeps the shape: a square layer, a factor, an activation."""
     kind = b.rng.random()
     if kind < 0.4 and _is_plain(x):
-        return linear.layer(b, x, x.width)
+        return layers.layer(b, x, x.width)
     if kind < 0.6:
         return sp.binary(b, b.rng.choice(("Add", "Mul", "Sub")), x, rows.operand(b, x))
     if kind < 0.7:

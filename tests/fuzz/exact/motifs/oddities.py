@@ -5,8 +5,7 @@ import math
 import numpy as np
 
 from tests.fuzz.exact import spelling as sp
-from tests.fuzz.exact.builder import Builder
-from tests.fuzz.exact.values import BOOL, INT64, is_static, sizes
+from tests.fuzz.exact.builder import BOOL, INT64, Builder, is_static, sizes
 
 
 def no_ops(b: Builder) -> None:
