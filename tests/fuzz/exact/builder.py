@@ -7,7 +7,7 @@ import dataclasses
 import itertools
 import math
 import random
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -72,14 +72,7 @@ def sizes(shape: Iterable[Dim]) -> tuple[int, ...]:
 
 def elements(shape: Sequence[Dim], batch: int = 3) -> int:
     """Count the elements at some size of the batch."""
-    return math.prod(concrete(shape, batch))
-
-
-def concrete(shape: Iterable[Dim], batch: int) -> tuple[int, ...]:
-    """Put a size in the place of the batch."""
-    return tuple(
-        each if isinstance(each, int) else each.times * batch for each in shape
-    )
+    return math.prod(n if isinstance(n, int) else n.times * batch for n in shape)
 
 
 def broadcast(*shapes: Sequence[Dim]) -> Shape:
@@ -114,6 +107,11 @@ class Val:
     def rank(self) -> int:
         return len(self.shape)
 
+    def is_rows(self, least: int = 1) -> bool:
+        """Say whether its last axis has a known size that is small."""
+        last = self.shape[-1] if self.shape else 0
+        return isinstance(last, int) and least <= last <= 64
+
     @property
     def width(self) -> int:
         """The size of its last axis, which must be known."""
@@ -122,49 +120,32 @@ class Val:
         return last
 
 
-@dataclasses.dataclass
 class Shared:
-    """What a graph and the bodies within it have in common."""
+    """What a graph and the bodies within it have in common: drawn for the whole."""
 
-    rng: random.Random
-    draws: np.random.Generator
-    opset: int
-    dtype: np.dtype[Any]
-    batch: Dim
-    listed_weights: bool
-    named: str
-    numbers: Iterator[int]
-    functions: list[onnx.FunctionProto] = dataclasses.field(default_factory=list)
-    domains: dict[str, int] = dataclasses.field(default_factory=dict)
-    motifs: list[str] = dataclasses.field(default_factory=list)
+    def __init__(self, seed: int) -> None:
+        self.rng = rng = random.Random(seed)
+        self.draws = np.random.default_rng(seed)
+        self.batch: Dim = Open() if rng.random() < 0.2 else rng.choice((1, 1, 2, 3, 5))
+        self.opset = rng.randint(11, 21)
+        self.dtype = np.dtype(np.float64 if rng.random() < 0.25 else np.float32)
+        self.listed_weights = rng.random() < 0.15
+        self.named = rng.choice(("", "plain", "modules"))
+        self.numbers = itertools.count()
+        self.functions = list[onnx.FunctionProto]()
+        self.domains = dict[str, int]()
+        self.motifs = list[str]()
 
 
 def port(value: Val) -> onnx.ValueInfoProto:
     """Declare a value; a multiple of the batch has a symbol of its own."""
+    symbols = {1: "N"}
     dims: list[int | str] = [
-        each
-        if isinstance(each, int)
-        else ("N" if each == Open() else f"N_times_{each.times}")
-        for each in value.shape
+        n if isinstance(n, int) else symbols.get(n.times, f"N_times_{n.times}")
+        for n in value.shape
     ]
     kind = helper.np_dtype_to_tensor_dtype(value.dtype)
     return helper.make_tensor_value_info(value.name, kind, dims)
-
-
-def shared(seed: int) -> Shared:
-    """Draw what holds for a whole graph."""
-    rng = random.Random(seed)
-    batch: Dim = Open() if rng.random() < 0.2 else rng.choice((1, 1, 2, 3, 5))
-    return Shared(
-        rng,
-        np.random.default_rng(seed),
-        rng.randint(11, 21),
-        np.dtype(np.float64 if rng.random() < 0.25 else np.float32),
-        batch,
-        rng.random() < 0.15,
-        rng.choice(("", "plain", "modules")),
-        itertools.count(),
-    )
 
 
 class Builder:
@@ -319,13 +300,8 @@ class Builder:
 
     def rows(self, least: int = 2, most: int = 4) -> Val:
         """Choose or make a value of rows: its last axis has a known size."""
-        found = self.pick(
-            lambda each: (
-                least <= each.rank <= most
-                and isinstance(each.shape[-1], int)
-                and 2 <= each.shape[-1] <= 64
-            )
-        )
+        fits = range(least, most + 1)
+        found = self.pick(lambda each: each.rank in fits and each.is_rows(2))
         return found or self.source(least, most)
 
     def source(self, least: int = 2, most: int = 4) -> Val:
@@ -364,11 +340,5 @@ class Builder:
 
     def graph(self, outputs: Sequence[Val], name: str) -> onnx.GraphProto:
         """Write the graph."""
-        made = helper.make_graph(
-            self.nodes,
-            name,
-            [port(each) for each in self.inputs],
-            [port(each) for each in outputs],
-            self.initializers,
-        )
-        return made
+        ports = ([port(each) for each in listed] for listed in (self.inputs, outputs))
+        return helper.make_graph(self.nodes, name, *ports, self.initializers)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import onnx
 from onnx import helper
 
-from tests.fuzz.exact.builder import SCOPES, Builder, TooLargeError, Val, shared
+from tests.fuzz.exact.builder import SCOPES, Builder, Shared, TooLargeError, Val
 from tests.fuzz.exact.motifs import attention, bodies, layers, oddities, rows
 
 Motif = Callable[[Builder], None]
@@ -65,7 +65,7 @@ def draw(seed: int) -> onnx.ModelProto:
 
 def drawing(seed: int) -> Drawing:
     """Draw a graph and tell its motifs."""
-    b = Builder(shared(seed))
+    b = Builder(Shared(seed))
     names = list(MOTIFS)
     weights = [MOTIFS[name][1] for name in names]
     for _ in range(b.rng.choice((1, 1, 2, 2, 3, 3, 4, 5))):

@@ -33,7 +33,7 @@ def _body(b: Builder, x: Val, *, steps: int = 1) -> tuple[Builder, Val]:
 
 
 def _is_plain(x: Val) -> bool:
-    return 2 <= x.rank <= 4 and isinstance(x.shape[-1], int) and 2 <= x.shape[-1] <= 64
+    return 2 <= x.rank <= 4 and x.is_rows(2)
 
 
 def _same_shape(b: Builder, x: Val) -> Val:

@@ -173,7 +173,7 @@ def row_wise(b: Builder, x: Val) -> Val:
             axes = sorted({axis % x.rank, b.rng.randint(0, x.rank - 1)})
         keep = x.rank <= len(axes) or b.chance(0.6)
         return sp.reduce(b, name, x, axes, keep=keep)
-    return layer(b, x) if _is_rows(x) else sp.unary(b, x)
+    return layer(b, x) if x.rank >= 2 and x.is_rows() else sp.unary(b, x)
 
 
 def _layer_norm(b: Builder, x: Val, axis: int) -> Val:
@@ -187,10 +187,6 @@ def _layer_norm(b: Builder, x: Val, axis: int) -> Val:
     given = at if b.chance(0.5) else at - x.rank
     attributes = {} if given == -1 and b.chance(0.5) else {"axis": given}
     return b.op("LayerNormalization", inputs, x.shape, attributes)
-
-
-def _is_rows(x: Val) -> bool:
-    return x.rank >= 2 and isinstance(x.shape[-1], int) and 1 <= x.shape[-1] <= 64
 
 
 def repeated_rows(b: Builder) -> None:
@@ -237,7 +233,7 @@ def repeated_layer(b: Builder) -> None:
         many = _viewed(b, many)
     if b.chance(0.4) and many.rank >= 2:
         many = row_wise(b, many)
-    if many.rank >= 2 and _is_rows(many):
+    if many.rank >= 2 and many.is_rows():
         layer(b, many, 16)
 
 
