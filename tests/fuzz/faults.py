@@ -12,16 +12,13 @@ from tests.fuzz.texts import HUGE, MARKUP
 Fault = Callable[[onnx.ModelProto], object]
 
 
-def _swap(m: onnx.ModelProto, one: int, other: int) -> None:
-    first = onnx.NodeProto()
-    first.CopyFrom(m.graph.node[one])
-    m.graph.node[one].CopyFrom(m.graph.node[other])
-    m.graph.node[other].CopyFrom(first)
+def _order(*order: int) -> Fault:
+    def fault(m: onnx.ModelProto) -> None:
+        nodes = onnx.GraphProto(node=m.graph.node).node
+        for at, source in enumerate(order):
+            m.graph.node[at].CopyFrom(nodes[source])
 
-
-def _reverse(m: onnx.ModelProto) -> None:
-    for at in range(len(m.graph.node) // 2):
-        _swap(m, at, len(m.graph.node) - 1 - at)
+    return fault
 
 
 def _each_node(change: Callable[[onnx.NodeProto], object]) -> Fault:
@@ -121,10 +118,6 @@ def _dim(field: str, value: object) -> Fault:
     return _type("image", lambda t: setattr(t.tensor_type.shape.dim[0], field, value))
 
 
-def _kind(value: int) -> Fault:
-    return _type("image", lambda t: setattr(t.tensor_type, "elem_type", value))
-
-
 def _tokens(*shape: int) -> Fault:
     tensor = numpy_helper.from_array(np.array(shape), "tokens")
     return lambda m: m.graph.initializer[0].CopyFrom(tensor)
@@ -154,20 +147,16 @@ def _stamp(key: str, value: str) -> Fault:
 
 FAULTS: dict[str, Fault] = {
     "cycle": lambda m: m.graph.node[1].input.__setitem__(0, "q"),
-    "self-loop": lambda m: m.graph.node[1].input.__setitem__(0, "r"),
-    "unsorted": lambda m: _swap(m, 0, 6),
-    "reversed": _reverse,
-    "node-twice": lambda m: m.graph.node.append(m.graph.node[1]),
+    "unsorted": _order(6, 1, 2, 3, 4, 5, 0),
+    "reversed": _order(*reversed(range(10))),
     "output-twice": lambda m: m.graph.node[2].output.__setitem__(0, "a"),
     "names-twice": _each_node(lambda n: setattr(n, "name", "same")),
     "initializer-twice": lambda m: m.graph.initializer.append(m.graph.initializer[0]),
     "input-twice": lambda m: m.graph.input.append(m.graph.input[0]),
     "graph-output-twice": lambda m: m.graph.output.append(m.graph.output[0]),
     "input-and-initializer": lambda m: m.graph.input.add(name="w"),
-    "initializer-is-output": lambda m: m.graph.output.add(name="w"),
     "input-is-output": lambda m: m.graph.output.add(name="image"),
     "input-is-made": lambda m: m.graph.node[1].output.__setitem__(0, "image"),
-    "initializer-is-made": lambda m: m.graph.node[1].output.__setitem__(0, "w"),
     "no-node-names": _each_node(lambda n: setattr(n, "name", "")),
     "no-output-name": lambda m: m.graph.node[1].output.__setitem__(0, ""),
     "no-input-name": lambda m: setattr(m.graph.input[0], "name", ""),
@@ -179,11 +168,9 @@ FAULTS: dict[str, Fault] = {
     "no-inputs-of-a-node": _each_node(lambda n: n.ClearField("input")),
     "input-left-out": _each_node(lambda n: n.input.__setitem__(0, "")),
     "too-many-inputs": _each_node(lambda n: n.input.extend(["w"] * 9)),
-    "too-many-outputs": _each_node(lambda n: n.output.extend(["e1", "e2"])),
     "no-nodes": lambda m: m.graph.ClearField("node"),
     "no-inputs": lambda m: m.graph.ClearField("input"),
     "no-graph-outputs": lambda m: m.graph.ClearField("output"),
-    "no-initializers": lambda m: m.graph.ClearField("initializer"),
     "no-graph": lambda m: m.ClearField("graph"),
     "no-functions": lambda m: m.ClearField("functions"),
     "unknown-output": lambda m: m.graph.output.add(name="nowhere"),
@@ -203,25 +190,19 @@ FAULTS: dict[str, Fault] = {
     "opset-twice": lambda m: m.opset_import.append(helper.make_opsetid("", 9)),
     "ir-0": lambda m: setattr(m, "ir_version", 0),
     "ir-99": lambda m: setattr(m, "ir_version", 99),
-    "ir-negative": lambda m: setattr(m, "ir_version", -1),
     "dims-negative": _set("w", dims=[-4, 3, 3, 3]),
     "dims-huge": _set("w", dims=[2**40, 2**40]),
     "dims-wrong": _set("w", dims=[4, 4]),
-    "dims-many": _set("w", dims=[1] * 200),
     "raw-short": _set("w", raw_data=b"\0\0\0"),
-    "raw-none": _set("w", raw_data=b""),
     "two-kinds-of-data": _set("w", float_data=[1.0]),
     "type-undefined": _set("w", data_type=0),
     "type-99": _set("w", data_type=99),
     "type-string": _set("w", data_type=8),
-    "type-complex": _set("w", data_type=15),
     "type-int4": _set("w", data_type=22),
-    "type-negative": _set("w", data_type=-1),
     "nan-weights": _set("b", raw_data=b"\xff" * 16),
     "external-absolute": _external("location", "/etc/hostname"),
     "external-above": _external("location", "../../../../etc/hostname"),
     "external-missing": _external("location", "none.bin"),
-    "external-nameless": _external("location", ""),
     "external-folder": _external("location", "."),
     "external-zero-byte": _external("location", "a\0b"),
     "external-offset-word": _external("offset", "zero"),
@@ -229,17 +210,13 @@ FAULTS: dict[str, Fault] = {
     "external-offset-negative": _external("offset", "-8"),
     "external-length-negative": _external("length", "-432"),
     "input-untyped": lambda m: m.graph.input[0].ClearField("type"),
-    "input-type-0": _kind(0),
-    "input-type-99": _kind(99),
-    "input-string": _kind(8),
-    "input-double": _kind(11),
+    "input-type-99": _type("image", lambda t: setattr(t.tensor_type, "elem_type", 99)),
+    "input-string": _type("image", lambda t: setattr(t.tensor_type, "elem_type", 8)),
+    "input-double": _type("image", lambda t: setattr(t.tensor_type, "elem_type", 11)),
     "input-shapeless": _type("image", lambda t: t.tensor_type.ClearField("shape")),
     "input-sequence": _type("image", lambda t: t.sequence_type.elem_type.SetInParent()),
     "input-optional": _type("image", lambda t: t.optional_type.elem_type.SetInParent()),
     "input-map": _type("image", lambda t: setattr(t.map_type, "key_type", 7)),
-    "input-sparse": _type(
-        "image", lambda t: setattr(t.sparse_tensor_type, "elem_type", 1)
-    ),
     "output-untyped": lambda m: m.graph.output[0].ClearField("type"),
     "output-shapeless": _type("y", lambda t: t.tensor_type.ClearField("shape")),
     "output-other-shape": _type(

@@ -25,10 +25,8 @@ def npz(**arrays: np.ndarray) -> bytes:
 def member(shape: str, descr: str = "'<f4'", more: int = 0) -> bytes:
     """Return an ``.npy`` whose header says what one likes, and so many zeros."""
     header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}"
-    text = header.ljust(117) + "\n"
-    return (
-        b"\x93NUMPY\x01\0" + struct.pack("<H", len(text)) + text.encode() + bytes(more)
-    )
+    text = f"{header:117}\n".encode()
+    return b"\x93NUMPY\x01\0" + struct.pack("<H", len(text)) + text + bytes(more)
 
 
 def archive(members: Mapping[str, bytes], kind: int = zipfile.ZIP_DEFLATED) -> bytes:
@@ -88,9 +86,9 @@ def broken_frames() -> Iterator[tuple[str, bytes]]:
         "nan": npz(**{**GOOD, "image": np.full_like(image, np.nan)}),
         "infinite": npz(**{**GOOD, "image": np.full_like(image, -np.inf)}),
         "largest": npz(**{**GOOD, "image": np.full_like(image, 3e38)}),
-        "checksum": _other_checksum(good),
-        "encrypted": _encrypted(good),
-        "size-lies": _other_size(good),
+        "checksum": _entry(good, 16, struct.pack("<I", zlib.crc32(member("(1,)")))),
+        "encrypted": _entry(good, 8, b"\x01\0"),
+        "size-lies": _entry(good, 24, struct.pack("<I", 2**31)),
     }.items()
 
 
@@ -101,17 +99,7 @@ def _twice(good: bytes) -> bytes:
     return content.getvalue().replace(b"image2.npy", b"memory.npy")
 
 
-def _other_checksum(good: bytes) -> bytes:
-    checksum = zlib.crc32(member("(1,)"))
-    at = good.index(b"PK\x01\x02")
-    return good[: at + 16] + struct.pack("<I", checksum) + good[at + 20 :]
-
-
-def _encrypted(good: bytes) -> bytes:
-    at = good.index(b"PK\x01\x02")
-    return good[: at + 8] + b"\x01\0" + good[at + 10 :]
-
-
-def _other_size(good: bytes) -> bytes:
-    at = good.index(b"PK\x01\x02")
-    return good[: at + 24] + struct.pack("<I", 2**31) + good[at + 28 :]
+def _entry(good: bytes, offset: int, field: bytes) -> bytes:
+    """Write a field of the first entry of an archive's directory."""
+    at = good.index(b"PK\x01\x02") + offset
+    return good[:at] + field + good[at + len(field) :]
