@@ -9,8 +9,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from tests.fuzz.faults import FAULTS
-from tests.fuzz.graphs import branch_graph, seed_graph
+from tests.fuzz.graphs import FAULTS, branch_graph, seed_graph
 
 REFUSED = {
     "cycle": "not a valid ONNX graph .*cycle",
