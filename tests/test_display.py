@@ -1,6 +1,5 @@
-"""A frame in one line, a plan as a table; how numbers are written."""
+"""A plan as a table; how numbers are written."""
 
-import numpy as np
 import pytest
 
 from me2e_compress.display import (
@@ -14,13 +13,6 @@ from me2e_compress.display import (
 from me2e_compress.quantization.plan import QuantPlan
 from me2e_compress.quantization.plan.decision import Decision
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.runtime.frames import Frame
-
-
-def test_a_frame_does_not_show_its_pictures() -> None:
-    frame = Frame(3, True, {"img": np.zeros((6, 3, 48, 80), np.float32)})
-
-    assert repr(frame) == "<Frame: 3, starts a scene; img [6, 3, 48, 80]>"
 
 
 def test_a_plan_is_told_by_module_and_rule() -> None:

@@ -5,7 +5,6 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from benchmarks.bench_runtime import Row, table
 from benchmarks.gpu_table import Found
 from benchmarks.gpu_table import table as gpu_table
 from benchmarks.original_patterns import FORMS, restored
-from benchmarks.runtime_files import ENTRIES, REFERENCE, TORCH, made, static
+from benchmarks.runtime_files import REFERENCE
 from benchmarks.subject import Subject
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule
 from me2e_compress.runtime.energy.energy_result import Absent
@@ -191,32 +190,6 @@ def test_every_lever_answers_as_none_does(tmp_path: Path) -> None:
     feeds = {"x": x, "prev_x": x}
     for lever in LEVERS.values():
         assert np.allclose(answer(feeds, Lever()), answer(feeds, lever), atol=1e-5)
-
-
-def test_files_of_constant_matrices_are_made_of_the_folded_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ran = list[list[str]]()
-
-    def noted(command: list[str], **_: object) -> object:
-        ran.append(command)
-        at = command.index("-o") + 1 if "-o" in command else -1
-        Path(command[at]).touch()
-        return SimpleNamespace(returncode=0, stderr="")
-
-    monkeypatch.setattr(subprocess, "run", noted)
-    frozen = static(ENTRIES)
-
-    assert [n for n in ENTRIES if frozen[n] == ENTRIES[n]] == [
-        name for name, entry in ENTRIES.items() if entry.engine in TORCH
-    ]
-    subject = Subject("vad-tiny", tmp_path)
-    assert made(subject, frozen["onnxsim + onnxruntime"], 1) is None
-    folded, simplified = ran
-    assert "import-normalize,freeze-inputs,fold-constants" in folded
-    assert simplified[-2:] == [
-        str(tmp_path / name) for name in ("static-source.onnx", "static-onnxsim.onnx")
-    ]
 
 
 def test_the_table_compares_with_the_first_row() -> None:

@@ -18,13 +18,11 @@ import me2e_compress as me2e
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.inputs import ModelInputs
 from me2e_compress.driving.adapter.recurrent import FirstValues
-from me2e_compress.driving.contract import Observation, Trajectory, checked
 from me2e_compress.driving.onnx_policy import OnnxPolicy, recurrent_of
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import DTYPES, Session, replay
-from me2e_compress.shipped.drivers import shipped
-from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.shipped.drivers import sample_frames, shipped
 from me2e_compress.workflows.inspect import inspect
 from tests.command import Cli, cli, command
 from tests.docs.pages import ROOT, Block, blocks
@@ -191,27 +189,6 @@ def test_the_front_camera_is_recorded_cloned_and_plans(tmp_path: Path) -> None:
     assert "front.toml" in shown.text
 
 
-def decided(model: Path) -> list[object]:
-    """Return three plans of a driver from the start of a route."""
-    policy, rig = OnnxPolicy.open(model), CameraRig(96, 160)
-    policy.reset(None)
-    random = np.random.default_rng(0)
-    plans = list[object]()
-    for step in range(3):
-        seen = Observation(
-            50_000 * step,
-            random.integers(0, 256, (6, 96, 160, 3)).astype(np.uint8),
-            rig.lidar2img,
-            random.normal(size=18).astype(np.float32),
-            2,
-            5.0,
-        )
-        answer = checked(policy.plan(seen))
-        assert isinstance(answer, Trajectory)
-        plans.append(answer.points.tolist())
-    return plans
-
-
 def test_a_stack_that_is_cut_and_joined_decides_as_the_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -223,7 +200,16 @@ def test_a_stack_that_is_cut_and_joined_decides_as_the_whole(
 
     made = me2e.join("stack.toml", "whole.onnx")
 
-    assert decided(made.output) == decided(shipped("highway"))
+    whole = shipped("highway")
+    frames = me2e.CalibrationSet(sample_frames(whole) or tmp_path)
+    for joined, one in zip(
+        *(replay(Session(path), frames, ["plan"]) for path in (made.output, whole)),
+        strict=True,
+    ):
+        assert joined["plan"].tolist() == one["plan"].tolist()
+    policies = map(OnnxPolicy.open, (made.output, whole))
+    read, shown = ((p.recurrent, p.normalization, p.image_size) for p in policies)
+    assert read == shown
 
 
 def test_the_commands_of_stacks_run(cli: Cli) -> None:
