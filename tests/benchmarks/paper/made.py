@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from benchmarks.paper.drives import FILE, Int8Counts, KeptFacts, ModelFacts
 from me2e_compress.metrics.infraction import InfractionKind
@@ -50,9 +51,7 @@ def _routes(
                 "collision" if hit else "completed",
                 ((kind.value, 5_000_000, "car 3"),) if hit else (),
                 round(150 + 2.0 * late + random.normal(0, 20), 3),
-                round(
-                    float(np.clip(0.8 - 0.02 * late + random.normal(0, 0.1), 0, 1)), 3
-                ),
+                round(float(np.clip(random.normal(0.8 - late / 50, 0.1), 0, 1)), 3),
                 20_000_000,
                 400 // (late + 1),
                 (50_000 * (late + 1),) * 4,
@@ -64,6 +63,10 @@ def _routes(
     return tuple(made)
 
 
+def _whole(values: npt.NDArray[np.float64]) -> tuple[int, ...]:
+    return tuple(values.astype(int).tolist())
+
+
 def _fact(name: str) -> ModelFacts:
     random = np.random.default_rng(len(name))
     int8 = Int8Counts(80, 60, 40) if name in ("full", "prediction") else None
@@ -73,7 +76,7 @@ def _fact(name: str) -> ModelFacts:
     samples = slow * random.lognormal(0.0, 0.05, 300)
     modules = {
         part: tuple(
-            int(each) for each in share * 430_000 * random.lognormal(0, 0.1, 60)
+            (share * 430_000 * random.lognormal(0, 0.1, 60)).astype(int).tolist()
         )
         for part, share in (("backbone", 0.5), ("map", 0.3), ("planner", 0.2))
     }
@@ -85,7 +88,7 @@ def _fact(name: str) -> ModelFacts:
         1_513_999 - 10_000 * name.count("-"),
         835_967_776 - 10**7 * name.count("-"),
         int8,
-        tuple(int(each) for each in samples),
+        _whole(samples),
         modules if name == "float" else {},
         modelled_j=0.004 - 1e-5 * (int8.operators if int8 else 0),
     )

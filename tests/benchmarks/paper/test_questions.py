@@ -85,23 +85,17 @@ def test_bad_questions_are_refused_in_one_line(
 
 
 @pytest.mark.parametrize(
-    ("asked", "value", "side"),
+    ("asked", "sides"),
     [
-        (question("above"), 0.1, 1),
-        (question("above"), -0.1, -1),
-        (question("below"), -0.1, 1),
-        (question("below"), 0.1, -1),
-        (question("above", -2.0), -1.9, 1),
-        (question("above", -2.0), -2.1, -1),
-        (question("above", 6.0, 1.0), 6.1, 1),
-        (question("above", 6.0, 1.0), 1.3, 0),
-        (question("above", 6.0, 1.0), 0.9, -1),
-        (question("within", 10.0), -7.8, 1),
-        (question("within", 10.0), -36.9, -1),
+        (question("above"), {0.1: 1, -0.1: -1}),
+        (question("below"), {-0.1: 1, 0.1: -1}),
+        (question("above", -2.0), {-1.9: 1, -2.1: -1}),
+        (question("above", 6.0, 1.0), {6.1: 1, 1.3: 0, 0.9: -1}),
+        (question("within", 10.0), {-7.8: 1, -36.9: -1}),
     ],
 )
-def test_the_side_of_a_value(asked: PaperQuestion, value: float, side: int) -> None:
-    assert asked.judge(value, certain)[0] == side
+def test_the_side_of_a_value(asked: PaperQuestion, sides: dict[float, int]) -> None:
+    assert {value: asked.judge(value, certain)[0] for value in sides} == sides
 
 
 VALUES, MARGINS = st.floats(-20, 20), st.floats(0.0, 10.0)

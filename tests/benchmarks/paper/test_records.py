@@ -39,12 +39,11 @@ minus = "float.fps-1"
 
 
 def test_the_page_is_that_of_the_drives_that_are_kept() -> None:
-    page = PAGE
-    text = page.path.read_text("utf-8")
+    text = PAGE.path.read_text("utf-8")
 
     [asked_at] = re.findall("; questions committed (.*?)\\. All", text)
 
-    assert text == page.text(asked_at)
+    assert text == PAGE.text(asked_at)
 
 
 def test_drives_that_are_kept_make_the_same_tables(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from tests.fuzz.exact import spelling as sp
-from tests.fuzz.exact.builder import BOOL, Builder, Dim, Val, product
+from tests.fuzz.exact.builder import BOOL, Builder, Dim, Val, product, sizes
 from tests.fuzz.exact.motifs.layers import layer
 
 
@@ -58,25 +58,24 @@ def _merged_heads(b: Builder, x: Val, s: _Sizes, *, last: bool) -> Val:
 def _scale(b: Builder, x: Val, s: _Sizes) -> Val:
     kind = b.rng.choice(("Mul", "Div"))
     root = math.sqrt(s.depth) if kind == "Div" else 1 / math.sqrt(s.depth)
-    factor = sp.scalar(b, root)
-    return sp.either_way(b, kind, x, factor)
+    return sp.either_way(b, kind, x, sp.scalar(b, root))
 
 
 def _source(b: Builder, s: _Sizes, count: int, width: int) -> Val:
     """Make tokens [B, J, width] or [J, B, width], which the batch may share."""
-    pair: tuple[Dim, Dim] = (count, s.batch) if s.merged else (s.batch, count)
+    at = int(s.merged)  # the axis of the batch
+    whole: tuple[Dim, ...] = (count, s.batch) if s.merged else (s.batch, count)
+    whole += (width,)
     if isinstance(s.batch, int) and b.chance(0.4):
-        one = (count, 1, width) if s.merged else (1, count, width)
+        one, repeats = list(sizes(whole)), [1, 1, 1]
+        one[at], repeats[at] = 1, s.batch
         small = b.input(one)
-        whole = (count, s.batch, width) if s.merged else (s.batch, count, width)
         if b.chance(0.4):
-            repeats = (1, s.batch, 1) if s.merged else (s.batch, 1, 1)
             return sp.tile(b, small, repeats)
         if b.chance(0.7):
-            return sp.expand(b, small, whole)
-        return sp.binary(b, "Add", small, b.input([*pair, width]))
-    found = b.pick(lambda each: each.shape == (*pair, width))
-    return found or b.input([*pair, width])
+            return sp.expand(b, small, sizes(whole))
+        return sp.binary(b, "Add", small, b.input(whole))
+    return b.pick(lambda each: each.shape == whole) or b.input(whole)
 
 
 def _projected(b: Builder, x: Val, s: _Sizes) -> Val:
@@ -136,12 +135,9 @@ def attention(b: Builder) -> None:
 
 
 def _joined(b: Builder, mixed: Val, s: _Sizes) -> None:
-    if s.merged:
-        turned = sp.transpose(b, mixed, (1, 0, 2))
-        rows = sp.reshape(b, turned, (s.queries, s.batch, s.wide))
-    else:
-        turned = sp.transpose(b, mixed, (0, 2, 1, 3))
-        rows = sp.reshape(b, turned, (s.batch, s.queries, s.wide))
+    turned = sp.transpose(b, mixed, (1, 0, 2) if s.merged else (0, 2, 1, 3))
+    lead = (s.queries, s.batch) if s.merged else (s.batch, s.queries)
+    rows = sp.reshape(b, turned, (*lead, s.wide))
     if b.chance(0.6):
         layer(b, rows)
 
@@ -169,9 +165,7 @@ def shared_operand(b: Builder) -> None:
     if b.chance(0.4):
         right = _scale(b, right, s)
     inner = s.depth if last else s.keys
-    lead = right.shape[:-2]
-    left = b.input([*lead, s.queries, inner])
-    sp.matmul(b, left, right)
+    sp.matmul(b, b.input([*right.shape[:-2], s.queries, inner]), right)
 
 
 DOMAINS = (

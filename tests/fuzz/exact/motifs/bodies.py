@@ -95,8 +95,7 @@ def loop(b: Builder) -> None:
     if b.chance(0.5):
         y = _same_shape(body, y)
     y = body.op("Tanh", [y], y.shape)
-    again = body.op("Identity", [go], (), dtype=BOOL)
-    outputs = [again, y]
+    outputs = [body.op("Identity", [go], (), dtype=BOOL), y]
     results = [Val(b.fresh("v"), x.shape, x.dtype)]
     if b.chance(0.4):
         outputs.append(sp.unary(body, y))

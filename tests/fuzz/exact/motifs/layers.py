@@ -145,13 +145,11 @@ def on_columns(b: Builder) -> None:
         width = b.rng.choice((1, 2, 4, 8))
         kind = b.rng.random()
         if kind < 0.3 and is_static(x.shape):
-            lead = [size for size in x.shape[:-1] if isinstance(size, int)]
-            parts.append(b.const(b.normal((*lead, width))))
+            parts.append(b.const(b.normal((*sizes(x.shape[:-1]), width))))
         elif kind < 0.6:
             small = b.input([*([1] * (x.rank - 1)), width])
-            lead = [size if isinstance(size, int) else 1 for size in x.shape[:-1]]
             if is_static(x.shape):
-                parts.append(sp.expand(b, small, (*lead, width)))
+                parts.append(sp.expand(b, small, (*sizes(x.shape[:-1]), width)))
         elif kind < 0.8:
             parts.append(sp.matmul(b, x, b.weight((x.width, width))))
         else:

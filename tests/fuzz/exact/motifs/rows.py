@@ -273,8 +273,7 @@ def computed_reshape(b: Builder) -> None:
             if b.chance(0.5):
                 parts.append(b.ints(-1))
             else:
-                two = [_dim(b, x, at), _dim(b, x, at + 1)]
-                both = b.op("Mul", two, ())
+                both = b.op("Mul", [_dim(b, x, at), _dim(b, x, at + 1)], ())
                 parts.append(sp.unsqueeze(b, both, 0))
         else:
             dims.append(x.shape[axis])
