@@ -105,9 +105,9 @@ def image(seed: int) -> dict[str, npt.NDArray[np.float32]]:
     return {"image": array.astype(np.float32)}
 
 
-def image_frames(count: int = 2) -> list[Frame]:
-    """Give one scene of frames of :func:`conv_attention`, its memory left out."""
-    return [Frame(at, at == 0, dict(image(at))) for at in range(count)]
+def image_frames() -> list[Frame]:
+    """Give one scene of two frames of :func:`conv_attention`, its memory left out."""
+    return [Frame(at, at == 0, dict(image(at))) for at in range(2)]
 
 
 def turn_softmax(model: ir.Model) -> None:

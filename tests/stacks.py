@@ -75,7 +75,7 @@ head (float[4,32] feats, float[4,32] prev_bev)
 """Parts with a layer to quantize each; ``w`` is drawn."""
 
 
-def write_dense(folder: Path, toml: str = TWO_PARTS) -> Path:
+def write_dense(folder: Path) -> Path:
     """Write parts that have a layer to quantize; return the TOML."""
     random = np.random.default_rng(0)
     for name, text in DENSE.items():
@@ -86,16 +86,14 @@ def write_dense(folder: Path, toml: str = TWO_PARTS) -> Path:
         layer.replace_input_with(1, weight)
         graph.save(model, folder / f"{name}.onnx")
     path = folder / "stack.toml"
-    path.write_text(toml)
+    path.write_text(TWO_PARTS)
     return path
 
 
-def dense_frames(folder: Path, count: int = 8) -> Path:
-    """Record frames for it: scenes of two."""
-    random = np.random.default_rng(1)
-    images = random.normal(size=(count, 4, 16)).astype(np.float32)
-    frames = [{"img": each} for each in images]
-    return record(folder / "frames", frames, tuple(range(0, count, 2)))
+def dense_frames(folder: Path) -> Path:
+    """Record frames for it: four scenes of two."""
+    images = np.random.default_rng(1).normal(size=(8, 4, 16)).astype(np.float32)
+    return record(folder / "frames", [{"img": each} for each in images], (0, 2, 4, 6))
 
 
 def ones(*starts: bool) -> list[Frame]:

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -44,13 +43,10 @@ BODY = """
     ["/planner/Add"] plan = Add (offsets, "planner.ahead")
     ["/planner/Identity"] prev_memory_out = Identity (timestamp)
 """
+ROWS = ("agents", "lanes", "motions", "occupancy", "prev_bev_out")
 OUTPUTS = {
     "plan": (1, 6, 2),
-    "agents": (1, WIDTH),
-    "lanes": (1, WIDTH),
-    "motions": (1, WIDTH),
-    "occupancy": (1, WIDTH),
-    "prev_bev_out": (1, WIDTH),
+    **dict.fromkeys(ROWS, (1, WIDTH)),
     "prev_memory_out": (1,),
 }
 METADATA = {
@@ -61,13 +57,7 @@ METADATA = {
 }
 
 
-def write_model(
-    path: Path,
-    *,
-    size: tuple[int, int] = (16, 24),
-    seed: int = 0,
-    metadata: Mapping[str, str] = METADATA,
-) -> Path:
+def write_model(path: Path, *, size: tuple[int, int] = (16, 24), seed: int = 0) -> Path:
     """Write it; its plan goes 4 m/s straight ahead, more or less."""
     rows, columns = size
     outputs = ", ".join(
@@ -82,7 +72,7 @@ def write_model(
     )
     for name, value in _weights(seed).items():
         model.graph.initializer.append(numpy_helper.from_array(value, name))
-    for key, text in metadata.items():
+    for key, text in METADATA.items():
         model.metadata_props.add(key=key, value=text)
     onnx.save(model, path)
     return path
@@ -92,22 +82,17 @@ def write_shipped(folder: Path) -> None:
     """Write a model and a card that fits it for all that ship, as the package does."""
     folder.mkdir(exist_ok=True)
     for seed, name in enumerate(SHIPPED):
-        model = write_model(folder / f"{name}.onnx", seed=seed)
-        card = _card(model.read_bytes(), seed)
+        content = write_model(folder / f"{name}.onnx", seed=seed).read_bytes()
+        card = {
+            "sha256": hashlib.sha256(content).hexdigest(),
+            "bytes": len(content),
+            "parameters": sum(value.size for value in _weights(0).values()),
+            "seed": seed,
+            "data": {"seeds": [100], "frames": 1},
+            "command": "none: drawn at random",
+            **{"hours": None, "scores": None},
+        }
         (folder / f"{name}.json").write_text(json.dumps(card))
-
-
-def _card(content: bytes, seed: int) -> dict[str, object]:
-    return {
-        "sha256": hashlib.sha256(content).hexdigest(),
-        "bytes": len(content),
-        "parameters": sum(value.size for value in _weights(0).values()),
-        "seed": seed,
-        "data": {"seeds": [100], "frames": 1},
-        "command": "none: drawn at random",
-        "hours": None,
-        "scores": None,
-    }
 
 
 def record_driver(folder: Path, count: int) -> Path:
@@ -141,9 +126,7 @@ def _weights(seed: int) -> dict[str, np.ndarray]:
         "bev_encoder.weight": draw(18, WIDTH) * np.float32(0.1),
         "bev_encoder.decay": np.array(0.5, np.float32),
         "track.weight": draw(WIDTH, WIDTH),
-        "map.weight": draw(WIDTH, WIDTH),
-        "motion.weight": draw(WIDTH, WIDTH),
-        "occ.weight": draw(WIDTH, WIDTH),
+        **{f"{name}.weight": draw(WIDTH, WIDTH) for name in ("map", "motion", "occ")},
         "planner.row": np.array([1, 1]),
         "planner.weight": draw(4 * WIDTH + 3, 12) * np.float32(0.1),
         "planner.shape": np.array([1, 6, 2]),
