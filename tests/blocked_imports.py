@@ -16,6 +16,7 @@ import pkgutil
 import sys
 import tempfile
 from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -35,7 +36,7 @@ def unimportable(package: ModuleType) -> dict[str, str]:
     for each in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
         if each.name.endswith("__main__"):
             continue
-        if error := error_of(lambda name=each.name: importlib.import_module(name)):
+        if error := error_of(partial(importlib.import_module, each.name)):
             found[each.name] = error
         elif each.ispkg:
             found |= unimportable(sys.modules[each.name])
@@ -60,7 +61,7 @@ def failures(gone: Collection[str]) -> dict[str, object]:
     sys.modules |= dict.fromkeys(gone)  # type: ignore[arg-type]  # None: not to be had
     package = importlib.import_module("me2e_compress")
     app = importlib.import_module("me2e_compress.cli.app")
-    names = {n: error_of(lambda n=n: getattr(package, n)) for n in package.__all__}
+    names = {n: error_of(partial(getattr, package, n)) for n in package.__all__}
     return {
         "help": {command: helped(command) for command in app.COMMANDS},
         "modules": unimportable(package),

@@ -340,5 +340,7 @@ class Builder:
 
     def graph(self, outputs: Sequence[Val], name: str) -> onnx.GraphProto:
         """Write the graph."""
-        ports = ([port(each) for each in listed] for listed in (self.inputs, outputs))
-        return helper.make_graph(self.nodes, name, *ports, self.initializers)
+        given, made = map(port, self.inputs), map(port, outputs)
+        return helper.make_graph(
+            self.nodes, name, list(given), list(made), self.initializers
+        )
