@@ -13,11 +13,11 @@ _WRITE_NOTHING = VIEWS | {"Constant", "DequantizeLinear"}
 
 
 def value_bytes(value: ir.Value) -> int | None:
-    """Return the bytes of a value; None where its shape or type is open."""
+    """Return the bytes of a value; None where its shape or type is open, or of text."""
     if value.const_value is not None:
         return int(value.const_value.nbytes)
     shape = static_shape(value)
-    if shape is None or value.dtype is None:
+    if shape is None or value.dtype in (None, ir.DataType.STRING):
         return None
     return math.ceil(math.prod(shape) * value.dtype.itemsize)
 
