@@ -8,7 +8,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import rewrite
-from me2e_compress.graph.stack.stack import JoinedStack
+from me2e_compress.graph.stack.join import JoinedStack
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
 from tests.frames import record

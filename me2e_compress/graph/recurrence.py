@@ -134,13 +134,16 @@ def sides(
 
 
 def _ports(values: Sequence[ir.Value]) -> dict[str, SessionPort]:
-    return {
-        str(value.name): SessionPort(
-            str(value.type), tuple(d if isinstance(d, int) else str(d) for d in shape)
-        )
-        for value in values
-        if (shape := value.shape) is not None
-    }
+    return {str(v.name): port_of(v) for v in values if v.shape is not None}
+
+
+def port_of(value: ir.Value) -> SessionPort:
+    """Describe a value as onnxruntime does; a shape that is not known is empty."""
+    kind, shape = str(value.type), value.shape
+    if isinstance(value.type, ir.TensorType):
+        kind = f"tensor({value.type.dtype.name.lower()})"
+    dims = () if shape is None else shape
+    return SessionPort(kind, tuple(d if isinstance(d, int) else d.value for d in dims))
 
 
 def _parse(text: str) -> dict[str, str | None]:

@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress import graph
-from me2e_compress.graph.stack.stack import JoinedStack
+from me2e_compress.graph.stack.join import JoinedStack
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.result import Result, Table, counted, megabytes, table
 
@@ -66,5 +66,4 @@ def join(stack: str | Path, output: str | Path, *, force: bool = False) -> JoinR
     with writing(outputs, (source, *joined.paths), force=force):
         graph.save(joined.model, output)
     fed = tuple(FedInput(*each) for each in joined.feeds())
-    parts = joined.joined.joints.order
-    return JoinResult(output, graph.file_bytes(output), parts, fed)
+    return JoinResult(output, graph.file_bytes(output), joined.order, fed)

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.stack.stack import JoinedStack
+from me2e_compress.graph.stack.join import JoinedStack
+from me2e_compress.graph.stack.split import split_stack
 from me2e_compress.registry import drafts
 from me2e_compress.workflows.checks import check_folder, model_path
 from me2e_compress.workflows.claims import writing
@@ -51,12 +52,12 @@ def split(
     source, toml, output = model_path(model), Path(stack), Path(output)
     joined, whole = JoinedStack.load(toml), graph.load(source)
     try:
-        parts = joined.split(whole)
+        parts = split_stack(joined, whole)
     except GraphError as error:
         raise GraphError(f"{source}: {error}") from error
     if not parts:
         raise GraphError(f"{source}: gives none of the outputs of {toml}")
-    files = {part: output / joined.files[part] for part in parts}
+    files = {part: output / joined.parts[part].file for part in parts}
     named = [
         each for path in files.values() for each in (path, *graph.data_names(path))
     ]
@@ -68,5 +69,5 @@ def split(
     with writing(named, inputs, force=force), drafts.all_or_none():
         for part, path in files.items():
             graph.save(parts[part], path)
-    missing = tuple(each for each in joined.files if each not in files)
+    missing = tuple(each for each in joined.parts if each not in files)
     return SplitResult(output, files, missing)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from me2e_compress.graph.stack.stack import JoinedStack
+from me2e_compress.graph.stack.join import JoinedStack
 from me2e_compress.runtime.session import replay
 from tests.stacks import HEAD, TWO_PARTS, joined, ones, write_stack
 
@@ -20,9 +20,9 @@ def test_equal_names_are_joined_and_state_runs_by_its_names(tmp_path: Path) -> N
 
     stack = JoinedStack.load(path)
 
-    assert list(stack.joined.inputs) == ["prev_bev", "img"]
-    assert list(stack.joined.outputs) == ["next_bev", "plan", "feats"]
-    assert stack.joined.recurrent == {"prev_bev": "next_bev"}
+    assert [each.name for each in stack.model.graph.inputs] == ["prev_bev", "img"]
+    assert list(stack.names.values()) == ["next_bev", "plan", "feats"]
+    assert stack.recurrent == {"prev_bev": "next_bev"}
     assert bevs(path, True, False, False, True) == [2.0, 3.0, 3.5, 2.0]
 
 
@@ -45,7 +45,7 @@ def test_two_outputs_of_one_name_are_called_by_their_parts(tmp_path: Path) -> No
         backbone (float[1,4] img) => (float[1,4] plan) { plan = Add(img, img) }""",
     )
 
-    assert list(JoinedStack.load(path).joined.outputs) == [
+    assert list(JoinedStack.load(path).names.values()) == [
         *("next_bev", "head.plan", "backbone.plan")
     ]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.stack.stack import JoinedStack
+from me2e_compress.graph.stack.join import JoinedStack
 from tests.stacks import HEAD, TWO_PARTS, write_stack
 
 OTHER_FEATS = HEAD.replace("float[1,4] feats", "float[1,5] feats")

@@ -10,7 +10,8 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.modules import ModuleMap
-from me2e_compress.graph.stack.stack import JoinedStack
+from me2e_compress.graph.stack.join import End, JoinedStack
+from me2e_compress.graph.stack.split import split_stack
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.runtime.frames import Array, Frame
@@ -21,7 +22,7 @@ from tests.stacks import DENSE, HEAD, TWO_PARTS, joined, ones, write_dense, writ
 def again(stack: JoinedStack, folder: Path, toml: str = TWO_PARTS) -> Path:
     """Split a stack's graph into a folder; return the path of a TOML beside it."""
     folder.mkdir()
-    for part, model in stack.split(stack.model).items():
+    for part, model in split_stack(stack, stack.model).items():
         graph.save(model, folder / f"{part}.onnx")
     (folder / "stack.toml").write_text(toml)
     return folder / "stack.toml"
@@ -29,29 +30,24 @@ def again(stack: JoinedStack, folder: Path, toml: str = TWO_PARTS) -> Path:
 
 def by_files(path: Path, frames: list[Frame]) -> list[dict[str, Array]]:
     """Run the files of a stack one by one; return what the frames' outputs are."""
-    found, joined = list[dict[str, Array]](), JoinedStack.load(path).joined
-    joints = joined.joints
+    outputs, stack = list[dict[str, Array]](), JoinedStack.load(path)
     sessions = {
         part: Session(each.path, threads=1, optimize=False)
-        for part, each in joints.graphs.items()
+        for part, each in stack.parts.items()
     }
     state = dict[str, Array]()
     for frame in frames:
         if frame.starts_scene:
             state = {"prev_bev": np.zeros((4, 32), np.float32)}
-        values = dict[tuple[str, str], Array]()
-        for part in joints.order:
-            fed = {
-                name: values[source]
-                if source.part
-                else {**frame.arrays, **state}[source.name]
-                for name, source in joints.sources[part].items()
-            }
-            ran = sessions[part].run(fed)
-            values |= {(part, name): value for name, value in ran.items()}
-        found.append({name: values[at] for name, at in joined.answers.items()})
-        state = {name: found[-1][answer] for name, answer in joined.recurrent.items()}
-    return found
+        values = {End("", k): each for k, each in {**frame.arrays, **state}.items()}
+        for part in stack.order:
+            names = stack.parts[part].inputs
+            inputs = {name: values[stack.sources[End(part, name)]] for name in names}
+            ran = sessions[part].run(inputs)
+            values |= {End(part, name): value for name, value in ran.items()}
+        outputs.append({name: values[end] for end, name in stack.names.items()})
+        state = {name: outputs[-1][answer] for name, answer in stack.recurrent.items()}
+    return outputs
 
 
 def images(count: int = 5) -> list[Frame]:
@@ -82,8 +78,8 @@ def test_what_passes_made_is_cut_and_joined_again(tmp_path: Path, text: str) -> 
 
     made = again(dataclasses.replace(stack, model=small), tmp_path / "small")
 
-    files = JoinedStack.load(made).joined.joints.graphs
-    for part, each in stack.joined.joints.graphs.items():
+    files = JoinedStack.load(made).parts
+    for part, each in stack.parts.items():
         assert files[part].inputs == each.inputs
         assert files[part].outputs == each.outputs
     whole = list(replay(joined(made), images()))
@@ -105,7 +101,7 @@ def test_weights_are_shared_with_the_files(tmp_path: Path) -> None:
     stack = JoinedStack.load(write_dense(tmp_path))
 
     weight = stack.model.graph.initializers["backbone.w"].const_value
-    file = stack.joined.joints.graphs["backbone"].model
+    file = stack.parts["backbone"].model
     assert weight is file.graph.initializers["w"].const_value
 
 
@@ -140,11 +136,15 @@ def test_what_a_part_passes_on_keeps_its_names(tmp_path: Path) -> None:
     toml = TWO_PARTS.replace("head", "neck") + "[edges]\nfeats = 'backbone.feats'\n"
     stack = JoinedStack.load(write_stack(tmp_path, toml, neck=passing))
 
-    made = JoinedStack.load(again(stack, tmp_path / "again", toml)).joined
+    made = JoinedStack.load(again(stack, tmp_path / "again", toml))
 
-    assert list(made.outputs) == ["next_bev", "plan", "neck.feats", "backbone.feats"]
-    neck = stack.joined.joints.graphs["neck"]
-    assert made.joints.graphs["neck"].inputs == neck.inputs
+    assert list(made.names.values()) == [
+        "next_bev",
+        "plan",
+        "neck.feats",
+        "backbone.feats",
+    ]
+    assert made.parts["neck"].inputs == stack.parts["neck"].inputs
 
 
 def test_a_part_that_would_need_what_no_file_gives_is_named(tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_a_part_that_would_need_what_no_file_gives_is_named(tmp_path: Path) -> N
     add.replace_input_with(0, image)
 
     with pytest.raises(GraphError, match=r"head cannot be cut out again: .* img"):
-        stack.split(stack.model)
+        split_stack(stack, stack.model)
 
 
 def test_dense_parts_share_no_name_with_their_inner_values(tmp_path: Path) -> None:
@@ -258,8 +258,8 @@ def test_what_a_pass_took_away_is_missing_from_its_part(tmp_path: Path) -> None:
 
     made = again(stack, tmp_path / "small")
 
-    found = JoinedStack.load(made).joined
-    assert list(found.inputs) == ["img"]
+    found = JoinedStack.load(made)
+    assert [each.name for each in found.model.graph.inputs] == ["img"]
     assert found.recurrent == {}
     (answer,) = replay(joined(made), ones(True))
     assert answer["next_bev"][0, 0] == 2.0

@@ -1,4 +1,4 @@
-"""Cut one graph into the parts of the stack that it was joined from."""
+"""Cut one graph into the files of the stack that it was joined from."""
 
 from collections.abc import Mapping
 
@@ -6,87 +6,59 @@ import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.nodes import STANDARD, nodes_of, reads_of
-from me2e_compress.graph.stack.joints import Joints, Names
-from me2e_compress.graph.stack.part_graph import PartGraph
+from me2e_compress.graph.stack.join import End, JoinedStack
+from me2e_compress.graph.stack.stack_file import Part
+
+Values = Mapping[str, ir.Value]
 
 
-def split(
-    model: ir.Model, joints: Joints, names: Names, before: Mapping[str, str]
-) -> dict[str, ir.Model]:
+def split_stack(stack: JoinedStack, model: ir.Model) -> dict[str, ir.Model]:
     """Return the graph of every part of a joined graph that passes changed.
 
     A part is what computes its outputs from its inputs, both under the names that its
     file has: whoever runs the files one by one can go on. A constant that two parts
     read stands in both. Inputs and outputs that a pass took away are missing, and so is
-    a part without any output. ``before`` is the metadata of the joined graph as it was
-    read: what is new in it since is written into every part.
+    a part without any output. Metadata that are new since the files were joined are
+    written into every part.
 
     Raises:
         GraphError: a part would need what another part computes and does not give.
     """
+    before = stack.model.metadata_props
     added = {
         key: text
         for key, text in model.metadata_props.items()
         if before.get(key) != text
     }
-    found = dict[str, ir.Model]()
-    for part, file in joints.graphs.items():
-        values = _values(model.graph)
-        fed = {
-            name: values[public]
-            for name, source in joints.sources[part].items()
-            if (public := names.public(*source) if source.part else source.name)
-            in values
+    ends = {
+        str(value.name): value for value in (*model.graph.inputs, *model.graph.outputs)
+    }
+    models = dict[str, ir.Model]()
+    for part, file in stack.parts.items():
+        sources = {name: stack.sources[End(part, name)] for name in file.inputs}
+        inputs = {
+            name: ends[public]
+            for name, source in sources.items()
+            if (public := stack.names.get(source, source.name)) in ends
         }
-        given = {
-            name: values[public]
+        outputs = {
+            name: ends[public]
             for name in file.outputs
-            if (public := names.public(part, name)) in values
+            if (public := stack.names[End(part, name)]) in ends
             and name not in file.inputs  # else it is passed on
         }
-        if not given:
-            continue
-        cut = _cut(model, file, fed, given)
-        cut.metadata_props.update({**file.metadata, **added})
-        found[part] = cut
-    return found
+        if outputs:
+            models[part] = _cut(model, file, inputs, outputs)
+            models[part].metadata_props.update({**file.model.metadata_props, **added})
+    return models
 
 
-def _values(graph: ir.Graph) -> dict[str, ir.Value]:
-    """Return the graph's inputs and outputs by name."""
-    return {str(value.name): value for value in (*graph.inputs, *graph.outputs)}
-
-
-def _cut(
-    model: ir.Model,
-    file: PartGraph,
-    fed: Mapping[str, ir.Value],
-    given: Mapping[str, ir.Value],
-) -> ir.Model:
-    """Copy what lies between a part's inputs and its outputs."""
-    borders = list(dict.fromkeys(fed.values()))
-    nodes, weights = _between(model.graph, file, borders, list(given.values()))
-    view = ir.GraphView(
-        borders,
-        list(given.values()),
-        nodes=nodes,
-        initializers=weights,
-        opset_imports=model.opset_imports,
-        name=file.part,
-    )
-    graph = view.clone()
-    _rename(graph, file, fed, given)
-    copy = ir.Model(graph, ir_version=model.ir_version)
-    _declare(copy, model)
-    return copy
-
-
-def _between(
-    graph: ir.Graph, file: PartGraph, borders: list[ir.Value], given: list[ir.Value]
-) -> tuple[list[ir.Node], list[ir.Value]]:
-    """List the nodes and weights that compute some outputs, in the graph's order."""
+def _cut(model: ir.Model, file: Part, inputs: Values, outputs: Values) -> ir.Model:
+    """Copy what lies between a part's inputs and its outputs, by its file's names."""
+    borders = list(dict.fromkeys(inputs.values()))
+    # The nodes and weights that compute the outputs
     needed, weights = set[ir.Node](), dict[ir.Value, None]()
-    stops, waiting = set(borders), list(given)
+    stops, waiting = set(borders), list(outputs.values())
     while waiting:
         value = waiting.pop()
         node = value.producer()
@@ -96,59 +68,56 @@ def _between(
             weights[value] = None
         elif node is None:
             raise GraphError(
-                f"{file.part} cannot be cut out again: a pass made it need"
+                f"{file.name} cannot be cut out again: a pass made it need"
                 f" {value.name}, which {file.path.name} does not take"
             )
         elif node not in needed:
             needed.add(node)
             waiting += reads_of(node)
-    return [node for node in graph if node in needed], list(weights)
+    # A copy of them
+    graph = ir.GraphView(
+        borders,
+        list(outputs.values()),
+        nodes=[node for node in model.graph if node in needed],
+        initializers=list(weights),
+        opset_imports=model.opset_imports,
+        name=file.name,
+    ).clone()
+    _rename(graph, file, inputs, outputs)
+    copy = ir.Model(graph, ir_version=model.ir_version)
+    _declare(copy, model)
+    return copy
 
 
-def _rename(
-    graph: ir.Graph,
-    file: PartGraph,
-    fed: Mapping[str, ir.Value],
-    given: Mapping[str, ir.Value],
-) -> None:
+def _rename(graph: ir.Graph, file: Part, inputs: Values, outputs: Values) -> None:
     """Give inputs and outputs the names of the part's file, in its order."""
-    places = {value: at for at, value in enumerate(dict.fromkeys(fed.values()))}
-    copies = list(graph.inputs)
+    inner = [value for node in graph for value in node.outputs]
+    others = {str(each.name): each for each in (*graph.initializers.values(), *inner)}
+
+    def name_it(value: ir.Value, name: str) -> None:
+        # An inner value of that name gives way
+        other = others.get(name)
+        if other is not None and other is not value:
+            free = f"{name}_"
+            while free in others:
+                free += "_"
+            other.name = free
+        value.name = name
+
+    for value, name in zip(graph.outputs, outputs, strict=True):
+        name_it(value, name)
+    copies = dict(zip(dict.fromkeys(inputs.values()), list(graph.inputs), strict=True))
     kinds = {str(value.name): value for value in file.model.graph.inputs}
-    inputs, seen = list[ir.Value](), set[ir.Value]()
-    others = {
-        str(value.name): value
-        for value in (
-            *graph.initializers.values(),
-            *(value for node in graph for value in node.outputs),
-        )
-    }
-    for value, name in zip(graph.outputs, given, strict=True):
-        _give_way(others, name, value)
-        value.name = name
-    for name, source in fed.items():
-        value = copies[places[source]]
-        if value in seen:  # one output feeds two inputs of a part
-            kind = kinds[name]
-            value = ir.Value(name=name, type=kind.type, shape=kind.shape)
-        seen.add(value)
-        _give_way(others, name, value)
-        value.name = name
-        inputs.append(value)
-    graph.inputs[:] = inputs
-    ends = {str(value.name): value for value in (*inputs, *graph.outputs)}
+    named = dict[ir.Value, None]()
+    for name, source in inputs.items():
+        value = copies[source]
+        if value in named:  # one output feeds two inputs of a part
+            value = ir.Value(name=name, type=kinds[name].type, shape=kinds[name].shape)
+        name_it(value, name)
+        named[value] = None
+    graph.inputs[:] = named
+    ends = {str(value.name): value for value in (*named, *graph.outputs)}
     graph.outputs[:] = [ends[name] for name in file.outputs if name in ends]
-
-
-def _give_way(others: Mapping[str, ir.Value], name: str, value: ir.Value) -> None:
-    """Rename an inner value that stands in the way of a name of the file."""
-    other = others.get(name)
-    if other is None or other is value:
-        return
-    free = f"{name}_"
-    while free in others:
-        free += "_"
-    other.name = free
 
 
 def _declare(copy: ir.Model, model: ir.Model) -> None:

@@ -1,13 +1,19 @@
-"""The TOML file that describes a stack of several ONNX files."""
+"""The TOML file that names the ONNX files of a stack, and one file of it."""
 
+import dataclasses
 import json
+import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
+import onnx_ir as ir
 import pydantic
 
 from me2e_compress.errors import FORMER, GraphError
+from me2e_compress.graph.files import load
+from me2e_compress.graph.recurrence import SessionPort, declared_pairs, port_of
 from me2e_compress.registry import documents
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
@@ -70,13 +76,15 @@ class StackFile(pydantic.BaseModel):
 
     @pydantic.field_validator("metadata")
     @classmethod
-    def _as_json(cls, metadata: dict[str, Any]) -> dict[str, Any]:
+    def _as_text(cls, metadata: dict[str, Any]) -> dict[str, str]:
+        texts = dict[str, str]()
         for key, value in metadata.items():
             try:
-                json.dumps(value, allow_nan=False)
+                text = json.dumps(value, allow_nan=False)
             except (TypeError, ValueError) as error:
                 raise ValueError(f"{key}: {error}") from error
-        return metadata
+            texts[key] = value if isinstance(value, str) else text
+        return texts
 
     @pydantic.model_validator(mode="after")
     def _once(self) -> Self:
@@ -91,9 +99,39 @@ class StackFile(pydantic.BaseModel):
         with documents.reading(path, GraphError, "not a stack of several files"):
             return cls.model_validate(documents.from_toml(documents.content(path)))
 
-    def said(self) -> dict[str, str]:
-        """Return the metadata as texts."""
-        return {
-            key: value if isinstance(value, str) else json.dumps(value)
-            for key, value in self.metadata.items()
-        }
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One ONNX file of a stack; ``file`` is its path as the TOML names it."""
+
+    name: str
+    file: Path
+    path: Path
+    inputs: Mapping[str, SessionPort]
+    outputs: Mapping[str, SessionPort]
+    model: ir.Model = dataclasses.field(repr=False)
+
+    @classmethod
+    def load(cls, entry: PartEntry, toml: Path) -> Self:
+        """Read a file; GraphError if it is missing, no graph, or outside the folder."""
+        path, file = toml.parent / entry.file, entry.file
+        real = Path(os.path.realpath(path))
+        homes = os.path.realpath(toml.parent), Path(os.path.realpath(toml)).parent
+        if file.is_absolute() or not any(real.is_relative_to(home) for home in homes):
+            raise GraphError(f"{file} is outside the folder of the stack: not read")
+        model = load(path)
+        inputs, outputs = (
+            {str(value.name): port_of(value) for value in values}
+            for values in (model.graph.inputs, model.graph.outputs)
+        )
+        return cls(entry.name, file, path, inputs, outputs, model)
+
+    def recurrent(self) -> dict[str, str | None]:
+        """Return the output declared for each input; None if it is not fed back."""
+        try:
+            declared = declared_pairs(self.model.metadata_props)
+        except GraphError as error:
+            raise GraphError(f"{self.path}: {error}") from error
+        if declared == {}:
+            return dict.fromkeys(self.inputs)
+        return declared or {}

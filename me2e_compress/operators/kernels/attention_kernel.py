@@ -29,9 +29,6 @@ from me2e_compress.operators.kernels import abi
 from me2e_compress.operators.kernels.abi import (
     ADDRESS,
     EACH,
-    made,
-    read,
-    refused,
 )
 from me2e_compress.operators.kernels.intrinsics import (
     FLOAT,
@@ -42,6 +39,9 @@ from me2e_compress.operators.kernels.intrinsics import (
     call,
     compiled,
     floats,
+    made,
+    read,
+    refused,
     stack,
     words,
 )

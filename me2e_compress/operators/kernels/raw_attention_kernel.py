@@ -21,17 +21,7 @@ from numba.core.cgutils import get_or_insert_function
 from numba.extending import intrinsic
 
 from me2e_compress.operators.kernels.abi import ADDRESS, EACH
-from me2e_compress.operators.kernels.attention_call import functions_of
-from me2e_compress.operators.kernels.intrinsics import (
-    FLOAT,
-    INT,
-    Word,
-    compiled,
-    floats,
-    stack,
-    words,
-)
-from me2e_compress.operators.kernels.sampling import (
+from me2e_compress.operators.kernels.deformable_kernel import (
     OTHERS,
     OUT,
     VALUE,
@@ -45,9 +35,19 @@ from me2e_compress.operators.kernels.sampling import (
     corner_offsets,
     corner_weights,
     corners,
+    functions_of,
     share_of,
     tables,
     to_real,
+)
+from me2e_compress.operators.kernels.intrinsics import (
+    FLOAT,
+    INT,
+    Word,
+    compiled,
+    floats,
+    stack,
+    words,
 )
 from me2e_compress.operators.kernels.weighted_rows import CAPACITY, weighted_rows
 

@@ -22,18 +22,18 @@ from me2e_compress.operators.kernels import abi
 from me2e_compress.operators.kernels.abi import (
     ADDRESS,
     EACH,
-    borrow,
-    give_back,
-    made,
-    read,
-    refused,
 )
 from me2e_compress.operators.kernels.intrinsics import (
     Word,
     address_of,
+    borrow,
     call,
     compiled,
     floats,
+    give_back,
+    made,
+    read,
+    refused,
     stack,
     words,
 )

@@ -1,0 +1,490 @@
+"""Join the ONNX files of a stack into one graph."""
+
+import dataclasses
+import graphlib
+import json
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import onnx_ir as ir
+
+from me2e_compress.errors import GraphError
+from me2e_compress.graph.nodes import STANDARD, graphs_of, nodes_of, opset_of
+from me2e_compress.graph.opset import newer
+from me2e_compress.graph.recurrence import RECURRENT, SessionPort, recurrence
+from me2e_compress.graph.stack.stack_file import Part, StackFile
+from me2e_compress.registry import documents
+
+
+class End(NamedTuple):
+    """An input or output of a part; without a part, an input of the whole stack."""
+
+    part: str
+    name: str
+
+    def __str__(self) -> str:
+        """Return the name that a TOML gives it."""
+        return f"{self.part}.{self.name}"
+
+
+Parts = Mapping[str, Part]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class JoinedStack:
+    """A stack of several files, joined into one graph.
+
+    Attributes:
+        parts: the files by part, as the TOML lists them.
+        order: the parts, each behind those that feed it.
+        sources: what feeds each input of a part: an output of another, or an input of
+            the stack.
+        names: the name in the graph of each output: ``NAME``, or ``PART.NAME`` where
+            two parts have it, or an input of the stack.
+        recurrent: ``{input: output}`` of what is fed back at the next frame.
+        model: the graph.
+    """
+
+    parts: Parts
+    order: tuple[str, ...]
+    sources: Mapping[End, End]
+    names: Mapping[End, str]
+    recurrent: Mapping[str, str]
+    model: ir.Model
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a TOML file and the files it names, and join them.
+
+        Raises:
+            GraphError: a file is missing, no graph or outside the folder, or does not
+                fit the others; the message names the TOML file, the part, the tensor.
+        """
+        content = StackFile.load(path)
+        try:
+            parts = {each.name: Part.load(each, path) for each in content.part}
+            joined = cls._of(parts, content)
+        except GraphError as error:
+            raise GraphError(f"{path}: {error}") from error
+        joined.model.graph.name = path.stem
+        return joined
+
+    @classmethod
+    def _of(cls, parts: Parts, content: StackFile) -> Self:
+        # What feeds what, in which order
+        sources, state = _sources(parts, content)
+        order = _order(parts, sources)
+        inputs = _inputs(parts, sources)
+        # The outputs of the stack, and those that come back
+        ends = [End(part, name) for part in parts for name in parts[part].outputs]
+        counts = Counter(end.name for end in ends)
+        names = {
+            end: end.name
+            if counts[end.name] == 1 and end.name not in inputs
+            else str(end)
+            for end in ends
+        }
+        recurrent = _recurrent(parts, state, inputs, names)
+        _check_connected(parts, sources, recurrent, names)
+        # One graph, whose metadata say what comes back
+        model = _merged(parts, order, sources, names, tuple(inputs))
+        pairs = {name: recurrent.get(name) for name in inputs}
+        model.metadata_props.update(_metadata(parts) | content.metadata)
+        model.metadata_props[RECURRENT] = json.dumps(pairs)
+        return cls(parts, order, sources, names, recurrent, model)
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The files that were read."""
+        return tuple(each.path for each in self.parts.values())
+
+    def feeds(self) -> Iterator[tuple[str, str, str, str]]:
+        """Yield part, input, source and form of what is fed, in the order of runs.
+
+        A source is an output (``backbone.feats``), ``frames`` or ``state: OUTPUT``.
+        """
+        for part in self.order:
+            for name, port in self.parts[part].inputs.items():
+                source = self.sources[End(part, name)]
+                given = f"state: {self.recurrent.get(source.name)}"
+                if source.part:
+                    given = str(source)
+                elif source.name not in self.recurrent:
+                    given = "frames"
+                yield part, name, given, _form(port)
+
+
+# What feeds every input, and what comes back: by the TOML, then by equal names.
+
+
+def _sources(parts: Parts, content: StackFile) -> tuple[dict[End, End], dict[End, str]]:
+    """Find the source of every input, and the inputs that ``[state]`` names."""
+    # A name without a part may stand for several inputs
+    edges = {
+        taker: _output(parts, output, f"[edges] {text}")
+        for text, output in content.edges.items()
+        for taker in _takers(parts, text, f"[edges] {text}")
+    }
+    state = {
+        taker: output
+        for text, output in content.state.items()
+        for taker in _takers(parts, text, f"[state] {text}")
+    }
+    if both := [each for each in state if each in edges]:
+        raise GraphError(f"{both[0]} is fed by [edges] and by [state]")
+    sources = dict[End, End]()
+    for part, file in parts.items():
+        for name in file.inputs:
+            # Edges come first, then state, then an output of the same name
+            taker = End(part, name)
+            giving = [each for each in _giving(parts, name) if each != part]
+            if taker in edges:
+                sources[taker] = edges[taker]
+            elif taker in state or file.recurrent().get(name) is not None or not giving:
+                sources[taker] = End("", name)
+            elif len(giving) > 1:
+                raise _ambiguous(str(taker), name, giving)
+            else:
+                sources[taker] = End(giving[0], name)
+    return sources, state
+
+
+def _giving(parts: Parts, name: str) -> list[str]:
+    return [part for part, each in parts.items() if name in each.outputs]
+
+
+def _output(parts: Parts, text: str, where: str) -> End:
+    """Find the output of a text: ``PART.NAME``, or a name that one part gives."""
+    giving = _giving(parts, text)
+    if len(giving) > 1:
+        raise _ambiguous(where, text, giving)
+    if giving:
+        return End(giving[0], text)
+    part, _, name = text.partition(".")
+    if part in _giving(parts, name):
+        return End(part, name)
+    there = (f"{each}.{name}" for each in parts for name in parts[each].outputs)
+    raise GraphError(f"{where}: no part gives {text}; there is {', '.join(there)}")
+
+
+def _takers(parts: Parts, text: str, where: str) -> list[End]:
+    """Find the inputs of a text: ``PART.NAME``, or all of a name."""
+    part, _, name = text.partition(".")
+    if takers := [End(each, text) for each in parts if text in parts[each].inputs]:
+        return takers
+    if part in parts and name in parts[part].inputs:
+        return [End(part, name)]
+    there = (f"{each}.{name}" for each in parts for name in parts[each].inputs)
+    raise GraphError(f"{where}: no part takes {text}; there is {', '.join(there)}")
+
+
+def _ambiguous(where: str, name: str, giving: list[str]) -> GraphError:
+    ways = " or ".join(f"{each}.{name}" for each in giving)
+    return GraphError(
+        f"{where}: {' and '.join(giving)} both give {name}: say {ways}, by [edges]"
+    )
+
+
+def _order(parts: Parts, sources: Mapping[End, End]) -> tuple[str, ...]:
+    """Sort the parts by what feeds them; refuse edges that do not fit, and cycles."""
+    waits: dict[str, list[str]] = {part: [] for part in parts}
+    for taker, source in sources.items():
+        if not source.part:
+            continue
+        waits[taker.part].append(source.part)
+        taken = parts[taker.part].inputs[taker.name]
+        given = parts[source.part].outputs[source.name]
+        if _misfit(given, taken):
+            raise GraphError(
+                f"{taker} takes {_form(taken)}, and {source}, which feeds it, is"
+                f" {_form(given)}"
+            )
+    try:
+        return tuple(graphlib.TopologicalSorter(waits).static_order())
+    except graphlib.CycleError as error:
+        cycle = " -> ".join(reversed(error.args[1]))
+        raise GraphError(
+            f"the parts wait for one another: {cycle}; what comes back at the next"
+            " frame belongs into [state]"
+        ) from error
+
+
+def _misfit(given: SessionPort, taken: SessionPort) -> bool:
+    """Return whether an output can never feed an input; an empty shape is unknown."""
+    if given.type != taken.type:
+        return True
+    if not given.shape or not taken.shape:
+        return False
+    return len(given.shape) != len(taken.shape) or any(
+        isinstance(one, int) and isinstance(other, int) and one != other
+        for one, other in zip(given.shape, taken.shape, strict=True)
+    )
+
+
+def _form(port: SessionPort) -> str:
+    """Describe type and shape: ``float [1, 6, 2]``."""
+    element = port.type.removeprefix("tensor(").removesuffix(")")
+    return f"{element} {list(port.shape)}"
+
+
+def _inputs(parts: Parts, sources: Mapping[End, End]) -> dict[str, SessionPort]:
+    """Collect the inputs of the stack; parts that share a name share the input."""
+    first = dict[str, End]()
+    for taker, source in sources.items():
+        if source.part:
+            continue
+        other = first.setdefault(source.name, taker)
+        known, port = (parts[each.part].inputs[each.name] for each in (other, taker))
+        if _misfit(known, port):
+            raise GraphError(
+                f"{other.part} takes {source.name} as {_form(known)}, {taker.part} as"
+                f" {_form(port)}; one that another part gives belongs into [edges]"
+            )
+    return {name: parts[each.part].inputs[each.name] for name, each in first.items()}
+
+
+def _recurrent(
+    parts: Parts,
+    state: Mapping[End, str],
+    inputs: Mapping[str, SessionPort],
+    names: Mapping[End, str],
+) -> dict[str, str]:
+    """Pair inputs with the outputs that come back to them at the next frame."""
+    outputs = {
+        name: parts[part].outputs[output] for (part, output), name in names.items()
+    }
+    # Metadata of the files come first; [state] overrides them
+    pairs = dict[str, str | None]()
+    for part, each in parts.items():
+        for name, output in each.recurrent().items():
+            if output is None:
+                pairs.setdefault(name, None)
+            else:
+                end = End(part, output)
+                other = output if output in outputs else str(end)
+                pairs[name] = names.get(end, other)
+    for (_, name), output in state.items():
+        answer = names[_output(parts, output, f"[state] {name}")]
+        if _misfit(outputs[answer], inputs[name]):
+            raise GraphError(
+                f"[state] {name} takes {_form(inputs[name])}, and {answer}, which is"
+                f" fed back to it, is {_form(outputs[answer])}"
+            )
+        pairs[name] = answer
+    # The naming rules complete the pairs
+    known = {name: to for name, to in pairs.items() if name in inputs}
+    return recurrence({RECURRENT: json.dumps(known)} if known else {}, inputs, outputs)
+
+
+def _check_connected(
+    parts: Parts,
+    sources: Mapping[End, End],
+    recurrent: Mapping[str, str],
+    names: Mapping[End, str],
+) -> None:
+    """Refuse a part that neither edges nor state connect to the first."""
+    part_of = {name: end.part for end, name in names.items()}
+    pairs = set[tuple[str, str]]()
+    for taker, source in sources.items():
+        if source.part:
+            pairs.add((taker.part, source.part))
+        elif source.name in recurrent:
+            pairs.add((taker.part, part_of[recurrent[source.name]]))
+    first, *others = parts
+    reached = {first}
+    for _ in parts:
+        reached |= {b for a, b in pairs if a in reached}
+        reached |= {a for a, b in pairs if b in reached}
+    if alone := [each for each in others if each not in reached]:
+        outputs, inputs = parts[first].outputs, parts[alone[0]].inputs
+        raise GraphError(
+            f"nothing joins {alone[0]} to {first}: [edges] must say which of"
+            f" {', '.join(outputs)} (of {first}) feeds which of"
+            f" {', '.join(inputs)} (of {alone[0]})"
+        )
+
+
+def _metadata(parts: Parts) -> dict[str, str]:
+    """Merge metadata: JSON objects that agree are joined, else a later file wins."""
+
+    def table(text: str) -> dict[str, object]:
+        try:
+            value = documents.from_json(text)
+        except documents.MalformedError:
+            return {}
+        return value if isinstance(value, dict) else {}
+
+    merged = dict[str, str]()
+    for each in parts.values():
+        for key, text in each.model.metadata_props.items():
+            before, now = table(merged.get(key, "")), table(text)
+            agree = all(now.get(name, value) == value for name, value in before.items())
+            both = json.dumps(before | now)
+            merged[key] = both if before and now and agree else text
+    merged.pop(RECURRENT, None)
+    return merged
+
+
+# The graphs of the parts, moved into one.
+
+
+def _merged(
+    parts: Parts,
+    order: tuple[str, ...],
+    sources: Mapping[End, End],
+    names: Mapping[End, str],
+    inputs: tuple[str, ...],
+) -> ir.Model:
+    """Return one graph of all parts.
+
+    Its inputs are those of the stack, its outputs all that a part gives. Other names
+    that two parts have get the part in front: ``head.w``, and ``/head/Mul`` for
+    ``/Mul``. Weights are shared with the files' graphs, not copied.
+    """
+    models = {part: each.model.clone() for part, each in parts.items()}
+    _write_one_opset(parts, models)
+    functions = _functions(models)
+    _rename_apart(models, {*names.values(), *inputs})
+    # Move nodes and weights; inputs become what feeds them
+    nodes, weights = list[ir.Node](), list[ir.Value]()
+    taken, given = dict[str, ir.Value](), dict[End, ir.Value]()
+    for part in order:
+        graph, file = models[part].graph, parts[part]
+        takers, outputs = list(graph.inputs), _outputs(graph, file)
+        weights += graph.initializers.values()
+        body = list(graph)
+        graph.inputs.clear()
+        graph.outputs.clear()
+        graph.initializers.clear()
+        graph.remove(body)
+        nodes += body
+        for value, name in zip(takers, file.inputs, strict=True):
+            source = sources[End(part, name)]
+            if source.part:
+                known = given[source]
+            else:
+                value.name = source.name
+                known = taken.setdefault(source.name, value)
+            if known is not value:
+                ir.convenience.replace_all_uses_with(value, known)
+        for value, name in zip(outputs, file.outputs, strict=True):
+            end = End(part, name)
+            value.name, given[end] = names[end], value
+    imports = {
+        domain: version
+        for model in models.values()
+        for domain, version in model.opset_imports.items()
+    }
+    joined = ir.Graph(
+        [taken[name] for name in inputs],
+        [given[end] for end in names],
+        nodes=nodes,
+        initializers=weights,
+        opset_imports=imports,
+    )
+    joined.sort()
+    newest = max(each.ir_version for each in models.values())
+    return ir.Model(joined, ir_version=newest, functions=functions)
+
+
+def _outputs(graph: ir.Graph, file: Part) -> list[ir.Value]:
+    """List the outputs, behind an Identity where no node gives one: it has no name."""
+    outputs = list[ir.Value]()
+    for value in list(graph.outputs):
+        if graph.outputs.count(value) > 1:
+            raise GraphError(f"{file.path}: output {value.name} is listed twice")
+        if value.producer() is None:
+            node = ir.node("Identity", [value], name=f"{value.name}/passed_on")
+            (copy,) = node.outputs
+            copy.type, copy.shape = value.type, value.shape
+            graph.append(node)
+            value = copy
+        outputs.append(value)
+    return outputs
+
+
+def _rename_apart(models: Mapping[str, ir.Model], public: Collection[str]) -> None:
+    """Put the part in front of names of inner values and nodes that others have too."""
+
+    def apart(
+        named: Mapping[str, list[ir.Value] | list[ir.Node]], reserved: Collection[str]
+    ) -> None:
+        seen = Counter(
+            name
+            for items in named.values()
+            for name in {each.name for each in items if each.name}
+        )
+        used = {*seen, *reserved}
+        for part, items in named.items():
+            known = dict[str, str]()
+            for each in items:
+                name = each.name
+                if not name or (seen[name] == 1 and name not in reserved):
+                    continue
+                if name not in known:
+                    free = f"/{part}{name}" if name[0] == "/" else f"{part}.{name}"
+                    while free in used:
+                        free += "_"
+                    used.add(free)
+                    known[name] = free
+                each.name = known[name]
+
+    apart({part: list(_inner_values(each)) for part, each in models.items()}, public)
+    nodes = {
+        part: [node for body in graphs_of(each.graph) for node in body]
+        for part, each in models.items()
+    }
+    apart(nodes, ())
+
+
+def _inner_values(model: ir.Model) -> Iterator[ir.Value]:
+    """Yield every value but the graph's own inputs and outputs."""
+    ends = {*model.graph.inputs, *model.graph.outputs}
+    for body in graphs_of(model.graph):
+        made = (value for node in body for value in node.outputs)
+        for value in (*body.inputs, *list(body.initializers.values()), *made):
+            if value not in ends:
+                yield value
+
+
+def _functions(models: Mapping[str, ir.Model]) -> list[ir.Function]:
+    """Collect the functions; one that differs from another's is renamed."""
+    known = dict[ir.OperatorIdentifier, ir.Function]()
+    for part, model in models.items():
+        for key, function in list(model.functions.items()):
+            other = known.setdefault(key, function)
+            if other is function or _text(other) == _text(function):
+                continue
+            name = f"{function.name}_{part}"
+            for node in nodes_of(model):
+                if node.op_identifier() == key:
+                    node.op_type = name
+            function.name = name
+            known[function.identifier()] = function
+    return list(known.values())
+
+
+def _text(function: ir.Function) -> bytes:
+    return ir.serde.serialize_function(function).SerializeToString(deterministic=True)
+
+
+def _write_one_opset(parts: Parts, models: Mapping[str, ir.Model]) -> None:
+    """Write every part in the newest opset of all, or refuse."""
+    opsets = {part: opset_of(each) for part, each in models.items()}
+    newest = max(opsets, key=opsets.__getitem__)
+    for part, opset in opsets.items():
+        if opset == opsets[newest] or not opset:
+            continue
+        reason = newer(models[part], opsets[newest])
+        if reason is not None:
+            here, there = parts[part].path, parts[newest].path
+            raise GraphError(
+                f"{here.name} is written in opset {opset}, {there.name} in"
+                f" {opsets[newest]}, and {reason}: export both in one opset"
+            )
+    for model in models.values():
+        for domain in STANDARD:
+            if domain in model.opset_imports:
+                model.opset_imports[domain] = opsets[newest]
