@@ -69,6 +69,11 @@ VARIADIC = (
     "GetVariadicOutputMinArity",
     "GetVariadicOutputHomogeneity",
 )
+CHARACTERISTICS = (
+    "GetInputCharacteristic",
+    "GetOutputCharacteristic",
+    "GetInputMemoryType",
+)
 FIELDS = (
     "version",
     "CreateKernel",
@@ -80,9 +85,7 @@ FIELDS = (
     "GetOutputTypeCount",
     "KernelCompute",
     "KernelDestroy",
-    "GetInputCharacteristic",
-    "GetOutputCharacteristic",
-    "GetInputMemoryType",
+    *CHARACTERISTICS,
     *VARIADIC,
     "CreateKernelV2",
     "KernelComputeV2",

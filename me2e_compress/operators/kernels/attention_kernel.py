@@ -20,10 +20,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
 
 from me2e_compress.operators.kernels import abi
 from me2e_compress.operators.kernels.abi import (
@@ -31,8 +29,6 @@ from me2e_compress.operators.kernels.abi import (
     EACH,
 )
 from me2e_compress.operators.kernels.intrinsics import (
-    FLOAT,
-    INT,
     WORD,
     Word,
     address_of,
@@ -47,6 +43,7 @@ from me2e_compress.operators.kernels.intrinsics import (
 )
 from me2e_compress.operators.kernels.kernel import WIDEST_HEAD
 from me2e_compress.operators.kernels.matrix_tile import host_tile, matrix_product
+from me2e_compress.operators.kernels.vectors import Vectors, vector_intrinsic
 
 POWERS = (
     1.535336188319500e-4, 1.339887440266574e-3, 9.618437357674640e-3,
@@ -66,7 +63,7 @@ MOST, SUM = range(2)
 
 
 def softmax_step(vectors: int, lanes: int) -> Any:
-    """Return the intrinsic ``(scores, count, state, sums, channels)``.
+    """Return the intrinsic ``((scores, count, state, sums, channels))``.
 
     ``scores``, ``state`` and ``sums`` are addresses of float32 rows of ``vectors *
     lanes`` queries side by side. It replaces ``count`` rows of scores by powers,
@@ -74,41 +71,23 @@ def softmax_step(vectors: int, lanes: int) -> Any:
     and the sum of all powers, at the start -infinity and 0. The ``channels`` rows of
     sums, which were weighted by the powers before, are corrected. NaN gives NaN.
     """
-
-    def typed(
-        context: Any, scores: Any, count: Any, state: Any, sums: Any, channels: Any
-    ) -> tuple[Any, Callable[..., Any]]:
-        # Numba calls this with LLVM values
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            _Step(builder, vectors, lanes, *arguments).write()
-            return context.get_dummy_value()
-
-        return types.void(*[types.intp] * 5), generate
-
-    return intrinsic(typed)
+    return vector_intrinsic(
+        lambda simd, *words: _Step(simd, vectors, *words).write(), lanes
+    )
 
 
 class _Step:
     """Writes a loop that finds the largest scores, and one that computes powers."""
 
     def __init__(
-        self,
-        builder: Any,
-        vectors: int,
-        lanes: int,
-        scores: Any,
-        count: Any,
-        state: Any,
-        sums: Any,
-        channels: Any,
+        self, simd: Vectors, vectors: int, scores: Any, count: Any, *others: Any
     ) -> None:
-        self.builder, self.vectors, self.lanes = builder, vectors, lanes
-        self.kind = ir.VectorType(FLOAT, lanes)
-        self.whole = ir.VectorType(INT, lanes)
+        state, sums, self.channels = others
+        self.builder, self.simd, self.vectors = simd.builder, simd, vectors
         self.scores, self.state, self.sums = (
-            builder.inttoptr(at, FLOAT.as_pointer()) for at in (scores, state, sums)
+            simd.pointer(at) for at in (scores, state, sums)
         )
-        self.count, self.channels = count, channels
+        self.count = count
 
     def write(self) -> None:
         builder = self.builder
@@ -150,42 +129,36 @@ class _Step:
     def _power(self, x: Any) -> Any:
         """Write 2^x for x <= 0: a polynomial of its fraction, whose exponent grows."""
         builder = self.builder
-        least, rounding = self._all(LEAST), self._all(ROUNDING)
+        least, rounding = self.simd.spread(LEAST), self.simd.spread(ROUNDING)
         x = builder.select(builder.fcmp_ordered("<", x, least), least, x)
         rounded = builder.fadd(x, rounding)
         fraction = builder.fsub(x, builder.fsub(rounded, rounding))
-        power = self._all(POWERS[0])
+        power = self.simd.spread(POWERS[0])
         for each in POWERS[1:]:
             power = builder.fmul(power, fraction, flags=("contract",))
-            power = builder.fadd(power, self._all(each), flags=("contract",))
+            power = builder.fadd(power, self.simd.spread(each), flags=("contract",))
         exponent = builder.shl(
-            builder.bitcast(rounded, self.whole), self.whole([23] * self.lanes)
+            builder.bitcast(rounded, self.simd.whole),
+            self.simd.whole([23] * self.simd.lanes),
         )
-        bits = builder.add(builder.bitcast(power, self.whole), exponent)
-        return builder.bitcast(bits, self.kind)
-
-    def _all(self, number: float) -> Any:
-        return self.kind([number] * self.lanes)
+        bits = builder.add(builder.bitcast(power, self.simd.whole), exponent)
+        return builder.bitcast(bits, self.simd.kind)
 
     def _variable(self, vector: Any) -> Any:
         return cgutils.alloca_once_value(self.builder, vector)
 
     def _row(self, rows: Any, index: Any) -> list[Any]:
-        places = self._places(rows, index)
-        return [self.builder.load(place, align=4) for place in places]
+        return [self.simd.load(place) for place in self._places(rows, index)]
 
     def _set_row(self, rows: Any, index: Any, row: list[Any]) -> None:
         for vector, place in zip(row, self._places(rows, index), strict=True):
-            self.builder.store(vector, place, align=4)
+            self.simd.store(vector, place)
 
     def _places(self, rows: Any, index: Any) -> list[Any]:
-        builder, places = self.builder, []
-        first = builder.mul(index, WORD(self.vectors * self.lanes))
-        for vector in range(self.vectors):
-            at = builder.add(first, WORD(vector * self.lanes))
-            place = builder.gep(rows, [at])
-            places.append(builder.bitcast(place, self.kind.as_pointer()))
-        return places
+        builder, lanes = self.builder, self.simd.lanes
+        first = builder.mul(index, WORD(self.vectors * lanes))
+        each = [builder.add(first, WORD(n * lanes)) for n in range(self.vectors)]
+        return [builder.gep(rows, [at]) for at in each]
 
 
 F = np.float32
@@ -275,11 +248,11 @@ def _block(user: int, index: int) -> Word:
         for p in range(panels):
             # Columns that no query fills hold anything; nothing of them is kept
             left, out = min(WIDTH, count - p * WIDTH), o + p * each
-            _multiply(
-                key, q + p * each, s, a[ROW], 1, WIDTH, WIDTH, many, left, a[D], 0
-            )
-            _soften(s, many, r + p * STATE * 4, out, a[D])
-            _multiply(value, s, out, 1, a[ROW], WIDTH, WIDTH, a[D], left, many, 1)
+            sizes = (a[ROW], 1, WIDTH, WIDTH, many, left, a[D], 0)
+            _multiply((key, q + p * each, s, *sizes))
+            _soften((s, many, r + p * STATE * 4, out, a[D]))
+            sizes = (1, a[ROW], WIDTH, WIDTH, a[D], left, many, 1)
+            _multiply((value, s, out, *sizes))
     for p in range(panels):
         left, at = min(WIDTH, count - p * WIDTH), rows + p * WIDTH * a[ROW] * 4
         _end(a, a[OUT] + at, left, floats(r + p * STATE * 4), floats(o + p * each))

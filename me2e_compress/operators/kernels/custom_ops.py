@@ -26,24 +26,17 @@ _asked = threading.local()
 """What this thread is registering; onnxruntime calls back within that same call."""
 
 
-def register(
-    options: ort.SessionOptions,
-    kernels: Iterable[CompiledKernel],
-    begins: Callable[[], None] = lambda: None,
-) -> None:
+def register(options: ort.SessionOptions, kernels: Iterable[CompiledKernel]) -> None:
     """Let sessions with these options run kernels; call it once per options object.
 
-    ``begins`` is called before a kernel is compiled, if this machine has not cached it.
+    A kernel is compiled if this machine has not cached it.
 
     Raises:
         OSError: no shared object can be opened; see :mod:`trampoline`.
         ImportError: Numba is not installed, or does not work here.
     """
     library = trampoline()
-    _asked.code = {
-        each: load_or_compile(each.op_type, each.module, default_folder(), begins)
-        for each in kernels
-    }
+    _asked.code = {each: load_or_compile(each, default_folder()) for each in kernels}
     library.fill(_address(_register))
     options.register_custom_ops_library(library.path)
 
@@ -90,29 +83,17 @@ def _operator(kernel: CompiledKernel, compute: int, block: int, base: int) -> An
         ctypes.create_string_buffer(f"{kernel.op_type}: {each}".encode())
         for each in kernel.messages
     ]
-    library = trampoline()
     # Callbacks that describe the operator, called only on opening
-    callbacks: dict[str, Any] = {
-        "GetName": ctypes.CFUNCTYPE(_POINTER, _POINTER)(
-            lambda _: ctypes.addressof(name)
-        ),
-        "GetExecutionProviderType": ctypes.CFUNCTYPE(_POINTER, _POINTER)(
-            lambda _: None
-        ),
-        "GetInputType": ctypes.CFUNCTYPE(_INT, _POINTER, _SIZE)(
-            lambda _, index: kernel.inputs[index]
-        ),
-        "GetInputTypeCount": ctypes.CFUNCTYPE(_SIZE, _POINTER)(
-            lambda _: len(kernel.inputs)
-        ),
-        "GetOutputType": ctypes.CFUNCTYPE(_INT, _POINTER, _SIZE)(
-            lambda _, index: kernel.output
-        ),
-        "GetOutputTypeCount": ctypes.CFUNCTYPE(_SIZE, _POINTER)(lambda _: 1),
-        "GetInputCharacteristic": _zero(),  # an input that is required
-        "GetOutputCharacteristic": _zero(),
-        "GetInputMemoryType": _zero(),
-        **{name: _one() for name in abi.VARIADIC},
+    callbacks = {
+        "GetName": _answer(_POINTER, lambda _: ctypes.addressof(name)),
+        "GetExecutionProviderType": _answer(_POINTER, lambda _: None),
+        "GetInputType": _answer(_INT, lambda _, index: kernel.inputs[index], _SIZE),
+        "GetInputTypeCount": _answer(_SIZE, lambda _: len(kernel.inputs)),
+        "GetOutputType": _answer(_INT, lambda _, index: kernel.output, _SIZE),
+        "GetOutputTypeCount": _answer(_SIZE, lambda _: 1),
+        # Inputs are required
+        **{name: _answer(_INT, lambda *_: 0, _SIZE) for name in abi.CHARACTERISTICS},
+        **{name: _answer(_INT, lambda _: 1) for name in abi.VARIADIC},
     }
     # Fill in the struct
     written = (_POINTER * (STATE_OFFSET // 8 + abi.STATE_WORDS))()
@@ -120,7 +101,7 @@ def _operator(kernel: CompiledKernel, compute: int, block: int, base: int) -> An
     for field, callback in callbacks.items():
         written[abi.FIELDS.index(field)] = _address(callback)
     for field in ("CreateKernel", "KernelDestroy"):
-        written[abi.FIELDS.index(field)] = library.address(field)
+        written[abi.FIELDS.index(field)] = trampoline().address(field)
     written[abi.FIELDS.index("KernelComputeV2")] = compute
     # The state of its kernels follows the struct
     api = _api(base)
@@ -144,12 +125,9 @@ def _memory(base: int) -> int:
     return made.value
 
 
-def _zero() -> Any:
-    return ctypes.CFUNCTYPE(_INT, _POINTER, _SIZE)(lambda _, index: 0)
-
-
-def _one() -> Any:
-    return ctypes.CFUNCTYPE(_INT, _POINTER)(lambda _: 1)
+def _answer(result: Any, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return a callback of an operator, whose first argument is that operator."""
+    return ctypes.CFUNCTYPE(result, _POINTER, *arguments)(function)
 
 
 def _address(callback: Any) -> int:

@@ -18,6 +18,7 @@ from typing import Any
 from llvmlite import binding as llvm
 
 from me2e_compress.errors import GraphError
+from me2e_compress.operators.kernels.kernel import CompiledKernel
 from me2e_compress.operators.kernels.store import keep, private
 
 _FOREIGN = frozenset({"memset", "memcpy", "memmove", "floorf", "expf", "sqrt"})
@@ -44,22 +45,19 @@ _ENGINES: list[Any] = []
 """Owners of the code, which may run for as long as the process lives."""
 
 
-def load_or_compile(
-    op_type: str, module: str, folder: Path, begins: Callable[[], None]
-) -> Mapping[str, int]:
+def load_or_compile(kernel: CompiledKernel, folder: Path) -> Mapping[str, int]:
     """Return the addresses of a kernel's functions by name, cached in ``folder``.
 
-    The module's ``functions(op_type)`` take two words and return one; ``begins`` is
-    called before a compilation. Code that calls into Python or Numba is a GraphError.
+    The ``functions`` of its module take two words and return one. Code that calls into
+    Python or Numba is a GraphError.
     """
     with _LOCK:
-        place = private(folder)
-        path = None if place is None else place / f"{op_type}-{_fingerprint()}.o"
+        place, name = private(folder), kernel.op_type
+        path = None if place is None else place / f"{name}-{_fingerprint()}.o"
         code = _read(path)
         if code is None:
-            begins()
-            found = importlib.import_module(f"{__package__}.{module}")
-            code = _compiled(found.functions(op_type))
+            module = importlib.import_module(f"{__package__}.{kernel.module}")
+            code = _compiled(module.functions(name))
             if path is not None:
                 keep(path, hashlib.sha256(code).digest() + code)
         return _addresses(code)

@@ -9,17 +9,16 @@ instructions, since Numba's loops over arrays do not keep tiles in registers.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from llvmlite import binding as llvm
 from llvmlite import ir
-from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
 
-from me2e_compress.operators.kernels.intrinsics import FLOAT, INT, WORD
+from me2e_compress.operators.kernels.intrinsics import INT, WORD
+from me2e_compress.operators.kernels.vectors import Vectors, vector_intrinsic
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +56,7 @@ def host_tile(vectors: int = 2) -> Tile:
 
 
 def matrix_product(tile: Tile) -> Any:
-    """Return the intrinsic ``(a, b, c, a_row, a_step, b_step, c_row, m, n, k, add)``.
+    """Return the intrinsic ``((a, b, c, a_row, a_step, b_step, c_row, m, n, k, add))``.
 
     It writes C [m, n], or adds to it if ``add`` is not 0: the product of A [m, k] and
     B [k, n]. ``a``, ``b`` and ``c`` are addresses of float32 numbers, the next four are
@@ -68,21 +67,9 @@ def matrix_product(tile: Tile) -> Any:
     All of B's ``k`` rows by ``tile.width`` columns are read again for each tile of rows
     and should fit into the first-level cache: callers divide larger ``k``.
     """
-
-    def typed(
-        context: Any,
-        a: Any, b: Any, c: Any,
-        a_row: Any, a_step: Any, b_step: Any, c_row: Any,
-        m: Any, n: Any, k: Any, add: Any,
-    ) -> tuple[Any, Callable[..., Any]]:  # fmt: skip
-        # Numba calls this with LLVM values
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            _Product(builder, tile, *arguments).write()
-            return context.get_dummy_value()
-
-        return types.void(*[types.intp] * 11), generate
-
-    return intrinsic(typed)
+    return vector_intrinsic(
+        lambda simd, *words: _Product(simd, tile, *words).write(), tile.lanes
+    )
 
 
 class _Product:
@@ -90,16 +77,14 @@ class _Product:
 
     def __init__(
         self,
-        builder: Any,
+        simd: Vectors,
         tile: Tile,
         a: Any, b: Any, c: Any,
         a_row: Any, a_step: Any, b_step: Any, c_row: Any,
         m: Any, n: Any, k: Any, add: Any,
     ) -> None:  # fmt: skip
-        self.builder, self.tile = builder, tile
-        self.kind = ir.VectorType(FLOAT, tile.lanes)
-        numbers = FLOAT.as_pointer()
-        self.a, self.b, self.c = (builder.inttoptr(at, numbers) for at in (a, b, c))
+        self.builder, self.tile, self.simd = simd.builder, tile, simd
+        self.a, self.b, self.c = (simd.pointer(at) for at in (a, b, c))
         self.a_row, self.a_step, self.b_step, self.c_row = a_row, a_step, b_step, c_row
         self.m, self.n, self.k, self.add = m, n, k, add
 
@@ -154,13 +139,13 @@ class _Product:
         wanted = builder.icmp_signed("!=", self.add, WORD(0))
         builder.cbranch(wanted, adding, zeros)
         builder.position_at_end(adding)
-        held = [self._load(place, mask) for place in places]
+        held = [self.simd.load(place, mask) for place in places]
         builder.branch(head)
         builder.position_at_end(zeros)
         builder.branch(head)
         builder.position_at_end(head)
         step = self._from(WORD(0), WORD(0), zeros, adding)
-        nothing = self.kind([0.0] * self.tile.lanes)
+        nothing = self.simd.spread(0.0)
         sums = [self._from(nothing, each, zeros, adding) for each in held]
         builder.cbranch(builder.icmp_signed("<", step, self.k), body, after)
         # Each step multiplies a row of B by one number of A for each row of C
@@ -171,11 +156,11 @@ class _Product:
             builder.gep(first, [builder.add(column, builder.mul(lanes, WORD(each)))])
             for each in range(vectors)
         ]
-        across = [self._load(place, mask) for place in numbers]
+        across = [self.simd.load(place, mask) for place in numbers]
         start = builder.gep(self.a, [builder.mul(step, self.a_step)])
         for index in range(rows):
             at = builder.mul(builder.add(row, WORD(index)), self.a_row)
-            factor = self._spread(builder.load(builder.gep(start, [at])))
+            factor = self.simd.spread(builder.load(builder.gep(start, [at])))
             for each in range(vectors):
                 total = sums[index * vectors + each]
                 product = builder.fmul(factor, across[each], flags=("contract",))
@@ -185,7 +170,7 @@ class _Product:
         builder.branch(head)
         builder.position_at_end(after)
         for total, place in zip(sums, places, strict=True):
-            self._store(total, place, mask)
+            self.simd.store(total, place, mask)
 
     def _from(self, one: Any, two: Any, first: Any, second: Any) -> Any:
         found = self.builder.phi(one.type)
@@ -210,30 +195,3 @@ class _Product:
         same = ir.VectorType(INT, lanes)([0] * lanes)
         spread = builder.shuffle_vector(blank, blank, same)
         return builder.icmp_signed("<", kind(list(range(lanes))), spread)
-
-    def _load(self, place: Any, mask: Any) -> Any:
-        at = self.builder.bitcast(place, self.kind.as_pointer())
-        if mask is None:
-            return self.builder.load(at, align=4)
-        nothing = self.kind([0.0] * self.tile.lanes)
-        arguments = [at, INT(4), mask, nothing]
-        return self._masked("load", self.kind, arguments)
-
-    def _store(self, vector: Any, place: Any, mask: Any) -> None:
-        at = self.builder.bitcast(place, self.kind.as_pointer())
-        if mask is None:
-            self.builder.store(vector, at, align=4)
-        else:
-            self._masked("store", ir.VoidType(), [vector, at, INT(4), mask])
-
-    def _masked(self, name: str, result: Any, arguments: list[Any]) -> Any:
-        kind = ir.FunctionType(result, [each.type for each in arguments])
-        name = f"llvm.masked.{name}.v{self.tile.lanes}f32.p0"
-        found = cgutils.get_or_insert_function(self.builder.module, kind, name)
-        return self.builder.call(found, arguments)
-
-    def _spread(self, number: Any) -> Any:
-        blank = self.kind(ir.Undefined)
-        first = self.builder.insert_element(blank, number, INT(0))
-        lanes = ir.VectorType(INT, self.tile.lanes)([0] * self.tile.lanes)
-        return self.builder.shuffle_vector(first, blank, lanes)

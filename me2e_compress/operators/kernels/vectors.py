@@ -1,4 +1,4 @@
-"""Vectors of 16 float32 numbers, for kernels that Numba does not vectorize itself.
+"""Vectors of float32 numbers, for kernels that Numba does not vectorize itself.
 
 LLVM splits them where the processor's are shorter.
 """
@@ -14,43 +14,41 @@ from numba.extending import intrinsic
 from me2e_compress.operators.kernels.intrinsics import FLOAT, INT
 
 LANES = 16
-"""Numbers of a vector."""
+"""Numbers of a vector of :func:`vector_intrinsic`."""
 
-_VECTOR = ir.VectorType(FLOAT, LANES)
-_LANE = ir.VectorType(INT, LANES)
 _FAST = ("contract",)
 
 
 class Vectors:
     """Writes arithmetic, loads and stores of vectors at addresses."""
 
-    def __init__(self, builder: Any) -> None:
-        self.builder = builder
+    def __init__(self, builder: Any, lanes: int = LANES) -> None:
+        self.builder, self.lanes = builder, lanes
+        self.kind = ir.VectorType(FLOAT, lanes)
+        self.whole = ir.VectorType(INT, lanes)
 
     def place(self, address: Any, offset: Any) -> Any:
         """Return the pointer to the number ``offset`` behind an address."""
-        first = self.builder.inttoptr(address, FLOAT.as_pointer())
-        return self.builder.gep(first, [offset])
+        return self.builder.gep(self.pointer(address), [offset])
 
-    def load(self, place: Any) -> Any:
-        """Load a vector from any place."""
-        at = self.builder.bitcast(place, _VECTOR.as_pointer())
-        return self.builder.load(at, align=4)
+    def pointer(self, address: Any) -> Any:
+        """Return the pointer to the number at an address."""
+        return self.builder.inttoptr(address, FLOAT.as_pointer())
 
-    def store(self, vector: Any, place: Any) -> None:
-        """Store a vector to any place."""
-        at = self.builder.bitcast(place, _VECTOR.as_pointer())
-        self.builder.store(vector, at, align=4)
+    def load(self, place: Any, mask: Any = None) -> Any:
+        """Load a vector from any place; of a mask its lanes, and 0 into the others."""
+        at = self.builder.bitcast(place, self.kind.as_pointer())
+        if mask is None:
+            return self.builder.load(at, align=4)
+        return self._masked("load", self.kind, [at, INT(4), mask, self.spread(0.0)])
 
-    def load_some(self, place: Any, mask: Any) -> Any:
-        """Load the lanes of a mask, and 0 into the others."""
-        at = self.builder.bitcast(place, _VECTOR.as_pointer())
-        return self._masked("load", _VECTOR, [at, INT(4), mask, self.spread(0.0)])
-
-    def store_some(self, vector: Any, place: Any, mask: Any) -> None:
-        """Store the lanes of a mask."""
-        at = self.builder.bitcast(place, _VECTOR.as_pointer())
-        self._masked("store", ir.VoidType(), [vector, at, INT(4), mask])
+    def store(self, vector: Any, place: Any, mask: Any = None) -> None:
+        """Store a vector, or the lanes of a mask, to any place."""
+        at = self.builder.bitcast(place, self.kind.as_pointer())
+        if mask is None:
+            self.builder.store(vector, at, align=4)
+        else:
+            self._masked("store", ir.VoidType(), [vector, at, INT(4), mask])
 
     def fetch(self, place: Any) -> None:
         """Begin to bring what is there into the caches; nothing need be there."""
@@ -62,27 +60,28 @@ class Vectors:
 
     def _masked(self, name: str, result: Any, arguments: list[Any]) -> Any:
         kind = ir.FunctionType(result, [each.type for each in arguments])
-        name = f"llvm.masked.{name}.v{LANES}f32.p0"
+        name = f"llvm.masked.{name}.v{self.lanes}f32.p0"
         found = cgutils.get_or_insert_function(self.builder.module, kind, name)
         return self.builder.call(found, arguments)
 
     def within(self, first: Any, limit: Any) -> Any:
         """Return the lanes whose position, counted from ``first``, is in 0..limit."""
-        builder, lanes = self.builder, _LANE(list(range(LANES)))
-        start = self._same(builder.trunc(first, INT), _LANE)
-        end = self._same(builder.trunc(limit, INT), _LANE)
+        builder, lanes = self.builder, self.whole(list(range(self.lanes)))
+        start = self._same(builder.trunc(first, INT), self.whole)
+        end = self._same(builder.trunc(limit, INT), self.whole)
         return builder.icmp_unsigned("<", builder.add(start, lanes), end)
 
     def spread(self, number: Any) -> Any:
         """Return a vector of one number."""
         if isinstance(number, float):
-            return _VECTOR([number] * LANES)
-        return self._same(number, _VECTOR)
+            return self.kind([number] * self.lanes)
+        return self._same(number, self.kind)
 
     def _same(self, number: Any, kind: Any) -> Any:
         blank = kind(ir.Undefined)
         first = self.builder.insert_element(blank, number, INT(0))
-        return self.builder.shuffle_vector(first, blank, _LANE([0] * LANES))
+        same = self.whole([0] * self.lanes)
+        return self.builder.shuffle_vector(first, blank, same)
 
     def add(self, one: Any, two: Any) -> Any:
         """Return one + two."""
@@ -108,7 +107,7 @@ class Vectors:
 
     def choose(self, one: Any, two: Any, lanes: Sequence[int]) -> Any:
         """Return lanes of two vectors, those of the second counted from 16."""
-        return self.builder.shuffle_vector(one, two, _LANE(list(lanes)))
+        return self.builder.shuffle_vector(one, two, self.whole(list(lanes)))
 
     def take_apart(self, v: Sequence[Any]) -> tuple[Any, ...]:
         """Return every fourth of 64 numbers, from the first, second, third, fourth."""
@@ -138,12 +137,12 @@ def _between(half: int) -> list[int]:
     return [lane for k in range(LANES // 2) for lane in (first + k, LANES + first + k)]
 
 
-def vector_intrinsic(write: Callable[..., None]) -> Any:
+def vector_intrinsic(write: Callable[..., None], lanes: int = LANES) -> Any:
     """Return an intrinsic of a tuple of words that writes instructions."""
 
     def typed(context: Any, given: Any) -> tuple[Any, Callable[..., Any]]:
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            write(Vectors(builder), *cgutils.unpack_tuple(builder, arguments[0]))
+            write(Vectors(builder, lanes), *cgutils.unpack_tuple(builder, arguments[0]))
             return context.get_dummy_value()
 
         return types.void(types.UniTuple(types.intp, len(given))), generate

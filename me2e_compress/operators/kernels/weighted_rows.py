@@ -13,6 +13,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from me2e_compress.operators.kernels.intrinsics import ELEMENTS, FLOAT, INT, WORD
+from me2e_compress.operators.kernels.vectors import Vectors
 
 CAPACITY = 1024
 """Points at a time, and the distance of the four arrays of offsets and weights."""
@@ -126,7 +127,9 @@ class _Loops:
             offset = builder.load(builder.gep(self.offsets, [place]))
             weight = builder.load(builder.gep(self.weights, [place]))
             row = self._row(builder.gep(rows, [builder.sext(offset, WORD)]), width)
-            part = builder.fmul(row, self._spread(weight, width), flags=("contract",))
+            part = builder.fmul(
+                row, Vectors(builder, width).spread(weight), flags=("contract",)
+            )
             more = builder.fadd(more, part, flags=("contract",))
         builder.branch(ahead)
 
@@ -160,9 +163,3 @@ class _Loops:
 
     def _vector_at(self, place: Any, element: Any, width: int) -> Any:
         return self.builder.bitcast(place, ir.VectorType(element, width).as_pointer())
-
-    def _spread(self, number: Any, width: int) -> Any:
-        blank = ir.VectorType(FLOAT, width)(ir.Undefined)
-        first = self.builder.insert_element(blank, number, INT(0))
-        lanes = ir.VectorType(INT, width)([0] * width)
-        return self.builder.shuffle_vector(first, blank, lanes)

@@ -140,7 +140,8 @@ def multiply(made: int, plane: int, read: int, to: int, depth: int, wide: int) -
         for channel in range(0, wide, LANES):
             left = made + (k * plane + channel * depth) * 4
             at = to + (k * PRODUCT_PLANE + channel * TILES) * 4
-            _multiply(left, right, at, 1, LANES, TILES, TILES, LANES, TILES, depth, 0)
+            sizes = (1, LANES, TILES, TILES, LANES, TILES, depth, 0)
+            _multiply((left, right, at, *sizes))
 
 
 @compiled

@@ -77,7 +77,7 @@ def _input_rows(
         inside = builder.icmp_unsigned("<", line, high)
         limit = builder.select(inside, wide, WORD(0))
         place = w.place(image, builder.add(builder.mul(line, wide), x))
-        read.append(w.load_some(place, w.within(x, limit)))
+        read.append(w.load(place, w.within(x, limit)))
         w.fetch(builder.gep(place, [ahead]))
     for k, vector in enumerate(_input(w, read)):
         w.store(vector, w.place(to, builder.mul(row, WORD(k))))
@@ -98,7 +98,7 @@ def _input_columns(
             taken.append(w.choose(taken[part], w.spread(after), following))
         for part, vector in enumerate(_input(w, taken)):
             at = builder.mul(plane, WORD(k * SIDE + part))
-            w.store_some(vector, w.place(to, at), mask)
+            w.store(vector, w.place(to, at), mask)
 
 
 def _filters(
@@ -107,7 +107,7 @@ def _filters(
     builder, mask, read = w.builder, w.within(WORD(0), count), []
     for k in range(FILTER * FILTER):
         place = w.place(elements, builder.mul(step, WORD(k)))
-        read.append(w.load_some(place, mask))
+        read.append(w.load(place, mask))
         w.fetch(builder.gep(place, [ahead]))
     across = [_filter(w, read[FILTER * k : FILTER * (k + 1)]) for k in range(FILTER)]
     for part in range(SIDE):
@@ -137,7 +137,7 @@ def _outputs(
         for part, vector in enumerate(w.put_together(made)):
             first = WORD(part * LANES)
             place = w.place(to, builder.add(builder.mul(wide, WORD(k)), first))
-            w.store_some(vector, place, w.within(first, limit))
+            w.store(vector, place, w.within(first, limit))
             w.fetch(builder.gep(place, [ahead]))
 
 

@@ -29,7 +29,7 @@ def product() -> Callable[..., None]:
         a: int, b: int, c: int, a_row: int, a_step: int, b_step: int, c_row: int,
         m: int, n: int, k: int, add: int,
     ) -> None:  # fmt: skip
-        multiply(a, b, c, a_row, a_step, b_step, c_row, m, n, k, add)
+        multiply((a, b, c, a_row, a_step, b_step, c_row, m, n, k, add))
 
     made: Callable[..., None] = numba.njit(**OPTIONS)(call)
     return made

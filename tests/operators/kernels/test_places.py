@@ -75,7 +75,7 @@ def test_code_is_compiled_once_and_read_afterwards(
 
     code = kernels.KERNELS[0]
     folder = store.default_folder()
-    machine_code.load_or_compile(code.op_type, code.module, folder, lambda: None)
+    machine_code.load_or_compile(code, folder)
     file = folder / f"{code.op_type}-{machine_code._fingerprint()}.o"
     if not file.is_file():
         pytest.skip("the user's cache folder keeps nothing")
@@ -89,19 +89,17 @@ def test_code_is_compiled_once_and_read_afterwards(
     monkeypatch.setattr(machine_code, "_compiled", counted)
 
     def load() -> int:
-        machine_code.load_or_compile(
-            code.op_type, code.module, tmp_path, lambda: compiled.append("begins")
-        )
+        machine_code.load_or_compile(code, tmp_path)
         return len(compiled)
 
-    assert load() == 2
-    assert load() == 2
+    assert load() == 1
+    assert load() == 1
     (kept,) = tmp_path.iterdir()
     assert kept.stat().st_mode & 0o777 == 0o600
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
-    assert load() == 2
-    machine_code.load_or_compile(code.op_type, code.module, blocked, lambda: None)
-    assert len(compiled) == 3  # nowhere to keep it: compiled in every process
+    assert load() == 1
+    machine_code.load_or_compile(code, blocked)
+    assert len(compiled) == 2  # nowhere to keep it: compiled in every process
     os.truncate(kept, kept.stat().st_size // 2)  # a disk that was full
-    assert load() == 5
+    assert load() == 3

@@ -177,9 +177,7 @@ def test_a_library_that_claims_the_operator_does_no_harm(
     mine = kernels.KERNELS[0]
     theirs = CompiledKernel(node.op_type, mine.module, mine.inputs, ("theirs",) * 9)
     options = ort.SessionOptions()
-    code = load_or_compile(
-        mine.op_type, mine.module, store.default_folder(), lambda: None
-    )
+    code = load_or_compile(mine, store.default_folder())
     with monkeypatch.context() as patch:
         patch.setattr(custom_ops, "load_or_compile", lambda *_: code)
         patch.setattr(custom_ops, "DOMAIN", node.domain)
