@@ -4,7 +4,7 @@ import contextlib
 import hashlib
 import os
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import onnx
@@ -63,7 +63,8 @@ def load(path: str | Path) -> ir.Model:
             f"{path}: not an ONNX file, or cut short ({reason(error)})"
         ) from error
     try:
-        model = _built(proto)
+        in_order = structure.check(proto)
+        model = _built(proto, in_order)
     except GraphError as error:
         raise GraphError(f"{path}: {error}") from error
     ir.external_data.set_base_dir(model.graph, path.parent)
@@ -74,9 +75,8 @@ def load(path: str | Path) -> ir.Model:
     return model
 
 
-def _built(proto: onnx.ModelProto) -> ir.Model:
-    """Check a message and build the graph that it holds, its nodes in order."""
-    in_order = structure.check(proto)
+def _built(proto: onnx.ModelProto, in_order: bool) -> ir.Model:
+    """Build the graph of a message, its nodes in order."""
     proto.graph.name = proto.graph.name or "graph"  # ONNX's checker wants one
     try:
         model = ir.serde.deserialize_model(proto)
@@ -110,13 +110,13 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
     if not path.parent.is_dir():
         raise GraphError(f"{path}: no such folder {path.parent}")
     stored = list(external_tensors(model))
-    names = data_names(path)
+    names, own = data_names(path), {os.path.realpath(each.path) for each in stored}
     for data in names:
-        if any(
-            os.path.realpath(data) == os.path.realpath(each.path) for each in stored
-        ):
+        if os.path.realpath(data) in own:
             raise GraphError(f"{data}: holds the weights of the model being saved")
-    earlier = _named_in(path, names)
+    # The model that is replaced names one data file, if any; the last may be old
+    there = path.is_file()
+    earlier = [each for each in names if there and _holds(path, each.name.encode())][:1]
     data = next(each for each in names if each not in earlier)
     if external is None:
         external = bool(stored) or weight_bytes(model) > INLINE_LIMIT_BYTES
@@ -155,13 +155,6 @@ def _ours(model: ir.Model) -> Iterator[None]:
 def data_names(path: Path) -> tuple[Path, Path]:
     """Return where the weights of a model may lie; what it is written over has one."""
     return path.with_name(f"{path.name}.data"), path.with_name(f"{path.name}.1.data")
-
-
-def _named_in(path: Path, names: Iterable[Path]) -> list[Path]:
-    """Return which data file the model at a path names; the last one may be old."""
-    if not path.is_file():
-        return []
-    return [each for each in names if _holds(path, each.name.encode())][:1]
 
 
 def is_external(model: ir.Model) -> bool:

@@ -18,9 +18,6 @@ from onnx.onnx_cpp2py_export.checker import CheckerContext
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.nodes import STANDARD
 
-# What a file declares: names, types and sizes, and nodes that fit their operators.
-
-
 LARGEST_ELEMENTS = 2**40
 """Elements of one tensor: no memory holds more."""
 HIGHEST_RANK = 64
@@ -44,36 +41,26 @@ _FIELDS = (
 )  # fmt: skip
 
 
-def check_text(where: str, texts: Iterable[str]) -> None:
-    """Refuse names that are not UTF-8: protobuf hands them out as bytes.
-
-    Raises:
-        GraphError: one of them is not.
-    """
+def _check_text(where: str, texts: Iterable[str]) -> None:
+    """Refuse names that are not UTF-8: protobuf hands them out as bytes."""
     for text in texts:
         if type(text) is not str:
             raise GraphError(f"{where}: {text!r} is not UTF-8")
 
 
-def check_port(port: onnx.ValueInfoProto, *, typed: bool) -> None:
+def _check_port(port: onnx.ValueInfoProto, *, typed: bool) -> None:
     """Check a type; a size below 0 becomes an open one, a type of nothing none.
 
-    ``typed`` ports must say what they are, as the inputs of a graph must.
-
-    Raises:
-        GraphError: it is no tensor, sequence or optional, or of an unknown element.
+    ``typed`` ports must say what they are, as the inputs of a graph must. Only tensors,
+    sequences and optionals are read.
     """
-    kind = port.type.WhichOneof("value")
-    if kind == "tensor_type":
-        _check_tensor_type(port, typed=typed)
-    elif kind in ("map_type", "sparse_tensor_type") or (kind is None and typed):
+    kind, about = port.type.WhichOneof("value"), port.type.tensor_type
+    if kind in ("map_type", "sparse_tensor_type") or (kind is None and typed):
         raise GraphError(
             f"{port.name!r} is not a tensor: its type is {kind or 'missing'}"
         )
-
-
-def _check_tensor_type(port: onnx.ValueInfoProto, *, typed: bool) -> None:
-    about = port.type.tensor_type
+    if kind != "tensor_type":
+        return
     if about.elem_type not in _TYPES:
         if typed or about.elem_type != TensorProto.UNDEFINED:
             raise GraphError(
@@ -85,20 +72,15 @@ def _check_tensor_type(port: onnx.ValueInfoProto, *, typed: bool) -> None:
         raise GraphError(f"{port.name!r} has {len(about.shape.dim)} dimensions")
     for dim in about.shape.dim:
         if dim.WhichOneof("value") == "dim_param":
-            check_text(f"{port.name!r}: a dimension", (dim.dim_param,))
+            _check_text(f"{port.name!r}: a dimension", (dim.dim_param,))
         elif dim.dim_value < 0:
             dim.ClearField("dim_value")
         elif dim.dim_value > LARGEST_ELEMENTS:
             raise GraphError(f"{port.name!r} has a dimension of {dim.dim_value}")
 
 
-def check_tensor(tensor: TensorProto, what: str = "") -> None:
-    """Check that a tensor has as many elements as its shape says.
-
-    Raises:
-        GraphError: it has not, or its type is unknown.
-    """
-    what = what or f"initializer {tensor.name!r}"
+def _check_tensor(tensor: TensorProto, what: str) -> None:
+    """Check that a tensor has a known type, and as many elements as its shape says."""
     kind, count = tensor.data_type, math.prod(tensor.dims)
     if kind not in _TYPES:
         raise GraphError(f"{what} is of element type {kind}, which is none")
@@ -111,38 +93,28 @@ def check_tensor(tensor: TensorProto, what: str = "") -> None:
     filled = [name for name in _FIELDS if getattr(tensor, name)]
     if filled and (len(filled) > 1 or tensor.raw_data):
         raise GraphError(f"{what} holds its data twice")
-    if filled or kind not in _BITS:
-        _check_values(tensor, what, count)
+    bits = _BITS.get(kind)
+    if bits is not None and not filled:
+        wanted, length = -(-count * bits // 8), len(tensor.raw_data)
+        if wanted != length:
+            raise GraphError(f"{what} has {length} bytes, its shape says {wanted}")
         return
-    wanted, found = -(-count * _BITS[kind] // 8), len(tensor.raw_data)
-    if wanted != found:
-        raise GraphError(f"{what} has {found} bytes, its shape says {wanted}")
+    # The elements stand one by one in a field of their type
+    if kind in (TensorProto.COMPLEX64, TensorProto.COMPLEX128):
+        count *= 2  # real and imaginary part
+    elif bits == 4:
+        count = -(-count // 2)  # two in a byte
+    length = len(getattr(tensor, onnx.helper.tensor_dtype_to_field(kind)))
+    if count != length:
+        raise GraphError(f"{what} has {length} values, its shape says {count}")
 
 
-def _check_values(tensor: TensorProto, what: str, count: int) -> None:
-    """Check the elements of a tensor that stand one by one in a field of their type."""
-    field = onnx.helper.tensor_dtype_to_field(tensor.data_type)
-    wanted = count
-    if tensor.data_type in (TensorProto.COMPLEX64, TensorProto.COMPLEX128):
-        wanted = 2 * count  # real and imaginary part
-    elif _BITS.get(tensor.data_type) == 4:
-        wanted = -(-count // 2)  # two in a byte
-    found = len(getattr(tensor, field))
-    if wanted != found:
-        raise GraphError(f"{what} has {found} values, its shape says {wanted}")
-
-
-def check_signature(node: onnx.NodeProto, versions: Mapping[str, int]) -> None:
+def _check_signature(node: onnx.NodeProto, version: int) -> None:
     """Check a node of ONNX's own against its operator, by ONNX's checker.
 
     One that nobody knows, as plugins are, takes anything, and so does an operator that
-    ONNX gave up: runtimes may have it still. ``versions`` are opsets by domain.
-
-    Raises:
-        GraphError: too many or too few inputs or outputs, or an attribute that is
-            unknown or of another type.
+    ONNX gave up: runtimes may have it still.
     """
-    version = versions.get("", versions.get("ai.onnx", 0))
     if node.domain not in STANDARD or not onnx.defs.has(node.op_type, version, ""):
         return
     if onnx.defs.get_schema(node.op_type, version, "").deprecated:
@@ -175,57 +147,39 @@ def _without_contents(node: onnx.NodeProto) -> onnx.NodeProto:
     for each in node.attribute:
         if each.type not in contents or each.ref_attr_name:
             bare.attribute.append(each)
-        elif each.type == onnx.AttributeProto.TENSOR:
-            empty = TensorProto(data_type=TensorProto.FLOAT, dims=[0])
-            bare.attribute.add(name=each.name, type=each.type, t=empty)
+            continue
+        empty = bare.attribute.add(name=each.name, type=each.type)
+        if each.type == onnx.AttributeProto.TENSOR:
+            empty.t.CopyFrom(TensorProto(data_type=TensorProto.FLOAT, dims=[0]))
         else:
-            bare.attribute.add(
-                name=each.name, type=each.type, g=onnx.GraphProto(name="body")
-            )
+            empty.g.name = "body"
     return bare
 
 
-def check_attributes(node: onnx.NodeProto, *, in_function: bool) -> None:
-    """Check that each attribute has a name and a value, or refers to a function's.
-
-    Raises:
-        GraphError: one has not, is there twice, or refers to one where there is none.
-    """
-    found = set[str]()
+def _check_attributes(node: onnx.NodeProto, *, in_function: bool) -> None:
+    """Check that each attribute has a name and a value, or refers to a function's."""
+    names = set[str]()
     for each in node.attribute:
         name = each.name
-        if type(name) is not str or not name or name in found:
+        if type(name) is not str or not name or name in names:
             raise GraphError(f"{_called(node)}: attribute {name!r} twice, or nameless")
-        found.add(name)
+        names.add(name)
+        field = _FIELD.get(each.type)
         if each.ref_attr_name:
             if not in_function:
                 raise GraphError(
                     f"{_called(node)}: attribute {name} refers to one of a function,"
                     " and stands in none"
                 )
-            continue
-        if each.type not in _ATTRIBUTE_TYPES:
+        elif each.type not in _ATTRIBUTE_TYPES:
             raise GraphError(f"{_called(node)}: attribute {name} is of no known type")
-        field = _FIELD.get(each.type)
-        if field is not None and not each.HasField(field):
+        elif field is not None and not each.HasField(field):
             raise GraphError(f"{_called(node)}: attribute {name} has no value")
 
 
 _ATTRIBUTE_TYPES = frozenset(onnx.AttributeProto.AttributeType.values()) - {0}
 _FIELD = {onnx.AttributeProto.TENSOR: "t", onnx.AttributeProto.GRAPH: "g"}
 """The field of an attribute that has no value of its own where it is left out."""
-
-
-def check_call(node: onnx.NodeProto, function: onnx.FunctionProto) -> None:
-    """Refuse a call of a function with more inputs or outputs than it has."""
-    for what, given, most in (
-        ("inputs", node.input, function.input),
-        ("outputs", node.output, function.output),
-    ):
-        if len(given) > len(most):
-            raise GraphError(
-                f"{_called(node)} has {len(given)} {what}, at most {len(most)} may be"
-            )
 
 
 def _called(node: onnx.NodeProto) -> str:
@@ -254,35 +208,34 @@ def check(model: onnx.ModelProto) -> bool:
         GraphError: names what is missing, doubled, unknown or of another kind, without
             the file.
     """
-    _check_opsets(model)
-    if not model.graph.output:
-        raise GraphError("not an ONNX model (no outputs)")
-    check_text("metadata", (p for e in model.metadata_props for p in (e.key, e.value)))
-    check_text("model", (model.producer_name, model.doc_string, model.domain))
-    versions = {each.domain: each.version for each in model.opset_import}
-    functions = {(f.domain, f.name, f.overload): f for f in model.functions}
-    if len(functions) < len(model.functions):
-        raise GraphError("two of its functions have one name")
-    _check_calls(model.graph, functions)
-    walk = _Walk(versions, functions)
-    walk.main(model.graph)
-    for function in model.functions:
-        walk.function(function)
-    return walk.in_order
-
-
-def _check_opsets(model: onnx.ModelProto) -> None:
+    # Versions
     if not model.opset_import:
         raise GraphError("not an ONNX model (no opset)")
     if not 1 <= model.ir_version <= LARGEST_VERSION:
         raise GraphError(f"IR version {model.ir_version} is none")
     for imports in (model.opset_import, *(f.opset_import for f in model.functions)):
-        check_text("opset", (each.domain for each in imports))
+        _check_text("opset", (each.domain for each in imports))
         for each in imports:
             if not 1 <= each.version <= LARGEST_VERSION:
                 raise GraphError(f"opset {each.version} of {each.domain or 'ai.onnx'}")
         if len({each.domain for each in imports}) < len(imports):
             raise GraphError("two opsets of one domain")
+    # What the model says of itself
+    if not model.graph.output:
+        raise GraphError("not an ONNX model (no outputs)")
+    _check_text("metadata", (p for e in model.metadata_props for p in (e.key, e.value)))
+    _check_text("model", (model.producer_name, model.doc_string, model.domain))
+    # Graph and functions
+    functions = {(f.domain, f.name, f.overload): f for f in model.functions}
+    if len(functions) < len(model.functions):
+        raise GraphError("two of its functions have one name")
+    _check_calls(model.graph, functions)
+    versions = {each.domain: each.version for each in model.opset_import}
+    walk = _Walk(versions, functions)
+    walk.main(model.graph)
+    for function in model.functions:
+        walk.function(function)
+    return walk.in_order
 
 
 Function = tuple[str, str, str]
@@ -294,17 +247,14 @@ def _check_calls(
     """Refuse functions that nothing can inline: in a circle, too deep or too many."""
 
     def size(nodes: Iterable[onnx.NodeProto]) -> int:
-        names = (
-            (each.domain, each.op_type, each.overload) for each in _all_nodes(nodes)
-        )
-        return sum(sizes.get(name, 1) for name in names)
+        return sum(sizes.get(_key(node), 1) for node in _all_nodes(nodes))
 
     sizes: dict[Function, int] = {}
     calls = {
         name: {
-            called
+            key
             for node in _all_nodes(function.node)
-            if (called := (node.domain, node.op_type, node.overload)) in functions
+            if (key := _key(node)) in functions
         }
         for name, function in functions.items()
     }
@@ -327,6 +277,10 @@ def _check_calls(
         )
 
 
+def _key(node: onnx.NodeProto) -> Function:
+    return node.domain, node.op_type, node.overload
+
+
 def _all_nodes(nodes: Iterable[onnx.NodeProto]) -> Iterable[onnx.NodeProto]:
     for node in nodes:
         yield node
@@ -336,41 +290,38 @@ def _all_nodes(nodes: Iterable[onnx.NodeProto]) -> Iterable[onnx.NodeProto]:
 
 
 class _Walk:
-    """Goes through every graph of a model, with the names that are known there.
-
-    Args:
-        versions: opset of every domain.
-        functions: the model's own.
-    """
+    """Goes through the graphs of a model, or a function, with the names known there."""
 
     def __init__(
         self,
-        versions: dict[str, int],
-        functions: dict[Function, onnx.FunctionProto],
+        versions: Mapping[str, int],
+        functions: Mapping[Function, onnx.FunctionProto],
+        in_function: bool = False,
     ) -> None:
         self.versions, self.functions = versions, functions
-        self.in_order = True
+        self.in_function, self.in_order = in_function, True
+        self.opset = versions.get("", versions.get("ai.onnx", 0))
 
     def main(self, body: onnx.GraphProto) -> None:
         """Check the graph itself: its inputs say what they are."""
         given = {each.name for each in body.initializer}
         for each in body.input:
             if each.name not in given:
-                check_port(each, typed=True)
+                _check_port(each, typed=True)
         for each in (*body.output, *body.value_info):
-            check_port(each, typed=False)
+            _check_port(each, typed=False)
         self.graph(body, frozenset(), 0)
 
     def function(self, function: onnx.FunctionProto) -> None:
         """Check a function."""
         where = f"function {function.name}"
-        check_text("function", (function.name, function.domain, function.doc_string))
+        _check_text("function", (function.name, function.domain, function.doc_string))
         if not function.name or not function.output or not function.node:
             raise GraphError(f"{where} has no name, no output or no node")
         _unique(f"{where}: input", function.input)
         local = {each.domain: each.version for each in function.opset_import}
-        inside = _Walk({**self.versions, **local}, self.functions)
-        known = inside.nodes(where, function.node, function.input, frozenset(), 0, True)
+        inside = _Walk({**self.versions, **local}, self.functions, in_function=True)
+        known = inside.nodes(where, function.node, function.input, frozenset(), 0)
         _made(f"{where}: output", function.output, known)
         self.in_order = self.in_order and inside.in_order
 
@@ -382,15 +333,15 @@ class _Walk:
         if body.sparse_initializer:
             name = body.sparse_initializer[0].values.name
             raise GraphError(f"initializer {name!r} is sparse: write it as a dense one")
-        check_text(where, (body.name, body.doc_string))
+        _check_text(where, (body.name, body.doc_string))
         names = [each.name for each in body.initializer]
         ports = [each.name for each in body.input]
         _unique(f"{where}: input", ports)
         _unique(f"{where}: initializer", names)
         for tensor in body.initializer:
-            check_tensor(tensor)
+            _check_tensor(tensor, f"initializer {tensor.name!r}")
         begin = (*ports, *(name for name in names if name not in set(ports)))
-        known = self.nodes(where, body.node, begin, outside, depth, False)
+        known = self.nodes(where, body.node, begin, outside, depth)
         _unique(f"{where}: output", [each.name for each in body.output])
         _made(f"{where}: output", (each.name for each in body.output), known)
 
@@ -401,12 +352,11 @@ class _Walk:
         begin: Sequence[str],
         outside: Names,
         depth: int,
-        in_function: bool,
     ) -> Names:
         """Check nodes; return every name that is known behind the last."""
         made = dict.fromkeys(begin, "an input or initializer")
         for node in nodes:
-            check_text("node", (node.name, node.op_type, node.domain, node.doc_string))
+            _check_text("node", (node.name, node.op_type, node.domain, node.doc_string))
             label = node.name or f"of {node.op_type}"
             if not node.op_type or not any(node.output):
                 raise GraphError(
@@ -422,17 +372,12 @@ class _Walk:
         reachable = made.keys() | outside
         before = {*begin, *outside}
         for node in nodes:
-            self._node(node, reachable, before, depth, in_function)
+            self._node(node, reachable, before, depth)
             before.update(node.output)
         return made.keys()
 
     def _node(
-        self,
-        node: onnx.NodeProto,
-        reachable: Names,
-        before: Names,
-        depth: int,
-        in_function: bool,
+        self, node: onnx.NodeProto, reachable: Names, before: Names, depth: int
     ) -> None:
         for name in filter(None, node.input):
             if name not in reachable:
@@ -440,30 +385,34 @@ class _Walk:
                     f"node {node.name!r} reads {name!r}, which nothing makes"
                 )
             self.in_order = self.in_order and name in before
-        check_attributes(node, in_function=in_function)
-        called = self.functions.get((node.domain, node.op_type, node.overload))
+        _check_attributes(node, in_function=self.in_function)
+        # By its operator, or the function that it calls
+        called = self.functions.get(_key(node))
         if called is None:
-            check_signature(node, self.versions)
+            _check_signature(node, self.opset)
         else:
-            check_call(node, called)
+            pairs = (node.input, called.input), (node.output, called.output)
+            for what, (given, most) in zip(("inputs", "outputs"), pairs, strict=True):
+                if len(given) > len(most):
+                    raise GraphError(
+                        f"{_called(node)} has {len(given)} {what}, at most {len(most)}"
+                        " may be"
+                    )
+        # What it holds
         for each in node.metadata_props:
-            check_text("metadata of a node", (each.key, each.value))
+            _check_text("metadata of a node", (each.key, each.value))
         for attribute in node.attribute:
-            own = (attribute.t,) if attribute.HasField("t") else ()
-            for tensor in (*own, *attribute.tensors):
-                check_tensor(tensor, f"the tensor of node {node.name!r}")
-            for body in _bodies(attribute):
+            tensors = (attribute.t,) if attribute.HasField("t") else ()
+            for tensor in (*tensors, *attribute.tensors):
+                _check_tensor(tensor, f"the tensor of node {node.name!r}")
+            bodies = (attribute.g,) if attribute.HasField("g") else ()
+            for body in (*bodies, *attribute.graphs):
                 self.graph(body, reachable, depth + 1)
-
-
-def _bodies(attribute: onnx.AttributeProto) -> tuple[onnx.GraphProto, ...]:
-    own = (attribute.g,) if attribute.HasField("g") else ()
-    return (*own, *attribute.graphs)
 
 
 def _unique(what: str, names: Iterable[str]) -> None:
     listed = list(names)
-    check_text(what, listed)
+    _check_text(what, listed)
     if "" in listed:
         raise GraphError(f"{what} without a name")
     if len(set(listed)) < len(listed):

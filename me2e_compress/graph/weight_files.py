@@ -7,12 +7,14 @@ bytes of the file are the same.
 """
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import onnx
 import onnx_ir as ir
+from google.protobuf.message import Message
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.nodes import nodes_of
@@ -42,10 +44,15 @@ def settle(model: ir.Model, path: Path) -> None:
     mapped = {id(value.const_value) for value in model.graph.initializers.values()}
     for tensor, replace in list(_places(model)):
         anchored = _anchored(tensor, path)
-        if tensor.nbytes <= SMALL_BYTES or id(tensor) not in mapped:
-            replace(_read(anchored, path))
-        else:
+        if tensor.nbytes > SMALL_BYTES and id(tensor) in mapped:
             replace(anchored)
+            continue
+        try:
+            array = anchored.numpy().copy()
+            replace(ir.tensor(array, dtype=tensor.dtype, name=tensor.name))
+        except (ValueError, TypeError) as error:
+            message = f"{path}: {tensor.name} cannot be read ({error})"
+            raise GraphError(message) from error
 
 
 def data_file(model: Path, tensor: ir.ExternalTensor) -> Path:
@@ -80,40 +87,25 @@ def _places(
     for graph in model.graphs():
         for value in graph.initializers.values():
             if isinstance(value.const_value, ir.ExternalTensor):
-                yield value.const_value, _setter(value)
+                yield value.const_value, partial(setattr, value, "const_value")
     for node in nodes_of(model):
         for attribute in node.attributes.values():
             if isinstance(attribute.value, ir.ExternalTensor):
-                yield attribute.value, _attribute_setter(node, attribute.name)
+                yield attribute.value, partial(_put, node, attribute.name, None)
             elif attribute.type == ir.AttributeType.TENSORS and not attribute.is_ref():
                 for at, tensor in enumerate(attribute.as_tensors()):
                     if isinstance(tensor, ir.ExternalTensor):
-                        yield tensor, _item_setter(node, attribute.name, at)
+                        yield tensor, partial(_put, node, attribute.name, at)
 
 
-def _setter(value: ir.Value) -> Callable[[ir.TensorProtocol], None]:
-    def put(tensor: ir.TensorProtocol) -> None:
-        value.const_value = tensor
-
-    return put
-
-
-def _attribute_setter(node: ir.Node, name: str) -> Callable[[ir.TensorProtocol], None]:
-    def put(tensor: ir.TensorProtocol) -> None:
+def _put(node: ir.Node, name: str, at: int | None, tensor: ir.TensorProtocol) -> None:
+    """Put a tensor into an attribute, or into one place of its list."""
+    if at is None:
         node.attributes[name] = ir.AttrTensor(name, tensor)
-
-    return put
-
-
-def _item_setter(
-    node: ir.Node, name: str, at: int
-) -> Callable[[ir.TensorProtocol], None]:
-    def put(tensor: ir.TensorProtocol) -> None:
-        tensors = list(node.attributes[name].as_tensors())
-        tensors[at] = tensor
-        node.attributes[name] = ir.AttrTensors(name, tensors)
-
-    return put
+        return
+    tensors = list(node.attributes[name].as_tensors())
+    tensors[at] = tensor
+    node.attributes[name] = ir.AttrTensors(name, tensors)
 
 
 def _anchored(tensor: ir.ExternalTensor, path: Path) -> ir.ExternalTensor:
@@ -146,13 +138,6 @@ def _anchored(tensor: ir.ExternalTensor, path: Path) -> ir.ExternalTensor:
     )
 
 
-def _read(tensor: ir.ExternalTensor, path: Path) -> ir.TensorProtocol:
-    try:
-        return ir.tensor(tensor.numpy().copy(), dtype=tensor.dtype, name=tensor.name)
-    except (ValueError, TypeError) as error:
-        raise GraphError(f"{path}: {tensor.name} cannot be read ({error})") from error
-
-
 LARGE_BYTES = 1 << 16
 """Weights beyond this are written one by one, smaller ones with the graph."""
 
@@ -160,9 +145,9 @@ _GRAPH, _INITIALIZER, _RAW_DATA = b"\x3a", b"\x2a", b"\x4a"
 """ModelProto.graph is field 7, GraphProto.initializer 5, TensorProto.raw_data 9, each
 followed by its length (onnx.proto)."""
 
-_BEHIND_GRAPH = (
-    *("opset_import", "metadata_props", "training_info", "functions"),
-    "configuration",
+_BEFORE_GRAPH = (
+    *("ir_version", "producer_name", "producer_version", "domain"),
+    *("model_version", "doc_string"),
 )
 _PLAIN = frozenset(
     {
@@ -185,24 +170,29 @@ def write_inline(model: ir.Model, path: Path) -> None:
         if value.const_value is not None and _is_large(value.const_value)
     }
     proto = _light(model, large)
-    of_name = {str(value.name): tensor for value, tensor in large.items()}
-    begins, lengths = list[bytes](), list[int]()
+    # The message of each weight, that of a large one but for its numbers
+    large_of = {str(value.name): tensor for value, tensor in large.items()}
+    weights = list[tuple[bytes, ir.TensorProtocol | None, int]]()
     for each in proto.graph.initializer:
-        held = of_name.get(each.name)
-        begin = each.SerializeToString() if held is None else _begin(each.name, held)
-        begins.append(begin)
-        lengths.append(len(begin) + (0 if held is None else held.nbytes))
-    total = sum(1 + len(_varint(length)) + length for length in lengths)
-    names = [each.name for each in proto.graph.initializer]
-    before, behind = _graph_around(proto.graph)
-    first, last = _model_around(proto)
+        tensor = large_of.get(each.name)
+        if tensor is None:
+            begin, more = bytes(each.SerializeToString()), 0
+        else:
+            begin, more = _begin(each.name, tensor), tensor.nbytes
+        weights.append((begin, tensor, len(begin) + more))
+    # Fields are written in the order of their numbers
+    proto.graph.ClearField("initializer")
+    before, behind = _around(proto.graph, ("node", "name"))
+    proto.ClearField("graph")
+    first, last = _around(proto, _BEFORE_GRAPH)
+    total = sum(1 + len(_varint(length)) + length for _, _, length in weights)
     total += len(before) + len(behind)
     with path.open("wb") as stream:
         stream.write(first + _GRAPH + _varint(total) + before)
-        for name, begin, length in zip(names, begins, lengths, strict=True):
+        for begin, tensor, length in weights:
             stream.write(_INITIALIZER + _varint(length) + begin)
-            if name in of_name:
-                stream.write(of_name[name].tobytes())
+            if tensor is not None:
+                stream.write(tensor.tobytes())
         stream.write(behind + last)
 
 
@@ -243,27 +233,13 @@ def _begin(name: str, tensor: ir.TensorProtocol) -> bytes:
     return bytes(begin.SerializeToString()) + _RAW_DATA + _varint(tensor.nbytes)
 
 
-def _graph_around(graph: onnx.GraphProto) -> tuple[bytes, bytes]:
-    """Return the fields of a graph before its initializers, and those behind.
-
-    Fields are written in the order of their numbers: nodes and name come before.
-    """
-    graph.ClearField("initializer")
-    whole = graph.SerializeToString()
-    graph.ClearField("node")
-    graph.ClearField("name")
-    behind = graph.SerializeToString()
+def _around(message: Message, fields_before: Iterable[str]) -> tuple[bytes, bytes]:
+    """Return the fields of a message before one that it lacks, and those behind."""
+    whole = message.SerializeToString()
+    for name in fields_before:
+        message.ClearField(name)
+    behind = message.SerializeToString()
     return whole[: len(whole) - len(behind)], behind
-
-
-def _model_around(proto: onnx.ModelProto) -> tuple[bytes, bytes]:
-    """Return the fields of a model before its graph, and those behind."""
-    proto.ClearField("graph")
-    whole = proto.SerializeToString()
-    for name in _BEHIND_GRAPH:
-        proto.ClearField(name)
-    first = proto.SerializeToString()
-    return first, whole[len(first) :]
 
 
 def _varint(number: int) -> bytes:
