@@ -1,6 +1,6 @@
 """Graphs that are newer than the runtime: written down to what it reads."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import onnx
@@ -58,15 +58,12 @@ def _lower_opset(model: ir.Model, newest: int, path: Path) -> None:
         for node in body.all_nodes()
         if _since(node, opset) > NEWEST_OPSET
     ]
-    if changed:
-        infer_shapes(model)
-    for node, opset in changed:
-        reason = _rewrite(node, opset)
-        if reason is not None:
-            raise GraphError(
-                f"{path}: opset {opset}: onnxruntime reads up to {NEWEST_OPSET}, and"
-                f" {node.op_type} {node.name!r} cannot be written in that: {reason}"
-            )
+    if failure := _write_in(model, changed, NEWEST_OPSET):
+        node, opset, reason = failure
+        raise GraphError(
+            f"{path}: opset {opset}: onnxruntime reads up to {NEWEST_OPSET}, and"
+            f" {node.op_type} {node.name!r} cannot be written in that: {reason}"
+        )
     functions = [function.opset_imports for function in model.functions.values()]
     for imports in (model.opset_imports, *functions):
         for domain in STANDARD:
@@ -98,21 +95,29 @@ def newer(model: ir.Model, opset: int) -> str | None:
     if opset > known:
         return f"onnx {onnx.__version__} converts to {known} at most"
     changed = [
-        node
+        (node, before)
         for node in model.graph.all_nodes()
         if _since(node, before) != _since(node, opset)
     ]
-    if changed:
-        infer_shapes(model)
-    for node in changed:
-        reason = _rewrite(node, before, opset)
-        if reason is not None:
-            called = f"{node.op_type} {node.name!r}"
-            return f"{called} cannot be written in {opset}: {reason}"
+    if failure := _write_in(model, changed, opset):
+        node, _, reason = failure
+        return f"{node.op_type} {node.name!r} cannot be written in {opset}: {reason}"
     return None
 
 
-def _rewrite(node: ir.Node, opset: int, wanted: int = NEWEST_OPSET) -> str | None:
+def _write_in(
+    model: ir.Model, nodes: Sequence[tuple[ir.Node, int]], opset: int
+) -> tuple[ir.Node, int, str] | None:
+    """Write nodes, each with its opset, in another; return the first that refuses."""
+    if nodes:
+        infer_shapes(model)
+    for node, before in nodes:
+        if (reason := _rewrite(node, before, opset)) is not None:
+            return node, before, reason
+    return None
+
+
+def _rewrite(node: ir.Node, opset: int, wanted: int) -> str | None:
     """Write a node as another opset has it; return why that cannot be done."""
     if has_subgraph(node):
         return "it holds a graph"

@@ -1,7 +1,7 @@
 """Find which outputs are fed back as inputs at the next frame."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import onnx_ir as ir
 
@@ -48,7 +48,14 @@ def recurrence(
     # The metadata comes first, then the naming rules.
     pairs = {source: to for source, to in (named or {}).items() if to is not None}
     for source, answer in pairs.items():
-        _check(source, answer, inputs, outputs)
+        if source not in inputs or answer not in outputs:
+            raise GraphError(
+                f"metadata {RECURRENT} pairs {source} with {answer}; the graph has"
+                f" inputs {', '.join(inputs)} and outputs {', '.join(outputs)}"
+            )
+        if not _fits(inputs[source], outputs[answer]):
+            why = _misfit(source, answer, inputs, outputs)
+            raise GraphError(f"metadata {RECURRENT}: {why}")
     # An output feeds one input only.
     for source in inputs:
         found = _answer(source, outputs)
@@ -62,7 +69,17 @@ def recurrence(
 def declared_pairs(metadata: Mapping[str, str]) -> dict[str, str | None] | None:
     """Return the pairs that the metadata declares; None where it declares nothing."""
     text = metadata.get(RECURRENT)
-    return None if text is None else _parse(text)
+    if text is None:
+        return None
+    try:
+        pairs = documents.from_json(text)
+    except documents.MalformedError as error:
+        raise GraphError(f"metadata {RECURRENT} is not JSON: {error}") from error
+    if not isinstance(pairs, dict) or not all(
+        answer is None or isinstance(answer, str) for answer in pairs.values()
+    ):
+        raise GraphError(f"metadata {RECURRENT} is not {{input: output}}: {text}")
+    return dict(pairs)
 
 
 def not_fed_back(
@@ -91,23 +108,6 @@ def _answer(source: str, outputs: Mapping[str, SessionPort]) -> str | None:
     return next((name for name in names if name in outputs), None)
 
 
-def _check(
-    source: str,
-    answer: str,
-    inputs: Mapping[str, SessionPort],
-    outputs: Mapping[str, SessionPort],
-) -> None:
-    if source not in inputs or answer not in outputs:
-        raise GraphError(
-            f"metadata {RECURRENT} pairs {source} with {answer}; the graph has"
-            f" inputs {', '.join(inputs)} and outputs {', '.join(outputs)}"
-        )
-    if not _fits(inputs[source], outputs[answer]):
-        raise GraphError(
-            f"metadata {RECURRENT}: {_misfit(source, answer, inputs, outputs)}"
-        )
-
-
 def _misfit(
     source: str,
     answer: str,
@@ -130,11 +130,11 @@ def sides(
     model: ir.Model,
 ) -> tuple[dict[str, SessionPort], dict[str, SessionPort]]:
     """Return the inputs and the outputs of known rank of a graph in memory."""
-    return _ports(model.graph.inputs), _ports(model.graph.outputs)
-
-
-def _ports(values: Sequence[ir.Value]) -> dict[str, SessionPort]:
-    return {str(v.name): port_of(v) for v in values if v.shape is not None}
+    inputs, outputs = (
+        {str(each.name): port_of(each) for each in values if each.shape is not None}
+        for values in (model.graph.inputs, model.graph.outputs)
+    )
+    return inputs, outputs
 
 
 def port_of(value: ir.Value) -> SessionPort:
@@ -144,18 +144,6 @@ def port_of(value: ir.Value) -> SessionPort:
         kind = f"tensor({value.type.dtype.name.lower()})"
     dims = () if shape is None else shape
     return SessionPort(kind, tuple(d if isinstance(d, int) else d.value for d in dims))
-
-
-def _parse(text: str) -> dict[str, str | None]:
-    try:
-        pairs = documents.from_json(text)
-    except documents.MalformedError as error:
-        raise GraphError(f"metadata {RECURRENT} is not JSON: {error}") from error
-    if not isinstance(pairs, dict) or not all(
-        answer is None or isinstance(answer, str) for answer in pairs.values()
-    ):
-        raise GraphError(f"metadata {RECURRENT} is not {{input: output}}: {text}")
-    return dict(pairs)
 
 
 def _fits(source: SessionPort, answer: SessionPort) -> bool:

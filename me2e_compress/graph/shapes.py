@@ -1,9 +1,8 @@
 """Shapes: of values, of layers and products; inference of those not known.
 
-Values that ONNX's inference carries along: a bound on how many, before it begins.
-
-It takes every vector for a shape, and a vector of a billion elements takes it minutes
-and all memory: thirty Concats, each of the one before twice, make one of a scalar.
+ONNX's inference takes every vector for a shape and carries its values along; a vector
+of a billion elements takes it minutes and all memory: thirty Concats, each of the one
+before twice, make one of a scalar. So there is a bound on them before it begins.
 """
 
 import dataclasses
@@ -137,7 +136,14 @@ def infer_shapes(
     Raises:
         onnx.shape_inference.InferenceError: strict, and shapes contradict each other.
     """
-    while _infer_once(model, strict, written) and _infer_plugins(model):
+    while _infer_once(model, strict, written):
+        bare = [
+            node
+            for node in nodes_in(model.graph)
+            if is_plugin(node) and None in map(static_shape, node.outputs)
+        ]
+        if not bare or not any([knowledge().infer(node) for node in bare]):
+            return
         written = None  # what is behind a plugin is known now, up to the next one
 
 
@@ -159,19 +165,6 @@ def _infer_once(model: ir.Model, strict: bool, written: onnx.ModelProto | None) 
         return False
     _adopt(model.graph, proto.graph, set(model.graph.outputs))
     return True
-
-
-def _infer_plugins(model: ir.Model) -> bool:
-    """Let plugins say what they give; return whether anything is new."""
-    bare = [
-        node
-        for node in nodes_in(model.graph)
-        if is_plugin(node) and any(static_shape(each) is None for each in node.outputs)
-    ]
-    if not bare:
-        return False
-    known = knowledge()
-    return any([known.infer(node) for node in bare])
 
 
 def _adopt(

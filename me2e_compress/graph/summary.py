@@ -55,14 +55,10 @@ def why_uncounted(node: ir.Node) -> str:
         return f"{node.op_type} ({'open shape' if known else 'plugin or function'})"
     if node.op_type in _LOOPS:
         return f"{node.op_type} (a loop)"
-    if node.op_type in _UNCOUNTED or _has_shapes(node):
-        return f"{node.op_type} (no rule)"
-    return f"{node.op_type} (open shape)"
-
-
-def _has_shapes(node: ir.Node) -> bool:
-    values = (*node.inputs, *node.outputs)
-    return all(static_shape(v) is not None for v in values if v is not None and v.name)
+    values = [each for each in (*node.inputs, *node.outputs) if each and each.name]
+    open_shape = any(static_shape(each) is None for each in values)
+    no_rule = node.op_type in _UNCOUNTED or not open_shape
+    return f"{node.op_type} ({'no rule' if no_rule else 'open shape'})"
 
 
 def macs_counter(model: ir.Model) -> Counter:
@@ -103,35 +99,24 @@ def total_macs(counts: Iterable[int | None]) -> tuple[int | None, int]:
     return (total if total or not unknown else None), unknown
 
 
-def _conv(weight: int) -> Counter:
+def _conv(weight: int, *, transposed: bool = False) -> Counter:
+    """Count the elements of the output, or of the input, times those of a filter."""
+
     def count(node: ir.Node) -> int | None:
         kernel = static_shape(input_at(node, weight))
-        out = static_shape(node.outputs[0])
+        out = static_shape(node.inputs[0] if transposed else node.outputs[0])
         return None if kernel is None or out is None else math.prod(out + kernel[1:])
 
     return count
 
 
-def _conv_transpose(node: ir.Node) -> int | None:
-    kernel, source = static_shape(node.inputs[1]), static_shape(node.inputs[0])
-    if kernel is None or source is None:
-        return None
-    return math.prod(source + kernel[1:])
-
-
-def _matmul(node: ir.Node) -> int | None:
+def _product(node: ir.Node) -> int | None:
+    """Count a MatMul or Gemm: the elements of the output times the inner dimension."""
     left, out = static_shape(node.inputs[0]), static_shape(node.outputs[0])
     if left is None or out is None:
         return None
-    return math.prod(out) * (left[-1] if left else 1)
-
-
-def _gemm(node: ir.Node) -> int | None:
-    left, out = static_shape(node.inputs[0]), static_shape(node.outputs[0])
-    if left is None or out is None:
-        return None
-    transposed = node.attributes.get_int("transA", 0)
-    return math.prod(out) * left[0 if transposed else 1]
+    flipped = node.op_type == "Gemm" and node.attributes.get_int("transA", 0)
+    return math.prod(out) * (left[0 if flipped else -1] if left else 1)
 
 
 def _einsum(node: ir.Node) -> int | None:
@@ -190,11 +175,10 @@ def _attention(node: ir.Node) -> int | None:
 _RULES: dict[str, Counter] = {
     **dict.fromkeys(("Conv", "ConvInteger", "DeformConv"), _conv(1)),
     **dict.fromkeys(("GRU", "LSTM", "RNN"), _recurrent),
-    **dict.fromkeys(("MatMul", "MatMulInteger", "QLinearMatMul"), _matmul),
+    **dict.fromkeys(("Gemm", "MatMul", "MatMulInteger", "QLinearMatMul"), _product),
     "Attention": _attention,
-    "ConvTranspose": _conv_transpose,
+    "ConvTranspose": _conv(1, transposed=True),
     "Einsum": _einsum,
-    "Gemm": _gemm,
     "QLinearConv": _conv(3),
 }
 
@@ -210,7 +194,11 @@ class Port:
 
 def interface(model: ir.Model) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
     """List the inputs and the outputs: no pass may change these unasked."""
-    return _ports(model.graph.inputs), _ports(model.graph.outputs)
+    inputs, outputs = (
+        tuple(Port(each.name or "", str(each.type), str(each.shape)) for each in values)
+        for values in (model.graph.inputs, model.graph.outputs)
+    )
+    return inputs, outputs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -277,7 +265,3 @@ def weight_bytes(model: ir.Model) -> int:
         for value in graph.initializers.values()
         if value.const_value is not None
     )
-
-
-def _ports(values: Iterable[ir.Value]) -> tuple[Port, ...]:
-    return tuple(Port(v.name or "", str(v.type), str(v.shape)) for v in values)

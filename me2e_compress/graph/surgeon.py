@@ -15,8 +15,6 @@ from onnx_graphsurgeon.util.exception import OnnxGraphSurgeonException
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance
 
-# Restore the metadata and provenance that a foreign tool has dropped.
-
 
 def restore(
     model: ir.Model, like: ir.Model, *, by: str, node_names: bool = False
@@ -42,24 +40,24 @@ def restore(
         if key in like.functions:
             _merge(function.metadata_props, like.functions[key].metadata_props)
             _match(list(function.all_nodes()), list(like.functions[key].all_nodes()))
-    _restore_values(model, like)
+    past = {value.name: value.metadata_props for value in _values(like)}
+    for value in _values(model):
+        _merge(value.metadata_props, past.get(value.name, {}))
     nodes = list(model.graph.all_nodes())
-    found = _match(nodes, list(like.graph.all_nodes()))
+    known = _match(nodes, list(like.graph.all_nodes()))
     if node_names:
-        _rename(nodes, found)
-    _inherit_from_neighbours(nodes, found, by)
+        names = {n: p.name for n, p in known.items() if p.name and _alike(n, p)}
+        taken = {node.name for node in nodes if node not in names}
+        for node, name in names.items():
+            if name not in taken:
+                taken.add(name)
+                node.name = name
+    _inherit_from_neighbours(nodes, known, by)
 
 
 def _merge(props: dict[str, str], past: dict[str, str]) -> None:
     for key, text in past.items():
         props.setdefault(key, text)
-
-
-def _restore_values(model: ir.Model, like: ir.Model) -> None:
-    known = {value.name: value.metadata_props for value in _values(like)}
-    for value in _values(model):
-        if past := known.get(value.name):
-            _merge(value.metadata_props, past)
 
 
 def _values(model: ir.Model) -> Iterable[ir.Value]:
@@ -88,15 +86,6 @@ def _match(nodes: Sequence[ir.Node], past: Sequence[ir.Node]) -> dict[ir.Node, i
 
 def _alike(one: ir.Node, other: ir.Node) -> bool:
     return one.op_identifier() == other.op_identifier()
-
-
-def _rename(nodes: Sequence[ir.Node], found: dict[ir.Node, ir.Node]) -> None:
-    renamed = {n: p.name for n, p in found.items() if p.name and _alike(n, p)}
-    taken = {node.name for node in nodes if node not in renamed}
-    for node, name in renamed.items():
-        if name not in taken:
-            taken.add(name)
-            node.name = name
 
 
 def _inherit_from_neighbours(
