@@ -13,9 +13,6 @@ from me2e_compress.graph.modules.paths import PathGlob, parameter_path, scope_of
 from me2e_compress.graph.nodes import has_subgraph
 from me2e_compress.graph.provenance import MODULE
 
-# The module of every node of a graph, and the rule that found it.
-
-
 Rule = Literal["stamp", "parameter", "scope", "neighbour"]
 
 
@@ -47,9 +44,6 @@ class Assignment:
         return dict(Counter(place.rule for place in self.placements.values()))
 
 
-# Find the preset that fits a graph.
-
-
 STACK = "me2e.stack"
 """Model metadata in which our exporters name the stack, e.g. ``vad-tiny``."""
 
@@ -65,21 +59,26 @@ def detect(model: ir.Model) -> ModuleMap:
     Raises:
         ModuleMapError: no preset fits.
     """
-    stack, paths = model.metadata_props.get(STACK), _paths(model)
     # the stack's own name decides
+    stack = model.metadata_props.get(STACK)
     for name in presets():
         if stack is not None and (stack == name or stack.startswith(f"{name}-")):
             return ModuleMap.load(name)
     # else the best fit
-    ranked = sorted(
-        ((*_fit(ModuleMap.load(name), paths), name) for name in presets()),
-        key=lambda entry: (-entry[0], -entry[1], entry[2]),
-    )
-    share, _, best = ranked[0]
-    if share < 0.5:
+    scopes = {node: scope_of(node) for node in model.graph.all_nodes()}
+    paths = [path for path in (*_parameters(model), *scopes.values()) if path]
+    ranked = list[tuple[float, int, str]]()
+    for name in presets():
+        modules = ModuleMap.load(name)
+        claims = [modules.match(path) for path in dict.fromkeys(paths)]
+        claimed = [module for module in claims if module is not None]
+        share = len({*claimed}) / len(modules.modules)
+        ranked.append((-share, -len(claimed), name))
+    share, _, best = min(ranked)
+    if -share < 0.5:
         raise ModuleMapError(
             f"no module map fits this graph: {best} comes closest with"
-            f" {share:.0%} of its modules (presets: {', '.join(presets())});"
+            f" {-share:.0%} of its modules (presets: {', '.join(presets())});"
             " give a map file"
         )
     return ModuleMap.load(best)
@@ -131,18 +130,6 @@ def behind_a_prefix(modules: ModuleMap, paths: Iterable[str]) -> str:
     )
 
 
-def _fit(modules: ModuleMap, paths: list[str]) -> tuple[float, int]:
-    claimed = [module for path in paths if (module := modules.match(path)) is not None]
-    return len(dict.fromkeys(claimed)) / len(modules.modules), len(claimed)
-
-
-def _paths(model: ir.Model) -> list[str]:
-    names = (name for graph in model.graphs() for name in graph.initializers)
-    paths = [parameter_path(name) for name in names]
-    paths += [scope_of(node) for node in model.graph.all_nodes()]
-    return [path for path in dict.fromkeys(paths) if path]
-
-
 def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
     """Find the module of every node, deterministically and in linear time.
 
@@ -170,8 +157,9 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
         and module is not None
     }
     scopes = {node: scope_of(node) for node in nodes}
+    paths = dict.fromkeys(scopes.values()) | dict.fromkeys(_parameters(model))
     if not placed:
-        _check(model, modules, scopes)
+        _check_required(modules, paths)
     # names of parameters, then scopes
     by_scope = {
         node: module
@@ -192,37 +180,30 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
     if nodes and not known:
         raise ModuleMapError(
             f"map {modules.name}: none of its patterns matches a parameter or a scope"
-            f" of this graph, which has {_sample(model, scopes)}"
-            f"{behind_a_prefix(modules, _every_path(model, scopes))}"
+            f" of this graph, which has {_sample(paths)}"
+            f"{behind_a_prefix(modules, paths)}"
         )
     for node, module in _spread(nodes, known, constant).items():
         placed.setdefault(node, Placement(module, "neighbour"))
     return Assignment(modules, {node: placed[node] for node in nodes})
 
 
-def _check(model: ir.Model, modules: ModuleMap, scopes: Mapping[ir.Node, str]) -> None:
-    wanted = modules.required()
-    if not wanted:
+def _check_required(modules: ModuleMap, paths: Collection[str]) -> None:
+    """Refuse a map if a required pattern matches neither a parameter nor a scope."""
+    if not (required := modules.required()):
         return
-    # each required pattern must match a parameter or a scope
-    paths = _every_path(model, scopes)
-    found = {claim for path in paths for claim in modules.claims(path)}
-    for module, pattern in wanted:
-        if (module, pattern) not in found:
+    claims = {claim for path in paths for claim in modules.claims(path)}
+    for module, pattern in required:
+        if (module, pattern) not in claims:
             raise ModuleMapError(
                 f"map {modules.name}: pattern {pattern!r} of module {module} matches"
-                f" no parameter and no scope; there are {_sample(model, scopes)}"
+                f" no parameter and no scope; there are {_sample(paths)}"
                 f"{behind_a_prefix(modules, paths)}"
             )
 
 
-def _every_path(model: ir.Model, scopes: Mapping[ir.Node, str]) -> dict[str, None]:
-    return dict.fromkeys(scopes.values()) | dict.fromkeys(_parameters(model))
-
-
-def _sample(model: ir.Model, scopes: Mapping[ir.Node, str]) -> str:
-    paths = [path for path in (*scopes.values(), *_parameters(model)) if path]
-    tops = list(dict.fromkeys(".".join(path.split(".")[:2]) for path in paths))
+def _sample(paths: Iterable[str]) -> str:
+    tops = list(dict.fromkeys(".".join(path.split(".")[:2]) for path in paths if path))
     more = f" and {len(tops) - 8} more" if len(tops) > 8 else ""
     return ", ".join(tops[:8]) + more if tops else "no scopes and no named parameters"
 
@@ -297,7 +278,12 @@ def is_constant(nodes: Sequence[ir.Node]) -> frozenset[ir.Node]:
     for node in nodes:
         if has_subgraph(node):
             continue
-        if all(_known(value, found) for value in node.inputs if value is not None):
+        if all(
+            value.producer() in found
+            or (value.is_initializer() and not value.is_graph_input())
+            for value in node.inputs
+            if value is not None
+        ):
             found.add(node)
     return frozenset(found)
 
@@ -327,11 +313,15 @@ def by_parameter(
             placed[node] = votes[0]
         if node in constant:
             claims.update((value, placed.get(node)) for value in node.outputs)
+    # a MatMul whose weight lost its name goes by the bias added to it
     for node in nodes:
-        if node not in placed and (bias := _bias_reader(node)) is not None:
-            module = placed.get(bias)
-            if module is not None:
-                placed[node] = module
+        if node in placed or node.op_type != "MatMul":
+            continue
+        readers = node.outputs[0].consumers()
+        if node.outputs[0].is_graph_output() or len(readers) != 1:
+            continue
+        if readers[0].op_type == "Add" and readers[0] in placed:
+            placed[node] = placed[readers[0]]
     return placed
 
 
@@ -355,31 +345,10 @@ def _claim(
     modules: ModuleMap,
     by_scope: Mapping[ir.Node, str],
 ) -> str | None:
-    if value in claims:
-        return claims[value]
-    module = None
-    if value.is_initializer() and not value.is_graph_input():
-        module = modules.match(parameter_path(value.name))
-        if module is not None and _merged(value, by_scope):
-            module = None
-        claims[value] = module
-    return module
-
-
-def _merged(value: ir.Value, by_scope: Mapping[ir.Node, str]) -> bool:
-    readers = [by_scope[node] for node in value.consumers() if node in by_scope]
-    return any(module != readers[0] for module in readers)
-
-
-def _bias_reader(node: ir.Node) -> ir.Node | None:
-    if node.op_type != "MatMul" or node.outputs[0].is_graph_output():
-        return None
-    readers = node.outputs[0].consumers()
-    return readers[0] if len(readers) == 1 and readers[0].op_type == "Add" else None
-
-
-def _known(value: ir.Value, constant: Collection[ir.Node]) -> bool:
-    producer = value.producer()
-    if producer is None:
-        return value.is_initializer() and not value.is_graph_input()
-    return producer in constant
+    if value in claims or not value.is_initializer() or value.is_graph_input():
+        return claims.get(value)
+    # one that scopes of several modules read was merged
+    scopes = {by_scope[node] for node in value.consumers() if node in by_scope}
+    named = modules.match(parameter_path(value.name))
+    claims[value] = None if len(scopes) > 1 else named
+    return claims[value]

@@ -59,10 +59,17 @@ def itemise(
         nodes.setdefault(module_of(node), []).append(node)
     # weights by the module that owns them
     elements, size = dict.fromkeys(nodes, 0), dict.fromkeys(nodes, 0)
-    for owner, tensor in _owned(model, modules, module_of):
-        size[owner] = size.get(owner, 0) + tensor.nbytes
-        if tensor.dtype not in _NOT_WEIGHTS:
-            elements[owner] = elements.get(owner, 0) + tensor.size
+    for graph in (model.graph, *model.graph.subgraphs()):
+        for value in graph.initializers.values():
+            tensor, readers = value.const_value, value.consumers()
+            owner = modules.match(parameter_path(value.name))
+            if owner is None and readers:
+                owner = module_of(readers[0])
+            if owner is None or tensor is None:
+                continue
+            size[owner] = size.get(owner, 0) + tensor.nbytes
+            if tensor.dtype not in _NOT_WEIGHTS:
+                elements[owner] = elements.get(owner, 0) + tensor.size
     return tuple(
         Item(
             *(module, len(own), elements[module], size[module]),
@@ -70,26 +77,3 @@ def itemise(
         )
         for module, own in nodes.items()
     )
-
-
-def _owner_of(
-    value: ir.Value, modules: ModuleMap, module_of: Callable[[ir.Node], str]
-) -> str | None:
-    """Return the module that an initializer counts for; None if nothing tells."""
-    named = modules.match(parameter_path(value.name))
-    if named is not None:
-        return named
-    readers = value.consumers()
-    return module_of(readers[0]) if readers else None
-
-
-def _owned(
-    model: ir.Model, modules: ModuleMap, module_of: Callable[[ir.Node], str]
-) -> list[tuple[str, ir.TensorProtocol]]:
-    return [
-        (owner, value.const_value)
-        for graph in (model.graph, *model.graph.subgraphs())
-        for value in graph.initializers.values()
-        if value.const_value is not None
-        and (owner := _owner_of(value, modules, module_of)) is not None
-    ]

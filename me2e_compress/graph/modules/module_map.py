@@ -5,7 +5,7 @@ import functools
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 import pydantic
 
@@ -28,9 +28,16 @@ class Substitute:
     for zeros.
     """
 
+    __pydantic_config__: ClassVar = pydantic.ConfigDict(extra="forbid")
+
     scope: str
     by: str | None = None
     reader: str | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a reader that would read nothing."""
+        if self.reader is not None and self.by is None:
+            raise ValueError("a substitute with a reader needs by=")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -237,26 +244,11 @@ def _checked(texts: tuple[str, ...]) -> tuple[str, ...]:
     return texts
 
 
-class _SubstituteTable(_Strict):
-    scope: str
-    by: str | None = None
-    reader: str | None = None
-
-    @pydantic.model_validator(mode="after")
-    def _reads_something(self) -> Self:
-        if self.reader is not None and self.by is None:
-            raise ValueError("a substitute with a reader needs by=")
-        return self
-
-    def substitute(self) -> Substitute:
-        return Substitute(self.scope, self.by, self.reader)
-
-
 class _ModuleTable(_Strict):
     role: Role
     patterns: tuple[str, ...] = ()
     optional: tuple[str, ...] = ()
-    substitutes: tuple[_SubstituteTable, ...] = ()
+    substitutes: tuple[Substitute, ...] = ()
 
     _check = pydantic.field_validator("patterns", "optional")(_checked)
 
@@ -267,13 +259,7 @@ class _ModuleTable(_Strict):
         return self
 
     def module(self, name: str) -> Module:
-        return Module(
-            name,
-            self.role,
-            self.patterns,
-            self.optional,
-            tuple(item.substitute() for item in self.substitutes),
-        )
+        return Module(name, self.role, self.patterns, self.optional, self.substitutes)
 
 
 class _File(Ports):
