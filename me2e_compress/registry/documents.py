@@ -43,7 +43,12 @@ UNREADABLE = (
 )
 """What numpy and zipfile raise on a file that holds no valid arrays."""
 
-_DECODER = json.JSONDecoder(parse_constant=lambda word: _refuse(word))
+
+def _refuse(word: str) -> None:
+    raise ValueError(f"{word} is not a number")
+
+
+_DECODER = json.JSONDecoder(parse_constant=_refuse)
 _ANY_NUMBER = json.JSONDecoder()
 _TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'|[\w-]+|\.|[^\s.]')
 _LONE_SURROGATE = re.compile("[\ud800-\udfff]")
@@ -140,10 +145,6 @@ def _decoded(text: bytes | str) -> str:
 
 def _line(error: ValueError) -> str:
     return " ".join(str(error).split())[:200]
-
-
-def _refuse(word: str) -> None:
-    raise ValueError(f"{word} is not a number")
 
 
 def _check_strings(value: object) -> None:

@@ -1,5 +1,6 @@
 """Names and the classes behind them; the fields of a class are its options."""
 
+import contextlib
 import dataclasses
 import functools
 import importlib.metadata
@@ -87,7 +88,12 @@ class Registry(Generic[T]):
 
     def usable(self) -> tuple[str, ...]:
         """List the names whose classes can be imported."""
-        return tuple(name for name in self.names() if self._is_usable(name))
+        usable = list[str]()
+        for name in self.names():
+            with contextlib.suppress(Me2eError):
+                self.get(name)
+                usable.append(name)
+        return tuple(usable)
 
     def build(self, name: str, options: Mapping[str, object]) -> T:
         """Make an item from its options, each checked against the field's type.
@@ -184,13 +190,6 @@ class Registry(Generic[T]):
         """Name the packages that bring a name, each with its version."""
         return tuple(_source(entry) for entry in self._claims(name))
 
-    def _is_usable(self, name: str) -> bool:
-        try:
-            self.get(name)
-        except Me2eError:
-            return False
-        return True
-
     def _unknown(self, name: str) -> Me2eError:
         there = ", ".join(self.names()) or "none"
         line = f"no {self.kind} {name!r}; there are {there}"
@@ -199,17 +198,15 @@ class Registry(Generic[T]):
     def _built(
         self, item: ParsedItem, cls: type[T], more: Mapping[str, object] | None = None
     ) -> T:
-        more = more or {}
-        if item.value is None:
-            if twice := [option for option in more if option in item.options]:
-                raise self.error(f"{item.name}: option {twice[0]} is given twice")
-            return self.make(cls, {**item.options, **more})
-        first = next((each for each in fields_of(cls) if not each.kw_only), None)
-        if first is None:
-            raise self.error(f"{item.name} takes no value, found {item.value!r}")
-        if first.name in more:
-            raise self.error(f"{item.name}: option {first.name} is given twice")
-        return self.make(cls, {first.name: item.value, **more})
+        options, more = item.options, more or {}
+        if item.value is not None:
+            first = next((each for each in fields_of(cls) if not each.kw_only), None)
+            if first is None:
+                raise self.error(f"{item.name} takes no value, found {item.value!r}")
+            options = {first.name: item.value}
+        if twice := [option for option in more if option in options]:
+            raise self.error(f"{item.name}: option {twice[0]} is given twice")
+        return self.make(cls, {**options, **more})
 
     def _claims(self, name: str) -> tuple[EntryPoint, ...]:
         """List what is to be loaded for a name; more than one is a conflict."""
@@ -227,7 +224,7 @@ class Registry(Generic[T]):
         except Exception as error:  # whatever an import of theirs may raise: chained
             line = f"{type(error).__name__}: {' '.join(str(error).split())}"
             raise self.error(f"{what} cannot be imported: {line}") from error
-        if not _is_frozen_dataclass(cls):
+        if not is_frozen_dataclass(cls):
             raise self.error(f"{what} is not a frozen dataclass")
         if inspect.isabstract(cls):
             lacks = ", ".join(sorted(cls.__abstractmethods__))
@@ -265,7 +262,7 @@ def _adapter(cls: type) -> "pydantic.TypeAdapter[Any]":
     return pydantic.TypeAdapter(cls)
 
 
-def _is_frozen_dataclass(cls: object) -> bool:
+def is_frozen_dataclass(cls: object) -> bool:
     """Look at the class itself: one without decorator inherits that of its base."""
     if not isinstance(cls, type):
         return False
@@ -279,14 +276,14 @@ def _source(entry: EntryPoint) -> str:
 
 
 def _installed(group: str) -> tuple[EntryPoint, ...]:
-    return _found(tuple(sys.path)).get(group, ())
+    return _all_installed(tuple(sys.path)).get(group, ())
 
 
 @functools.cache
-def _found(path: tuple[str, ...]) -> Mapping[str, tuple[EntryPoint, ...]]:
+def _all_installed(path: tuple[str, ...]) -> Mapping[str, tuple[EntryPoint, ...]]:
     """Find the entry points along the path that modules are looked for on, by group."""
-    found: Any = importlib.metadata.entry_points()  # a type of its own in Python 3.11
-    return {group: tuple(found.select(group=group)) for group in found.groups}
+    points: Any = importlib.metadata.entry_points()  # a type of its own in Python 3.11
+    return {group: tuple(points.select(group=group)) for group in points.groups}
 
 
 # The entries of a registry, described: where from, and with which options.
@@ -337,33 +334,31 @@ class Entry:
 
 def describe(registry: Registry[T]) -> tuple[Entry, ...]:
     """Describe every entry of a registry; what cannot be used says why."""
-    return tuple(_entry(registry, name) for name in registry.names())
+    entries = list[Entry]()
+    for name in registry.names():
+        source = " and ".join(registry.sources(name))
+        try:
+            cls = registry.get(name)
+        except Me2eError as error:
+            entries.append(Entry(name, source, error=str(error)))
+            continue
+        first_line = (inspect.getdoc(cls) or "").partition("\n")[0]
+        entries.append(Entry(name, source, first_line, options_of(cls)))
+    return tuple(entries)
 
 
 def options_of(cls: type) -> tuple[Option, ...]:
     """Describe the options of a dataclass, in the order of its fields."""
-    docs = _docs(cls)
-    return tuple(
-        Option(
-            field.name,
-            _type(field.type),
-            write_value(default_of(field)) if _has_default(field) else None,
-            docs.get(field.name, ""),
-        )
-        for field in fields_of(cls)
-    )
-
-
-def _has_default(field: "dataclasses.Field[Any]") -> bool:
-    """Return whether an option may be left out."""
-    missing = dataclasses.MISSING
-    return field.default is not missing or field.default_factory is not missing
-
-
-def _type(annotation: object) -> str:
-    if not isinstance(annotation, str):
-        annotation = inspect.formatannotation(annotation)
-    return _PATH.sub("", annotation)
+    docs, options = _docs(cls), list[Option]()
+    for field in fields_of(cls):
+        default, kind = default_of(field), field.type
+        if not isinstance(kind, str):
+            kind = inspect.formatannotation(kind)
+        given = default is dataclasses.MISSING
+        text = None if given else write_value(default)
+        doc = docs.get(field.name, "")
+        options.append(Option(field.name, _PATH.sub("", kind), text, doc))
+    return tuple(options)
 
 
 def _docs(cls: type) -> Mapping[str, str]:
@@ -374,13 +369,3 @@ def _docs(cls: type) -> Mapping[str, str]:
         options = [] if section is None else _OPTION.findall(section.group(1))
         found |= {name: " ".join(text.split()) for name, text in options}
     return found
-
-
-def _entry(registry: Registry[T], name: str) -> Entry:
-    source = " and ".join(registry.sources(name))
-    try:
-        cls = registry.get(name)
-    except Me2eError as error:
-        return Entry(name, source, error=str(error))
-    first_line = (inspect.getdoc(cls) or "").partition("\n")[0]
-    return Entry(name, source, first_line, options_of(cls))

@@ -114,11 +114,10 @@ def write_value(value: object) -> str:
 
 def chosen_fields(value: "DataclassInstance") -> dict[str, object]:
     """Return the fields of a dataclass by name, without those at their default."""
-    held = {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
     return {
-        each.name: held[each.name]
+        each.name: own
         for each in dataclasses.fields(value)
-        if held[each.name] != each.default
+        if (own := getattr(value, each.name)) != each.default
     }
 
 
@@ -158,21 +157,18 @@ class _Reader:
         return options
 
     def key(self) -> str:
-        name = self.match(_KEY)
-        if name is not None:
+        if name := self.match(_KEY):
             return name
-        quoted = self.match(_QUOTED)
-        if quoted is None:
-            self.fail("option=value is expected")
-        return self.string(quoted)
+        if quoted := self.match(_QUOTED):
+            return self.string(quoted)
+        self.fail("option=value is expected")
 
     def value(self) -> object:
         if self.take("["):
             return self.sequence()
         if self.take("{"):
             return self.options()
-        quoted = self.match(_QUOTED)
-        if quoted is not None:
+        if quoted := self.match(_QUOTED):
             return self.string(quoted)
         word = self.match(_WORD)
         if word is None:
@@ -185,7 +181,9 @@ class _Reader:
 
     def sequence(self) -> list[object]:
         values: list[object] = []
-        self.deeper()
+        self.depth += 1
+        if self.depth > _DEEPEST:
+            self.fail("lists are nested too deeply")
         while not self.take("]"):
             if values and not self.take(","):
                 self.fail("a comma or ] is expected")
@@ -229,12 +227,6 @@ class _Reader:
             return None
         self.at = found.end()
         return found.group()
-
-    def deeper(self) -> None:
-        """Step into a list."""
-        self.depth += 1
-        if self.depth > _DEEPEST:
-            self.fail("lists are nested too deeply")
 
     def fail(self, expected: str) -> NoReturn:
         rest = self.text[self.at :]

@@ -9,7 +9,7 @@ from me2e_compress.errors import VerificationError
 from me2e_compress.evaluators import EVALUATORS
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import is_route_id
-from me2e_compress.testing.form import check_form
+from me2e_compress.testing.form import check_form, require
 
 
 def check_evaluator(
@@ -33,48 +33,39 @@ def check_evaluator(
     name = evaluator.name
     if isinstance(evaluator, SizedEvaluator):
         size: object = evaluator.set_size
-        if not isinstance(size, int):
-            raise VerificationError(f"{name}: set_size is no property of a number")
+        require(isinstance(size, int), f"{name}: set_size is no property of a number")
     first = tuple(evaluator.episodes())
-    if not first:
-        raise VerificationError(f"{name} yields no episode")
+    require(first, f"{name} yields no episode")
     # episodes, each of its own route, that can be stored
-    strange = [each for each in first if not isinstance(each, Episode)]
-    if strange:
-        raise VerificationError(f"{name} yields {strange[0]!r}, no episode")
+    for each in first:
+        require(isinstance(each, Episode), f"{name} yields {each!r}, no episode")
     route, count = Counter(each.route for each in first).most_common(1)[0]
-    if count > 1:
-        raise VerificationError(f"{name} yields route {route} {count} times")
+    require(count == 1, f"{name} yields route {route} {count} times")
     for each in first:
         _check_kept(name, each)
     # the same again
     second = tuple((evaluator if again is None else again).episodes())
-    if [each.route for each in second] != [each.route for each in first]:
-        raise VerificationError(f"{name} yields other routes, or in another order")
+    routes = [[each.route for each in episodes] for episodes in (first, second)]
+    same = routes[0] == routes[1]
+    require(same, f"{name} yields other routes, or in another order")
     for one, other in zip(first, second, strict=True):
-        if one != other:
-            raise VerificationError(
-                f"two runs of {name} give different episodes for {one.route}"
-            )
+        differ = f"two runs of {name} give different episodes for {one.route}"
+        require(one == other, differ)
     return first
 
 
 def _check_kept(name: str, episode: Episode) -> None:
     route = episode.route
-    if not is_route_id(route):
-        raise VerificationError(
-            f"{name} yields route {route!r}: a name is made of letters, digits, '_' "
-            "and '-'"
-        )
+    words = "a name is made of letters, digits, '_' and '-'"
+    require(is_route_id(route), f"{name} yields route {route!r}: {words}")
     # the episode survives its JSON
     try:
         again = Episode.from_json(json.loads(json.dumps(episode.to_json())))
     except (TypeError, ValueError) as error:
         line = " ".join(str(error).split())[:200]
         raise VerificationError(f"{name}: {route} cannot be kept: {line}") from error
-    if again != episode:
-        raise VerificationError(f"{name}: {route} is read back as another episode")
+    require(again == episode, f"{name}: {route} is read back as another episode")
     # frames are in order
     times = [frame.time_us for frame in episode.frames]
-    if any(later <= earlier for earlier, later in itertools.pairwise(times)):
-        raise VerificationError(f"{name}: the frames of {route} are not in their order")
+    ordered = all(early < late for early, late in itertools.pairwise(times))
+    require(ordered, f"{name}: the frames of {route} are not in their order")

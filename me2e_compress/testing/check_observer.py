@@ -5,8 +5,8 @@ import numpy.typing as npt
 
 from me2e_compress.calibration.observers import OBSERVERS, Bounds, Observer
 from me2e_compress.calibration.statistics import BINS, Statistics
-from me2e_compress.errors import FramesError, VerificationError
-from me2e_compress.testing.form import check_form
+from me2e_compress.errors import FramesError
+from me2e_compress.testing.form import check_form, require
 
 FRAMES, ELEMENTS = 6, 500
 
@@ -25,59 +25,58 @@ def check_observer(observer: Observer, seed: int = 0) -> tuple[Bounds, Bounds]:
         VerificationError: it broke a promise; the message says which.
     """
     check_form(observer, OBSERVERS)
-    tensors = _tensors(seed)
+    name, tensors = observer.name, _tensors(seed)
     _check_counts(observer, tensors)
     # the same statistics give the same ranges
     seen = _statistics(tensors, observer.counts)
     lows, highs = observer.ranges(seen)
-    if not _equal((lows, highs), observer.ranges(seen)):
-        raise VerificationError(f"{observer.name} gives two ranges for one tensor")
-    _check_bounds(observer.name, seen, lows, highs)
+    again = observer.ranges(seen)
+    require(_equal((lows, highs), again), f"{name} gives two ranges for one tensor")
+    _check_bounds(name, seen, lows, highs)
     # the order of the tensors does not matter
     turned = observer.ranges(_statistics(tensors[::-1], observer.counts))
-    if not _equal((lows[::-1], highs[::-1]), turned):
-        raise VerificationError(
-            f"{observer.name}: the range of a tensor depends on the other tensors"
-        )
+    alike = _equal((lows[::-1], highs[::-1]), turned)
+    require(alike, f"{name}: the range of a tensor depends on the other tensors")
     return lows, highs
 
 
 def _check_counts(observer: Observer, tensors: list[npt.NDArray[np.float32]]) -> None:
+    name, reads = observer.name, False
     try:
         observer.ranges(_statistics(tensors, histograms=False))
-    except FramesError as error:
-        if not observer.counts:
-            raise VerificationError(
-                f"{observer.name} reads histograms, and counts is False"
-            ) from error
-        return
-    if observer.counts:
-        raise VerificationError(
-            f"{observer.name} reads no histograms, and counts is True: a second pass"
-            " over the frames for nothing"
-        )
+    except FramesError:
+        reads = True
+    require(
+        observer.counts or not reads, f"{name} reads histograms, and counts is False"
+    )
+    require(
+        reads or not observer.counts,
+        f"{name} reads no histograms, and counts is True: a second pass over the frames"
+        " for nothing",
+    )
 
 
 def _check_bounds(name: str, seen: Statistics, lows: Bounds, highs: Bounds) -> None:
+    count = len(seen.tensors)
     for bounds in (lows, highs):
-        if bounds.shape != (len(seen.tensors),) or bounds.dtype != np.float32:
-            raise VerificationError(
-                f"{name}: a bound is {bounds.dtype} {list(bounds.shape)}, it must be"
-                f" float32 [{len(seen.tensors)}]"
-            )
-        if not np.isfinite(bounds).all():
-            raise VerificationError(f"{name}: a bound is not finite")
+        require(
+            bounds.shape == (count,) and bounds.dtype == np.float32,
+            f"{name}: a bound is {bounds.dtype} {list(bounds.shape)}, it must be"
+            f" float32 [{count}]",
+        )
+        require(np.isfinite(bounds).all(), f"{name}: a bound is not finite")
     # low bounds below high ones, and within what was seen
     for tensor, low, high in zip(seen.tensors, lows, highs, strict=True):
-        if low > high:
-            raise VerificationError(
-                f"{name}: tensor {tensor!r}: the low bound {low:g} is above the high"
-                f" one {high:g}"
-            )
-    if (lows < seen.lows.min(axis=0)).any() or (highs > seen.highs.max(axis=0)).any():
-        raise VerificationError(
-            f"{name}: a range reaches beyond what was seen, where steps are wasted"
+        require(
+            low <= high,
+            f"{name}: tensor {tensor!r}: the low bound {low:g} is above the high one"
+            f" {high:g}",
         )
+    inside = (lows >= seen.lows.min(axis=0)) & (highs <= seen.highs.max(axis=0))
+    require(
+        inside.all(),
+        f"{name}: a range reaches beyond what was seen, where steps are wasted",
+    )
 
 
 def _equal(one: tuple[Bounds, Bounds], other: tuple[Bounds, Bounds]) -> bool:

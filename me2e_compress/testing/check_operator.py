@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError, VerificationError
+from me2e_compress.errors import PreconditionError
 from me2e_compress.operators import (
     OPERATORS,
     OWN_DOMAIN,
@@ -22,7 +22,7 @@ from me2e_compress.operators import (
 from me2e_compress.operators.call import AttributeValue
 from me2e_compress.operators.dialect import INTEGERS, NdArray
 from me2e_compress.runtime.session import run_once
-from me2e_compress.testing.form import check_form
+from me2e_compress.testing.form import check_form, require
 
 # Random calls of a fused operator, each a node in a graph of its own.
 
@@ -115,6 +115,7 @@ TOLERANCE = 1e-4
 """Allowed max|a-b| / max(1, max|b|) of float32 against float64."""
 
 _NO_ATTRIBUTE = "no_such_attribute"
+_BY = "check-operator"
 
 
 def check_operator(
@@ -138,12 +139,22 @@ def check_operator(
         Me2eError: it refused a call in a dialect of its own.
     """
     check_form(operator, OPERATORS)
-    if (operator.own.name, operator.own.domain) != (OWN_DOMAIN, OWN_DOMAIN):
-        raise VerificationError(
-            f"{operator.name}: the own form is {operator.own.name!r} in the domain"
-            f" {operator.own.domain!r}, both must be {OWN_DOMAIN!r}"
-        )
-    _check_letters(operator)
+    name, own = operator.name, operator.own
+    require(
+        own.name == own.domain == OWN_DOMAIN,
+        f"{name}: the own form is {own.name!r} in the domain {own.domain!r}, both must"
+        f" be {OWN_DOMAIN!r}",
+    )
+    # sizes that nobody gives would count as unknown for ever
+    sizes = {letter for each in own.operands for letter in each.letters}
+    sizes |= {each.name for each in own.attributes}
+    for which, text in (("output", operator.output), ("work", operator.work)):
+        for word in text.split():
+            require(
+                word in sizes or word.isdigit(),
+                f"{name}: {which} has {word!r}, which is no letter of an operand,"
+                " attribute or number",
+            )
     # every dialect at every opset, on random calls
     make = drawn if draw is None else draw
     for dialect in operator.all_dialects():
@@ -152,21 +163,8 @@ def check_operator(
             for _ in range(calls):
                 case = _Case(operator, dialect, opset)
                 case.check_call(make(dialect, random))
-                case.check_translated(make(operator.own, random))
+                case.check_translated(make(own, random))
         _Case(operator, dialect, OPSETS[0]).check_attributes(make(dialect, random))
-
-
-def _check_letters(operator: Operator) -> None:
-    """Refuse sizes that nobody gives: they would count as unknown for ever."""
-    sizes = {letter for each in operator.own.operands for letter in each.letters}
-    sizes |= {each.name for each in operator.own.attributes}
-    for which, text in (("output", operator.output), ("work", operator.work)):
-        for word in text.split():
-            if word not in sizes and not word.isdigit():
-                raise VerificationError(
-                    f"{operator.name}: {which} has {word!r}, which is no letter of an"
-                    " operand, attribute or number"
-                )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,20 +183,21 @@ class _Case:
         self.dialect.check(node)
         want = self._reference(self.dialect, call)
         set_output(node, self.operator, self.dialect)
-        told, kind = node.outputs[0].shape, node.outputs[0].dtype
-        if told is not None and not _fits(tuple(told), want.shape):
-            raise self._broken(
-                f"the output is said to be {list(told)}, it is {list(want.shape)}"
-            )
+        shape, kind = node.outputs[0].shape, node.outputs[0].dtype
+        fits = shape is None or _fits(tuple(shape), want.shape)
+        declared = None if shape is None else list(shape)
+        self._require(
+            fits, f"the output is said to be {declared}, it is {list(want.shape)}"
+        )
         # what the body computes
         node.outputs[0].shape = node.outputs[0].type = None  # the body says it itself
         known = (self.operator, self.dialect)
-        expand(node, opset=self.opset, by="check-operator", known=known)
+        expand(node, opset=self.opset, by=_BY, known=known)
         import_domains(model)
-        found = run_once(model, call.inputs)["result"]
-        if kind is not None and kind != ir.DataType.from_numpy(found.dtype):
-            raise self._broken(f"the output is said to be {kind}, it is {found.dtype}")
-        self._compare("the body", found, want)
+        result = run_once(model, call.inputs)["result"]
+        same = kind in (None, ir.DataType.from_numpy(result.dtype))
+        self._require(same, f"the output is said to be {kind}, it is {result.dtype}")
+        self._compare("the body", result, want)
 
     def check_translated(self, call: DrawnCall) -> None:
         """Compare a call in the own form, translated, with its reference."""
@@ -207,25 +206,20 @@ class _Case:
             return
         # a call in the own form, translated and expanded
         model = graph_of(call, own, self.opset)
-        by = "check-operator"
+        before, after = (self.operator, own), (self.operator, self.dialect)
         try:
             translate(
-                model.graph[0],
-                self.dialect,
-                opset=self.opset,
-                by=by,
-                known=(self.operator, own),
+                model.graph[0], self.dialect, opset=self.opset, by=_BY, known=before
             )
             (node,) = (
                 each for each in model.graph if each.op_type == self.dialect.op_type
             )
-            known = (self.operator, self.dialect)
-            expand(node, opset=self.opset, by=by, known=known)
+            expand(node, opset=self.opset, by=_BY, known=after)
         except PreconditionError:
             return  # a dialect need not be able to say everything
         import_domains(model)
-        found = run_once(model, call.inputs)["result"]
-        self._compare("a translated call", found, self._reference(own, call))
+        result = run_once(model, call.inputs)["result"]
+        self._compare("a translated call", result, self._reference(own, call))
 
     def check_attributes(self, call: DrawnCall) -> None:
         """Give a node an attribute that no dialect has."""
@@ -236,7 +230,7 @@ class _Case:
             self.dialect.attributes_of(node)
         except PreconditionError:
             return
-        raise self._broken("it takes an attribute that it does not have")
+        self._require(False, "it takes an attribute that it does not have")
 
     def _reference(self, dialect: Dialect, call: DrawnCall) -> NdArray:
         node = graph_of(call, dialect, self.opset).graph[0]
@@ -244,27 +238,22 @@ class _Case:
             dialect, tuple(call.inputs.values()), dialect.attributes_of(node)
         )
 
-    def _compare(self, what: str, found: NdArray, want: NdArray) -> None:
-        if found.shape != want.shape:
-            raise self._broken(
-                f"{what} gives {list(found.shape)}, the reference {list(want.shape)}"
-            )
+    def _compare(self, what: str, result: NdArray, want: NdArray) -> None:
+        shapes = list(result.shape), list(want.shape)
+        same = f"{what} gives {shapes[0]}, the reference {shapes[1]}"
+        self._require(shapes[0] == shapes[1], same)
         scale = max(1.0, float(np.abs(want).max(initial=0.0)))
-        error = float(np.abs(found - want).max(initial=0.0)) / scale
-        if not error <= TOLERANCE:  # NaN is not
-            raise self._broken(
-                f"{what} is off the reference by {error:.2g}, of {TOLERANCE:g} allowed"
-            )
+        error = float(np.abs(result - want).max(initial=0.0)) / scale
+        off = f"{what} is off the reference by {error:.2g}, of {TOLERANCE:g} allowed"
+        self._require(error <= TOLERANCE, off)  # NaN is not
 
-    def _broken(self, why: str) -> VerificationError:
-        return VerificationError(
-            f"{self.operator.name} in the dialect {self.dialect.name}, opset"
-            f" {self.opset}: {why}"
-        )
+    def _require(self, holds: bool, why: str) -> None:
+        where = f"{self.operator.name} in the dialect {self.dialect.name}, opset"
+        require(holds, f"{where} {self.opset}: {why}")
 
 
-def _fits(told: tuple[object, ...], shape: tuple[int, ...]) -> bool:
-    return len(told) == len(shape) and all(
+def _fits(declared: tuple[object, ...], shape: tuple[int, ...]) -> bool:
+    return len(declared) == len(shape) and all(
         dim == size or not isinstance(dim, int)
-        for dim, size in zip(told, shape, strict=True)
+        for dim, size in zip(declared, shape, strict=True)
     )

@@ -13,7 +13,7 @@ from me2e_compress.manager.attempt import attempt
 from me2e_compress.manager.verification_inputs import VerificationInputs
 from me2e_compress.passes import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize
-from me2e_compress.testing.form import check_class
+from me2e_compress.testing.form import check_class, require
 
 
 def check_pass(
@@ -36,35 +36,27 @@ def check_pass(
         VerificationError: it broke a promise; the message says which.
         Me2eError: it refused the graph.
     """
-    _check_form(current)
+    # its class
+    check_class(current)
+    cls, text = type(current), type(current).__doc__ or ""
+    shown = "Given:" in text and "Result:" in text
+    require(shown, f"{cls.__name__}'s docstring lacks Given: and Result:")
+    for field in dataclasses.fields(cls):
+        lacks = f"{cls.__name__}'s docstring lacks {field.name}"
+        require(field.name in text, lacks)
+    # a graph as a pass sees it: imported, shapes inferred
     context = context if context is not None else Context(map_of(model, None))
-    ready = _prepare(model, context)
+    ready = model.clone()
+    graph.infer_shapes(ready)
+    if provenance.missing(ready):
+        ready = ImportNormalize().run(ready, context).model
+    # two runs
     first, again = (_run(current, ready, context) for _ in range(2))
-    if graph.digest(first.model) != graph.digest(again.model):
-        raise VerificationError(f"{current.name} gives two graphs on two runs")
+    same = graph.digest(first.model) == graph.digest(again.model)
+    require(same, f"{current.name} gives two graphs on two runs")
     if current.exact:
         _check_exact(current, ready, first.model, context)
     return first
-
-
-def _prepare(model: ir.Model, context: Context) -> ir.Model:
-    """Copy a graph as a pass sees it: imported, shapes inferred."""
-    copy = model.clone()
-    graph.infer_shapes(copy)
-    if provenance.missing(copy):
-        copy = ImportNormalize().run(copy, context).model
-    return copy
-
-
-def _check_form(current: Pass) -> None:
-    check_class(current)
-    cls = type(current)
-    text = cls.__doc__ or ""
-    if "Given:" not in text or "Result:" not in text:
-        raise VerificationError(f"{cls.__name__}'s docstring lacks Given: and Result:")
-    for field in dataclasses.fields(cls):
-        if field.name not in text:
-            raise VerificationError(f"{cls.__name__}'s docstring lacks {field.name}")
 
 
 def _run(current: Pass, ready: ir.Model, context: Context) -> PassResult:
@@ -72,8 +64,8 @@ def _run(current: Pass, ready: ir.Model, context: Context) -> PassResult:
     found = attempt(current, ready, context, before)
     if isinstance(found, Me2eError):
         raise found
-    if graph.digest(ready) != before:
-        raise VerificationError(f"{current.name} reached into a clone's source")
+    alone = graph.digest(ready) == before
+    require(alone, f"{current.name} reached into a clone's source")
     return found.result
 
 
@@ -87,13 +79,10 @@ def _check_exact(
             f"on its second run, {error}; is something left that nothing reads"
             " (remove_dead)?"
         ) from error
-    if second.changes:
-        raise VerificationError(
-            f"{current.name} is not idempotent: {second.changes} changes on a second"
-            " run"
-        )
+    again = f"{second.changes} changes on a second run"
+    require(not second.changes, f"{current.name} is not idempotent: {again}")
     # the outputs are the same
     inputs = VerificationInputs.of(before, context.frames, context.seed, 2)
-    found = equivalence.verify((current.name,), before, after, inputs)
-    if not equivalence.passed(found):
-        raise VerificationError(f"{current.name} moved the outputs: {found.errors}")
+    proof = equivalence.verify((current.name,), before, after, inputs)
+    moved = f"{current.name} moved the outputs: {proof.errors}"
+    require(equivalence.passed(proof), moved)

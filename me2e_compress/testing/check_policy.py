@@ -16,9 +16,8 @@ from me2e_compress.driving.contract import (
     checked,
 )
 from me2e_compress.driving.policies import POLICIES, Driver
-from me2e_compress.errors import VerificationError
 from me2e_compress.extras import need_extra
-from me2e_compress.testing.form import check_form
+from me2e_compress.testing.form import check_form, require
 
 ROUTE = "HighwayExit_R2_0"
 DECISIONS = 8
@@ -43,15 +42,15 @@ def check_policy(driver: Driver) -> Answers:
     """
     need_extra("highway", "check_policy")
     check_form(driver, POLICIES)
-    if not driver.fingerprint() or driver.fingerprint() != driver.fingerprint():
-        raise VerificationError(f"{driver.name} has no fingerprint, or more than one")
+    name, prints = driver.name, {driver.fingerprint(), driver.fingerprint()}
+    one = len(prints) == 1 and all(prints)
+    require(one, f"{name} has no fingerprint, or more than one")
     # the same answers after a reset, and from a new policy
     policy = driver.open()
     answers, again = _answers(driver, policy), _answers(driver, policy)
-    if not _same(answers, again):
-        raise VerificationError(f"{driver.name} plans otherwise after a reset")
-    if not _same(answers, _answers(driver, driver.open())):
-        raise VerificationError(f"{driver.name} plans otherwise when it is opened anew")
+    require(_same(answers, again), f"{name} plans otherwise after a reset")
+    new = _answers(driver, driver.open())
+    require(_same(answers, new), f"{name} plans otherwise when it is opened anew")
     return answers
 
 
@@ -81,8 +80,7 @@ def _answers(driver: Driver, policy: Policy) -> Answers:
 
     def answered() -> None:
         world, time_us = asked[-1]
-        if world.time_us != time_us:
-            raise VerificationError(f"{driver.name} steps the world")
+        require(world.time_us == time_us, f"{driver.name} steps the world")
 
     # drive until the policy has answered often enough, then check the episode
     (route,) = pick_routes(load_routes(), ROUTE)
@@ -90,8 +88,7 @@ def _answers(driver: Driver, policy: Policy) -> Answers:
     listeners = Listeners(lambda world: asked.append((world, world.time_us)), answered)
     conditions = Conditions(image_size=image_size_of(policy))
     episode = drive(route, watched, conditions, listeners)
-    if len(watched.answers) < DECISIONS or not watched.enough:
-        raise VerificationError(f"{driver.name}: {episode.failure}")
+    require(watched.enough, f"{driver.name}: {episode.failure}")
     return tuple(checked(answer) for answer in watched.answers)
 
 

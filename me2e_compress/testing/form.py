@@ -5,21 +5,24 @@ from typing import TypeVar
 
 from me2e_compress.errors import VerificationError
 from me2e_compress.registry import NamedItem, Registry, options_of
+from me2e_compress.registry.registry import is_frozen_dataclass
 
 _KEBAB = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
 T = TypeVar("T", bound=NamedItem)
 
 
+def require(holds: object, message: str) -> None:
+    """Raise a VerificationError with a message unless something holds."""
+    if not holds:
+        raise VerificationError(message)
+
+
 def check_class(item: NamedItem) -> None:
     """Check that an item is of a frozen dataclass with a name-like-this."""
     cls = type(item)
-    # of its own: an undecorated class inherits that of its base
-    parameters = vars(cls).get("__dataclass_params__")
-    if parameters is None or not parameters.frozen:
-        raise VerificationError(f"{cls.__name__} is not a frozen dataclass")
-    if _KEBAB.fullmatch(item.name) is None:
-        raise VerificationError(f"{item.name!r} is not a name-like-this")
+    require(is_frozen_dataclass(cls), f"{cls.__name__} is not a frozen dataclass")
+    require(_KEBAB.fullmatch(item.name), f"{item.name!r} is not a name-like-this")
 
 
 def check_form(item: T, registry: Registry[T]) -> None:
@@ -35,14 +38,11 @@ def check_form(item: T, registry: Registry[T]) -> None:
     """
     check_class(item)
     cls = type(item)
-    if cls.__doc__ is None or cls.__doc__.startswith(f"{cls.__name__}("):
-        raise VerificationError(f"{cls.__name__} has no docstring")
+    own = cls.__doc__ is not None and not cls.__doc__.startswith(f"{cls.__name__}(")
+    require(own, f"{cls.__name__} has no docstring")
     for option in options_of(cls):
-        if not option.doc:
-            raise VerificationError(
-                f"{cls.__name__}'s docstring lacks {option.name} under Attributes:"
-            )
+        lacks = f"docstring lacks {option.name} under Attributes:"
+        require(option.doc, f"{cls.__name__}'s {lacks}")
     # its text builds an equal item
     text = registry.text(item, defaults=True)
-    if registry.parse(text, cls) != item:
-        raise VerificationError(f"{text} is read back as something else")
+    require(registry.parse(text, cls) == item, f"{text} is read back as something else")
