@@ -1,6 +1,5 @@
 """Join the ONNX files of a stack into one graph."""
 
-import dataclasses
 import graphlib
 import json
 from collections import Counter
@@ -32,7 +31,6 @@ class End(NamedTuple):
 Parts = Mapping[str, Part]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class JoinedStack:
     """A stack of several files, joined into one graph.
 
@@ -41,18 +39,54 @@ class JoinedStack:
         order: the parts, each behind those that feed it.
         sources: what feeds each input of a part: an output of another, or an input of
             the stack.
+        outputs: those of all parts.
+        inputs: those of the stack; parts that share a name share the input.
         names: the name in the graph of each output: ``NAME``, or ``PART.NAME`` where
             two parts have it, or an input of the stack.
         recurrent: ``{input: output}`` of what is fed back at the next frame.
         model: the graph.
     """
 
-    parts: Parts
-    order: tuple[str, ...]
-    sources: Mapping[End, End]
-    names: Mapping[End, str]
-    recurrent: Mapping[str, str]
-    model: ir.Model
+    def __init__(self, parts: Parts, content: StackFile) -> None:
+        self.parts = parts
+        self.outputs = [
+            End(part, name) for part, each in parts.items() for name in each.outputs
+        ]
+        # What feeds what, in which order
+        edges = {
+            taker: self._output(output, f"[edges] {text}")
+            for text, output in content.edges.items()
+            for taker in self._ends(text, f"[edges] {text}")
+        }
+        state = {
+            taker: output
+            for text, output in content.state.items()
+            for taker in self._ends(text, f"[state] {text}")
+        }
+        if both := [each for each in state if each in edges]:
+            raise GraphError(f"{both[0]} is fed by [edges] and by [state]")
+        self.sources = {
+            End(part, name): self._source(End(part, name), edges, state)
+            for part, each in parts.items()
+            for name in each.inputs
+        }
+        self.order = self._order()
+        self.inputs = self._inputs()
+        # The outputs of the stack, and those that come back
+        counts = Counter(end.name for end in self.outputs)
+        self.names = {
+            end: end.name
+            if counts[end.name] == 1 and end.name not in self.inputs
+            else str(end)
+            for end in self.outputs
+        }
+        self.recurrent = self._recurrent(state)
+        self._check_connected()
+        # One graph, whose metadata say what comes back
+        self.model = _merged(self)
+        pairs = {name: self.recurrent.get(name) for name in self.inputs}
+        self.model.metadata_props.update(_metadata(parts) | content.metadata)
+        self.model.metadata_props[RECURRENT] = json.dumps(pairs)
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -65,35 +99,11 @@ class JoinedStack:
         content = StackFile.load(path)
         try:
             parts = {each.name: Part.load(each, path) for each in content.part}
-            joined = cls._of(parts, content)
+            joined = cls(parts, content)
         except GraphError as error:
             raise GraphError(f"{path}: {error}") from error
         joined.model.graph.name = path.stem
         return joined
-
-    @classmethod
-    def _of(cls, parts: Parts, content: StackFile) -> Self:
-        # What feeds what, in which order
-        sources, state = _sources(parts, content)
-        order = _order(parts, sources)
-        inputs = _inputs(parts, sources)
-        # The outputs of the stack, and those that come back
-        ends = [End(part, name) for part in parts for name in parts[part].outputs]
-        counts = Counter(end.name for end in ends)
-        names = {
-            end: end.name
-            if counts[end.name] == 1 and end.name not in inputs
-            else str(end)
-            for end in ends
-        }
-        recurrent = _recurrent(parts, state, inputs, names)
-        _check_connected(parts, sources, recurrent, names)
-        # One graph, whose metadata say what comes back
-        model = _merged(parts, order, sources, names, tuple(inputs))
-        pairs = {name: recurrent.get(name) for name in inputs}
-        model.metadata_props.update(_metadata(parts) | content.metadata)
-        model.metadata_props[RECURRENT] = json.dumps(pairs)
-        return cls(parts, order, sources, names, recurrent, model)
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -115,100 +125,137 @@ class JoinedStack:
                     given = "frames"
                 yield part, name, given, _form(port)
 
+    def _port(self, end: End, *, output: bool = False) -> SessionPort:
+        part = self.parts[end.part]
+        return (part.outputs if output else part.inputs)[end.name]
 
-# What feeds every input, and what comes back: by the TOML, then by equal names.
+    def _ends(self, text: str, where: str, *, outputs: bool = False) -> list[End]:
+        """Find the inputs or outputs of a text: all of a name, or ``PART.NAME``."""
+        ends = self.outputs
+        if not outputs:
+            ends = [
+                End(part, n) for part, each in self.parts.items() for n in each.inputs
+            ]
+        matches = [end for end in ends if end.name == text]
+        matches = matches or [end for end in ends if str(end) == text]
+        if not matches:
+            does, there = "gives" if outputs else "takes", ", ".join(map(str, ends))
+            raise GraphError(f"{where}: no part {does} {text}; there is {there}")
+        return matches
 
+    def _output(self, text: str, where: str) -> End:
+        """Find the one output of a text."""
+        end, *others = self._ends(text, where, outputs=True)
+        if others:
+            raise _ambiguous(where, text, [end, *others])
+        return end
 
-def _sources(parts: Parts, content: StackFile) -> tuple[dict[End, End], dict[End, str]]:
-    """Find the source of every input, and the inputs that ``[state]`` names."""
-    # A name without a part may stand for several inputs
-    edges = {
-        taker: _output(parts, output, f"[edges] {text}")
-        for text, output in content.edges.items()
-        for taker in _takers(parts, text, f"[edges] {text}")
-    }
-    state = {
-        taker: output
-        for text, output in content.state.items()
-        for taker in _takers(parts, text, f"[state] {text}")
-    }
-    if both := [each for each in state if each in edges]:
-        raise GraphError(f"{both[0]} is fed by [edges] and by [state]")
-    sources = dict[End, End]()
-    for part, file in parts.items():
-        for name in file.inputs:
-            # Edges come first, then state, then an output of the same name
-            taker = End(part, name)
-            giving = [each for each in _giving(parts, name) if each != part]
-            if taker in edges:
-                sources[taker] = edges[taker]
-            elif taker in state or file.recurrent().get(name) is not None or not giving:
-                sources[taker] = End("", name)
-            elif len(giving) > 1:
-                raise _ambiguous(str(taker), name, giving)
-            else:
-                sources[taker] = End(giving[0], name)
-    return sources, state
+    def _source(
+        self, taker: End, edges: Mapping[End, End], state: Mapping[End, str]
+    ) -> End:
+        # Edges come first, then state, then an output of the same name
+        if taker in edges:
+            return edges[taker]
+        declared = self.parts[taker.part].recurrent().get(taker.name)
+        givers = [each for each in self.outputs if each.name == taker.name]
+        givers = [each for each in givers if each.part != taker.part]
+        if taker in state or declared is not None or not givers:
+            return End("", taker.name)
+        if len(givers) > 1:
+            raise _ambiguous(str(taker), taker.name, givers)
+        return givers[0]
 
-
-def _giving(parts: Parts, name: str) -> list[str]:
-    return [part for part, each in parts.items() if name in each.outputs]
-
-
-def _output(parts: Parts, text: str, where: str) -> End:
-    """Find the output of a text: ``PART.NAME``, or a name that one part gives."""
-    giving = _giving(parts, text)
-    if len(giving) > 1:
-        raise _ambiguous(where, text, giving)
-    if giving:
-        return End(giving[0], text)
-    part, _, name = text.partition(".")
-    if part in _giving(parts, name):
-        return End(part, name)
-    there = (f"{each}.{name}" for each in parts for name in parts[each].outputs)
-    raise GraphError(f"{where}: no part gives {text}; there is {', '.join(there)}")
-
-
-def _takers(parts: Parts, text: str, where: str) -> list[End]:
-    """Find the inputs of a text: ``PART.NAME``, or all of a name."""
-    part, _, name = text.partition(".")
-    if takers := [End(each, text) for each in parts if text in parts[each].inputs]:
-        return takers
-    if part in parts and name in parts[part].inputs:
-        return [End(part, name)]
-    there = (f"{each}.{name}" for each in parts for name in parts[each].inputs)
-    raise GraphError(f"{where}: no part takes {text}; there is {', '.join(there)}")
-
-
-def _ambiguous(where: str, name: str, giving: list[str]) -> GraphError:
-    ways = " or ".join(f"{each}.{name}" for each in giving)
-    return GraphError(
-        f"{where}: {' and '.join(giving)} both give {name}: say {ways}, by [edges]"
-    )
-
-
-def _order(parts: Parts, sources: Mapping[End, End]) -> tuple[str, ...]:
-    """Sort the parts by what feeds them; refuse edges that do not fit, and cycles."""
-    waits: dict[str, list[str]] = {part: [] for part in parts}
-    for taker, source in sources.items():
-        if not source.part:
-            continue
-        waits[taker.part].append(source.part)
-        taken = parts[taker.part].inputs[taker.name]
-        given = parts[source.part].outputs[source.name]
-        if _misfit(given, taken):
+    def _order(self) -> tuple[str, ...]:
+        """Sort the parts by what feeds them; refuse misfits and cycles."""
+        waits: dict[str, list[str]] = {part: [] for part in self.parts}
+        for taker, source in self.sources.items():
+            if not source.part:
+                continue
+            waits[taker.part].append(source.part)
+            given, taken = self._port(source, output=True), self._port(taker)
+            if _misfit(given, taken):
+                raise GraphError(
+                    f"{taker} takes {_form(taken)}, and {source}, which feeds it, is"
+                    f" {_form(given)}"
+                )
+        try:
+            return tuple(graphlib.TopologicalSorter(waits).static_order())
+        except graphlib.CycleError as error:
+            cycle = " -> ".join(reversed(error.args[1]))
             raise GraphError(
-                f"{taker} takes {_form(taken)}, and {source}, which feeds it, is"
-                f" {_form(given)}"
+                f"the parts wait for one another: {cycle}; what comes back at the next"
+                " frame belongs into [state]"
+            ) from error
+
+    def _inputs(self) -> dict[str, SessionPort]:
+        first = dict[str, End]()
+        for taker, source in self.sources.items():
+            if source.part:
+                continue
+            other = first.setdefault(source.name, taker)
+            known, port = self._port(other), self._port(taker)
+            if _misfit(known, port):
+                raise GraphError(
+                    f"{other.part} takes {source.name} as {_form(known)}, {taker.part}"
+                    f" as {_form(port)}; one that another part gives belongs into"
+                    " [edges]"
+                )
+        return {name: self._port(end) for name, end in first.items()}
+
+    def _recurrent(self, state: Mapping[End, str]) -> dict[str, str]:
+        """Pair inputs with the outputs that come back to them at the next frame."""
+        names = self.names
+        outputs = {names[end]: self._port(end, output=True) for end in self.outputs}
+        # Metadata of the files come first; [state] overrides them
+        pairs = dict[str, str | None]()
+        for part, each in self.parts.items():
+            for name, output in each.recurrent().items():
+                if output is None:
+                    pairs.setdefault(name, None)
+                    continue
+                end = End(part, output)
+                other = output if output in outputs else str(end)
+                pairs[name] = names.get(end, other)
+        for (_, name), output in state.items():
+            answer = names[self._output(output, f"[state] {name}")]
+            given, taken = outputs[answer], self.inputs[name]
+            if _misfit(given, taken):
+                raise GraphError(
+                    f"[state] {name} takes {_form(taken)}, and {answer}, which is fed"
+                    f" back to it, is {_form(given)}"
+                )
+            pairs[name] = answer
+        # The naming rules complete the pairs
+        known = {name: to for name, to in pairs.items() if name in self.inputs}
+        metadata = {RECURRENT: json.dumps(known)} if known else {}
+        return recurrence(metadata, self.inputs, outputs)
+
+    def _check_connected(self) -> None:
+        """Refuse a part that neither edges nor state connect to the first."""
+        part_of = {name: end.part for end, name in self.names.items()}
+        pairs = set[tuple[str, str]]()
+        for taker, source in self.sources.items():
+            if source.part:
+                pairs.add((taker.part, source.part))
+            elif source.name in self.recurrent:
+                pairs.add((taker.part, part_of[self.recurrent[source.name]]))
+        first, *others = self.parts
+        reached = {first}
+        for _ in self.parts:
+            reached |= {b for a, b in pairs if a in reached}
+            reached |= {a for a, b in pairs if b in reached}
+        if alone := [each for each in others if each not in reached]:
+            outputs, inputs = self.parts[first].outputs, self.parts[alone[0]].inputs
+            raise GraphError(
+                f"nothing joins {alone[0]} to {first}: [edges] must say which of"
+                f" {', '.join(outputs)} (of {first}) feeds which of"
+                f" {', '.join(inputs)} (of {alone[0]})"
             )
-    try:
-        return tuple(graphlib.TopologicalSorter(waits).static_order())
-    except graphlib.CycleError as error:
-        cycle = " -> ".join(reversed(error.args[1]))
-        raise GraphError(
-            f"the parts wait for one another: {cycle}; what comes back at the next"
-            " frame belongs into [state]"
-        ) from error
+
+
+def _ambiguous(where: str, name: str, givers: list[End]) -> GraphError:
+    parts, ways = " and ".join(e.part for e in givers), " or ".join(map(str, givers))
+    return GraphError(f"{where}: {parts} both give {name}: say {ways}, by [edges]")
 
 
 def _misfit(given: SessionPort, taken: SessionPort) -> bool:
@@ -227,83 +274,6 @@ def _form(port: SessionPort) -> str:
     """Describe type and shape: ``float [1, 6, 2]``."""
     element = port.type.removeprefix("tensor(").removesuffix(")")
     return f"{element} {list(port.shape)}"
-
-
-def _inputs(parts: Parts, sources: Mapping[End, End]) -> dict[str, SessionPort]:
-    """Collect the inputs of the stack; parts that share a name share the input."""
-    first = dict[str, End]()
-    for taker, source in sources.items():
-        if source.part:
-            continue
-        other = first.setdefault(source.name, taker)
-        known, port = (parts[each.part].inputs[each.name] for each in (other, taker))
-        if _misfit(known, port):
-            raise GraphError(
-                f"{other.part} takes {source.name} as {_form(known)}, {taker.part} as"
-                f" {_form(port)}; one that another part gives belongs into [edges]"
-            )
-    return {name: parts[each.part].inputs[each.name] for name, each in first.items()}
-
-
-def _recurrent(
-    parts: Parts,
-    state: Mapping[End, str],
-    inputs: Mapping[str, SessionPort],
-    names: Mapping[End, str],
-) -> dict[str, str]:
-    """Pair inputs with the outputs that come back to them at the next frame."""
-    outputs = {
-        name: parts[part].outputs[output] for (part, output), name in names.items()
-    }
-    # Metadata of the files come first; [state] overrides them
-    pairs = dict[str, str | None]()
-    for part, each in parts.items():
-        for name, output in each.recurrent().items():
-            if output is None:
-                pairs.setdefault(name, None)
-            else:
-                end = End(part, output)
-                other = output if output in outputs else str(end)
-                pairs[name] = names.get(end, other)
-    for (_, name), output in state.items():
-        answer = names[_output(parts, output, f"[state] {name}")]
-        if _misfit(outputs[answer], inputs[name]):
-            raise GraphError(
-                f"[state] {name} takes {_form(inputs[name])}, and {answer}, which is"
-                f" fed back to it, is {_form(outputs[answer])}"
-            )
-        pairs[name] = answer
-    # The naming rules complete the pairs
-    known = {name: to for name, to in pairs.items() if name in inputs}
-    return recurrence({RECURRENT: json.dumps(known)} if known else {}, inputs, outputs)
-
-
-def _check_connected(
-    parts: Parts,
-    sources: Mapping[End, End],
-    recurrent: Mapping[str, str],
-    names: Mapping[End, str],
-) -> None:
-    """Refuse a part that neither edges nor state connect to the first."""
-    part_of = {name: end.part for end, name in names.items()}
-    pairs = set[tuple[str, str]]()
-    for taker, source in sources.items():
-        if source.part:
-            pairs.add((taker.part, source.part))
-        elif source.name in recurrent:
-            pairs.add((taker.part, part_of[recurrent[source.name]]))
-    first, *others = parts
-    reached = {first}
-    for _ in parts:
-        reached |= {b for a, b in pairs if a in reached}
-        reached |= {a for a, b in pairs if b in reached}
-    if alone := [each for each in others if each not in reached]:
-        outputs, inputs = parts[first].outputs, parts[alone[0]].inputs
-        raise GraphError(
-            f"nothing joins {alone[0]} to {first}: [edges] must say which of"
-            f" {', '.join(outputs)} (of {first}) feeds which of"
-            f" {', '.join(inputs)} (of {alone[0]})"
-        )
 
 
 def _metadata(parts: Parts) -> dict[str, str]:
@@ -330,19 +300,14 @@ def _metadata(parts: Parts) -> dict[str, str]:
 # The graphs of the parts, moved into one.
 
 
-def _merged(
-    parts: Parts,
-    order: tuple[str, ...],
-    sources: Mapping[End, End],
-    names: Mapping[End, str],
-    inputs: tuple[str, ...],
-) -> ir.Model:
+def _merged(stack: JoinedStack) -> ir.Model:
     """Return one graph of all parts.
 
     Its inputs are those of the stack, its outputs all that a part gives. Other names
     that two parts have get the part in front: ``head.w``, and ``/head/Mul`` for
     ``/Mul``. Weights are shared with the files' graphs, not copied.
     """
+    parts, names, inputs = stack.parts, stack.names, stack.inputs
     models = {part: each.model.clone() for part, each in parts.items()}
     _write_one_opset(parts, models)
     functions = _functions(models)
@@ -350,7 +315,7 @@ def _merged(
     # Move nodes and weights; inputs become what feeds them
     nodes, weights = list[ir.Node](), list[ir.Value]()
     taken, given = dict[str, ir.Value](), dict[End, ir.Value]()
-    for part in order:
+    for part in stack.order:
         graph, file = models[part].graph, parts[part]
         takers, outputs = list(graph.inputs), _outputs(graph, file)
         weights += graph.initializers.values()
@@ -361,7 +326,7 @@ def _merged(
         graph.remove(body)
         nodes += body
         for value, name in zip(takers, file.inputs, strict=True):
-            source = sources[End(part, name)]
+            source = stack.sources[End(part, name)]
             if source.part:
                 known = given[source]
             else:
