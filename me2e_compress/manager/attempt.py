@@ -13,10 +13,9 @@ from me2e_compress import graph
 from me2e_compress.display import counted
 from me2e_compress.errors import GraphError, Me2eError, PassError, VerificationError
 from me2e_compress.graph import provenance
-from me2e_compress.graph.node_inference import REFUSALS, infer_node
 from me2e_compress.graph.nodes import has_subgraph, is_standard, nodes_in, opset_of
 from me2e_compress.graph.provenance import is_same
-from me2e_compress.graph.shapes import refined, without_weights
+from me2e_compress.graph.shapes import REFUSALS, infer_node, refined, without_weights
 from me2e_compress.graph.validity import refusal
 from me2e_compress.passes.base import Context, Pass, PassResult
 

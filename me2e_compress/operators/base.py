@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.graph.activations import total_bytes
 from me2e_compress.graph.shapes import Dims, open_shape, product
+from me2e_compress.graph.summary import total_bytes
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values
 

@@ -8,9 +8,9 @@ import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import array_of, provenance
-from me2e_compress.graph.node_inference import REFUSALS, infer_node
 from me2e_compress.graph.nodes import Array
 from me2e_compress.graph.rewrite import add_constant, fresh_name, value_names
+from me2e_compress.graph.shapes import REFUSALS, infer_node
 
 AttributeValue: TypeAlias = int | float | str | Sequence[int]
 Attributes: TypeAlias = Mapping[str, AttributeValue]

@@ -224,3 +224,33 @@ def _take_place(call: FusedCall, result: ir.Value) -> None:
         old.replace_all_uses_with(result, replace_graph_outputs=True)
     body.remove(node, safe=True)
     result.name = name
+
+
+class DialectKnowledge:
+    """See :class:`me2e_compress.graph.shapes.PluginKnowledge`.
+
+    A node that its dialect refuses counts as unknown.
+    """
+
+    def knows(self, node: ir.Node) -> bool:
+        """Return whether a dialect has the node's operator."""
+        return find(node) is not None
+
+    def infer(self, node: ir.Node) -> bool:
+        """Write the type and shape of a node's output; return whether any is new."""
+        found = find(node)
+        try:
+            if found is not None:
+                found[1].check(node)
+                return set_output(node, *found)
+        except PreconditionError:
+            pass
+        return False
+
+    def macs(self, node: ir.Node) -> int | None:
+        """Count a node's multiply-accumulates, if known."""
+        found = find(node)
+        try:
+            return None if found is None else found[0].cost(node, found[1]).macs
+        except PreconditionError:
+            return None

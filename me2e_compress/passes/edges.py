@@ -13,8 +13,8 @@ from me2e_compress import graph
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance, rewrite
 from me2e_compress.graph.modules import ModuleMap
-from me2e_compress.graph.node_inference import REFUSALS, infer_node
 from me2e_compress.graph.nodes import makers_of
+from me2e_compress.graph.shapes import REFUSALS, infer_node
 from me2e_compress.passes.parts import Part, fit, listed, stretched
 from me2e_compress.passes.substitutes import finished, reshaped, shaped_like
 

@@ -6,8 +6,8 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import macs
-from me2e_compress.graph.activations import value_bytes
 from me2e_compress.graph.nodes import VIEWS
+from me2e_compress.graph.summary import value_bytes
 
 BYTES_PER_NODE = 2048
 """File bytes that a removed node may cost: at 2 us a node, 1 MB for 1 ms."""

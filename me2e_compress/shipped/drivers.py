@@ -2,7 +2,6 @@
 
 import functools
 import hashlib
-import tempfile
 from pathlib import Path
 from typing import Self
 
@@ -11,8 +10,7 @@ import pydantic
 from me2e_compress.errors import FORMER, GraphError
 from me2e_compress.registry import drafts
 from me2e_compress.registry.documents import reading
-
-# Write model files atomically.
+from me2e_compress.runtime.atomic import write_bytes
 
 
 def write(path: Path, content: bytes) -> Path:
@@ -23,13 +21,8 @@ def write(path: Path, content: bytes) -> Path:
         raise GraphError(
             f"{path}: its folder cannot be made: {error.strerror}"
         ) from error
-    with (
-        drafts.written(path, GraphError),
-        tempfile.TemporaryDirectory(dir=path.parent, prefix=".model-") as folder,
-    ):
-        draft = Path(folder) / path.name
-        draft.write_bytes(content)
-        drafts.put(draft, path)
+    with drafts.written(path, GraphError):
+        write_bytes(path, content)
     return path
 
 

@@ -10,8 +10,8 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import provenance
-from me2e_compress.graph.activations import activation_bytes
 from me2e_compress.graph.modules import Item
+from me2e_compress.graph.summary import activation_bytes
 from me2e_compress.runtime.latency_trace import LatencyTrace, shares
 
 

@@ -3,7 +3,7 @@
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.graph.activations import activation_bytes
+from me2e_compress.graph.summary import activation_bytes
 
 NET = """
 <ir_version: 9, opset_import: ["" : 17]>

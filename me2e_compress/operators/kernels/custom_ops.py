@@ -16,8 +16,11 @@ import onnxruntime as ort
 from me2e_compress.operators.kernels import abi
 from me2e_compress.operators.kernels.kernel import DOMAIN, KERNELS, CompiledKernel
 from me2e_compress.operators.kernels.machine_code import load_or_compile
-from me2e_compress.operators.kernels.store import default_folder
-from me2e_compress.operators.kernels.trampoline import STATE_OFFSET, trampoline
+from me2e_compress.operators.kernels.trampoline import (
+    STATE_OFFSET,
+    default_folder,
+    trampoline,
+)
 
 _POINTER = ctypes.c_void_p
 _INT, _SIZE = ctypes.c_int, ctypes.c_size_t

@@ -19,7 +19,7 @@ from llvmlite import binding as llvm
 
 from me2e_compress.errors import GraphError
 from me2e_compress.operators.kernels.kernel import CompiledKernel
-from me2e_compress.operators.kernels.store import keep, private
+from me2e_compress.operators.kernels.trampoline import keep, private
 
 _FOREIGN = frozenset({"memset", "memcpy", "memmove", "floorf", "expf", "sqrt"})
 """C library functions that kernels may call. Code that calls into Python or Numba

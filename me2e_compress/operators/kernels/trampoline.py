@@ -6,6 +6,9 @@ shared object of three functions of one or two instructions is written as bytes:
 needs no compiler on the user's machine and no shipped binary, and has 4 kB (64 kB where
 memory pages are larger). Each process puts the address of its own callback into the
 object's ``slot``.
+
+It lies in the private folder of compiled kernels. What is there is executed: a folder
+that others may write to, or that belongs to another user, is not used.
 """
 
 import ctypes
@@ -13,13 +16,15 @@ import dataclasses
 import functools
 import os
 import platform
+import stat
 import struct
 import sys
+import tempfile
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
-from me2e_compress.operators.kernels.store import default_folder, keep, private
+import platformdirs
 
 STATE_OFFSET = 0x180
 """Bytes from an operator's description to the state of its kernels, which follows it:
@@ -60,16 +65,6 @@ _MACHINES: Mapping[str, _Machine] = {
         struct.pack("<I", 0xD65F03C0),
     ),
 }
-
-
-def _no_trampoline() -> str | None:
-    """Return why this platform has no trampoline; None if it has one."""
-    if sys.platform != "linux":
-        return f"there are kernels on Linux only, not on {sys.platform}"
-    if platform.machine() not in _MACHINES:
-        known = " and ".join(_MACHINES)
-        return f"there are kernels for {known} only, not for {platform.machine()}"
-    return None
 
 
 def shared_object(machine: str) -> bytes:
@@ -122,6 +117,39 @@ def _header(kind: _Machine, dynamic: int, tags: int) -> bytes:
     return head
 
 
+def default_folder() -> Path:
+    """Return the default folder of kernels."""
+    return platformdirs.user_cache_path("me2e-compress") / "kernels"
+
+
+def private(folder: Path) -> Path | None:
+    """Return a folder of mode 0700, made if needed; None if others may write to it."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.stat()
+    except OSError:
+        return None
+    others = stat.S_IWGRP | stat.S_IWOTH
+    mine = found.st_uid == os.getuid() and not found.st_mode & others
+    return folder if mine and os.access(folder, os.W_OK | os.X_OK) else None
+
+
+def keep(path: Path, content: bytes) -> bool:
+    """Write a file atomically, unless unchanged; return whether it has the content."""
+    try:
+        if path.read_bytes() == content:
+            return True
+    except OSError:
+        pass
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as draft:
+            draft.write(content)
+        os.replace(draft.name, path)
+    except OSError:
+        return False
+    return True
+
+
 @dataclasses.dataclass(frozen=True)
 class Trampoline:
     """The shared object, open in this process; ``path`` is what onnxruntime opens."""
@@ -171,8 +199,11 @@ def why_not() -> str | None:
 
     Nothing is imported for this check: Numba itself may still fail to load.
     """
-    if reason := _no_trampoline():
-        return reason
+    if sys.platform != "linux":
+        return f"there are kernels on Linux only, not on {sys.platform}"
+    if platform.machine() not in _MACHINES:
+        known = " and ".join(_MACHINES)
+        return f"there are kernels for {known} only, not for {platform.machine()}"
     for package in ("numba", "llvmlite"):
         if find_spec(package) is None:
             return f"{package} is not installed: pip install 'me2e-compress[fast]'"

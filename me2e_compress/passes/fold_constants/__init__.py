@@ -25,7 +25,6 @@ import onnx_ir as ir
 from me2e_compress import graph as graphs
 from me2e_compress.display import counted
 from me2e_compress.graph import provenance
-from me2e_compress.graph.activations import value_bytes
 from me2e_compress.graph.rewrite import (
     Array,
     add_constant,
@@ -36,6 +35,7 @@ from me2e_compress.graph.rewrite import (
     replace_value,
     value_names,
 )
+from me2e_compress.graph.summary import value_bytes
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fold_constants import evaluation
 from me2e_compress.passes.fold_constants.evaluation import Expression, Knowledge

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.operators import kernels
-from me2e_compress.operators.kernels import store, trampoline
+from me2e_compress.operators.kernels import trampoline
 
 needs_kernels = pytest.mark.skipif(
     kernels.why_not() is not None, reason=str(kernels.why_not())
@@ -17,11 +17,11 @@ needs_kernels = pytest.mark.skipif(
 def test_the_folder_is_this_users_alone(tmp_path: Path) -> None:
     folder = tmp_path / "cache" / "kernels"
 
-    assert store.private(folder) == folder
+    assert trampoline.private(folder) == folder
     assert folder.stat().st_mode & 0o777 == 0o700
 
     folder.chmod(0o777)
-    assert store.private(folder) is None
+    assert trampoline.private(folder) is None
 
 
 @pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
@@ -74,7 +74,7 @@ def test_code_is_compiled_once_and_read_afterwards(
     from me2e_compress.operators.kernels import machine_code
 
     code = kernels.KERNELS[0]
-    folder = store.default_folder()
+    folder = trampoline.default_folder()
     machine_code.load_or_compile(code, folder)
     file = folder / f"{code.op_type}-{machine_code._fingerprint()}.o"
     if not file.is_file():

@@ -17,7 +17,7 @@ from me2e_compress import graph
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.operators import dialect_of, kernels
 from me2e_compress.operators.deformable_attention import DeformableAttention
-from me2e_compress.operators.kernels import custom_ops, store, trampoline
+from me2e_compress.operators.kernels import custom_ops, trampoline
 from me2e_compress.operators.kernels.kernel import CompiledKernel
 from me2e_compress.operators.kernels.machine_code import load_or_compile
 from me2e_compress.runtime.frames import Frame
@@ -177,7 +177,7 @@ def test_a_library_that_claims_the_operator_does_no_harm(
     mine = kernels.KERNELS[0]
     theirs = CompiledKernel(node.op_type, mine.module, mine.inputs, ("theirs",) * 9)
     options = ort.SessionOptions()
-    code = load_or_compile(mine, store.default_folder())
+    code = load_or_compile(mine, trampoline.default_folder())
     with monkeypatch.context() as patch:
         patch.setattr(custom_ops, "load_or_compile", lambda *_: code)
         patch.setattr(custom_ops, "DOMAIN", node.domain)
