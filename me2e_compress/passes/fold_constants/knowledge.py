@@ -7,10 +7,10 @@ import numpy as np
 import onnx
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, static_shape
+from me2e_compress.graph import array_of, shapes, static_shape
 from me2e_compress.graph.nodes import DRAWS, NATIVE, attribute_values, unrenamed
 from me2e_compress.graph.rewrite import Array, has_subgraph, is_standard
-from me2e_compress.graph.shapes import REFUSALS, infer_node, refined
+from me2e_compress.graph.shapes import refined
 from me2e_compress.graph.summary import value_bytes
 from me2e_compress.passes.fold_constants import evaluation
 from me2e_compress.passes.fold_constants.evaluation import Expression, Knowledge
@@ -31,8 +31,8 @@ def learn_shapes(
     Use ``trust_shapes=False`` in loops, whose outputs may change shape between rounds.
     """
     try:
-        found = infer_node(node, opset, known=known.get)
-    except REFUSALS:
+        found = shapes.infer_node(node, opset, known=known.get)
+    except shapes.REFUSALS:
         return False
     return _record(node, found, answers=trust_shapes)
 
@@ -56,8 +56,8 @@ def _accepts(node: ir.Node, instead: Mapping[ir.Value, ir.Value], opset: int) ->
         and (array := array_of(unrenamed(instead.get(value, value)))) is not None
     }
     try:
-        infer_node(node, opset, known=arrays.get, instead=instead)
-    except REFUSALS:
+        shapes.infer_node(node, opset, known=arrays.get, instead=instead)
+    except shapes.REFUSALS:
         return False
     return True
 
