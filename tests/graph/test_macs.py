@@ -146,37 +146,29 @@ def test_why_macs_are_not_known(text: str, reason: str) -> None:
     assert why_uncounted(only_node(text)) == reason
 
 
-def test_a_plugin_leaves_the_sum_a_lower_bound() -> None:
-    model = ir.from_onnx_text(
-        HEAD + "m (float[2,3] x, float[3,4] w) => (float[2,4] y)"
-        " { a = MatMul(x, w)\n y = trt.Rotate(a) }"
-    )
-    graph.infer_shapes(model)
-    found = graph.size(model)
-    assert (found.macs, found.unknown_macs_nodes) == (2 * 3 * 4, 1)
-
-
-def test_a_sum_of_which_nothing_is_known_is_not_zero() -> None:
-    model = ir.from_onnx_text(
-        HEAD + "m (float[2] x) => (float[2] y) { y = trt.Rotate(x) }"
-    )
-    found = graph.size(model)
-    assert (found.macs, found.unknown_macs_nodes) == (None, 1)
+FUNCTION = """m (float[2,2] x) => (float[2,2] y) { y = f.local(x) }
+<domain: "f", opset_import: ["" : 17]> local (x) => (y) { BODY }"""
 
 
 @pytest.mark.parametrize(
-    ("body", "expected"), [("y = Relu(x)", (0, 0)), ("y = MatMul(x, x)", (None, 1))]
+    ("text", "macs", "unknown"),
+    [
+        (
+            "m (float[2,3] x, float[3,4] w) => (float[2,4] y)"
+            " { a = MatMul(x, w)\n y = trt.Rotate(a) }",
+            *(2 * 3 * 4, 1),
+        ),
+        ("m (float[2] x) => (float[2] y) { y = trt.Rotate(x) }", None, 1),
+        (FUNCTION.replace("BODY", "y = Relu(x)"), 0, 0),
+        (FUNCTION.replace("BODY", "y = MatMul(x, x)"), None, 1),
+    ],
+    ids=["a lower bound", "nothing known is not zero", "a function", "its product"],
 )
-def test_a_function_is_worth_its_body(
-    body: str, expected: tuple[int | None, int]
-) -> None:
-    model = ir.from_onnx_text(
-        HEAD + "m (float[2,2] x) => (float[2,2] y) { y = f.local(x) }\n"
-        '<domain: "f", opset_import: ["" : 17]> local (x) => (y)'
-        f" {{ {body} }}"
-    )
-    found = graph.size(model)
-    assert (found.macs, found.unknown_macs_nodes) == expected
+def test_the_sum_of_a_graph(text: str, macs: int | None, unknown: int) -> None:
+    model = ir.from_onnx_text(HEAD + text)
+    graph.infer_shapes(model)
+    size = graph.size(model)
+    assert (size.macs, size.unknown_macs_nodes) == (macs, unknown)
 
 
 def test_a_function_counts_at_every_call() -> None:

@@ -32,26 +32,69 @@ def placed(found: Assignment) -> dict[str | None, tuple[str, str]]:
     }
 
 
-def test_a_named_parameter_decides_before_the_scope() -> None:
-    model = read(
-        "(float[2] x) => (float[2] y) <float[2] det__weight = {1.0, 2.0}>",
+ONE = "(float[2] x) => (float[2] y)"
+RULES = {
+    "a named parameter decides before the scope": (
+        f"{ONE} <float[2] det__weight = {{1.0, 2.0}}>",
         '["/neck/Mul"] y = Mul(x, det__weight)',
-    )
-    assert placed(assign(model, MAP)) == {"y": ("det", "parameter")}
-
-
-def test_a_parameter_reaches_through_arithmetic_of_constants() -> None:
-    model = read(
+        {"y": ("det", "parameter")},
+    ),
+    "a parameter reaches through arithmetic of constants": (
         "(float[1, 1] x) => (float[1, 1] y) <float[1, 1] det__w = {1.0}>",
         '["/neck/T"] t = Transpose(det__w) c = Cast<to: int = 1>(t)'
         ' ["/neck/M"] h = MatMul(x, c) ["/neck/R"] y = Relu(h)',
-    )
-    assert placed(assign(model, MAP)) == {
-        "t": ("det", "parameter"),
-        "c": ("det", "parameter"),
-        "h": ("det", "parameter"),
-        "y": ("neck", "scope"),
-    }
+        {
+            **dict.fromkeys(("t", "c", "h"), ("det", "parameter")),
+            "y": ("neck", "scope"),
+        },
+    ),
+    "an initializer that the exporter merged decides nothing": (
+        f"{ONE} <float[2] det__bias = {{0.0, 0.0}}>",
+        '["/det/Add"] a = Add(x, det__bias) ["/plan/Add"] y = Add(a, det__bias)',
+        {"a": ("det", "scope"), "y": ("plan", "scope")},
+    ),
+    "glue that serves one module is of it": (
+        ONE,
+        '["/neck/Relu"] a = Relu(x) b = Neg(a) c = Abs(b) ["/det/Exp"] y = Exp(c)',
+        dict.fromkeys("bc", ("det", "neighbour")),
+    ),
+    "glue that serves several is of the last that feeds it": (
+        "(float[2] x) => (float[2] y, float[2] z)",
+        '["/neck/Relu"] a = Relu(x) ["/det/Neg"] b = Neg(a) c = Add(b, a) d = Abs(c)'
+        ' ["/plan/Exp"] y = Exp(d) ["/neck/Log"] z = Log(d)',
+        dict.fromkeys("cd", ("det", "neighbour")),
+    ),
+    "glue that leaves the graph stays with its producer": (
+        "(float[2] x) => (float[2] b, float[2] y)",
+        '["/det/Relu"] a = Relu(x) b = Neg(a) ["/plan/Exp"] y = Exp(b)',
+        {"b": ("det", "neighbour")},
+    ),
+    "a shared constant goes with its first consumer": (
+        "(float[2] x) => (float[2] z)",
+        ' k = Constant<value_floats = [1.0, 2.0]>() ["/neck/Relu"] a = Relu(x)'
+        ' ["/det/Add"] y = Add(a, k) ["/plan/Add"] z = Add(y, k)',
+        {"k": ("det", "neighbour")},
+    ),
+    "nodes in branches go by scope or with what holds them": (
+        "(bool c, float[2] x) => (float[2] y)",
+        '["/det/If"] y = If(c) <'
+        'then_branch = t () => (float[2] a) { ["/plan/Relu"] a = Relu(x) },'
+        " else_branch = e () => (float[2] b) { b = Neg(x) }>",
+        {"a": ("plan", "scope"), "b": ("plan", "neighbour")},
+    ),
+    "what hangs on nothing goes with the node before it": (
+        "(float[2] x, float[2] w) => (float[2] y, float[2] z)",
+        '["/det/Relu"] y = Relu(x) z = Neg(w)',
+        {"z": ("det", "neighbour")},
+    ),
+}
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_the_rule_that_applies_first_decides(rule: str) -> None:
+    signature, body, expected = RULES[rule]
+    places = placed(assign(read(signature, body), MAP))
+    assert {name: places[name] for name in expected} == expected
 
 
 def test_a_matmul_whose_weight_lost_its_name_goes_by_its_bias() -> None:
@@ -61,94 +104,23 @@ def test_a_matmul_whose_weight_lost_its_name_goes_by_its_bias() -> None:
         '["/neck/MatMul"] h = MatMul(x, weight) ["/neck/Add"] y = Add(plan__bias, h)',
     )
     model.graph.initializers["weight"].name = "onnx::MatMul_123"
-    assert placed(assign(model, MAP)) == {
-        "h": ("plan", "parameter"),
-        "y": ("plan", "parameter"),
-    }
+    assert placed(assign(model, MAP)) == dict.fromkeys("hy", ("plan", "parameter"))
 
 
-def test_an_initializer_that_the_exporter_merged_decides_nothing() -> None:
-    model = read(
-        "(float[2] x) => (float[2] y) <float[2] det__bias = {0.0, 0.0}>",
-        '["/det/Add"] a = Add(x, det__bias) ["/plan/Add"] y = Add(a, det__bias)',
-    )
-    assert placed(assign(model, MAP)) == {
-        "a": ("det", "scope"),
-        "y": ("plan", "scope"),
-    }
-
-
-def test_glue_that_serves_one_module_is_of_it() -> None:
-    model = read(
-        "(float[2] x) => (float[2] y)",
-        '["/neck/Relu"] a = Relu(x) b = Neg(a) c = Abs(b) ["/det/Exp"] y = Exp(c)',
-    )
-    found = placed(assign(model, MAP))
-    assert found["b"] == found["c"] == ("det", "neighbour")
-
-
-def test_glue_that_serves_several_is_of_the_last_that_feeds_it() -> None:
-    model = read(
-        "(float[2] x) => (float[2] y, float[2] z)",
-        '["/neck/Relu"] a = Relu(x) ["/det/Neg"] b = Neg(a) c = Add(b, a) d = Abs(c)'
-        ' ["/plan/Exp"] y = Exp(d) ["/neck/Log"] z = Log(d)',
-    )
-    found = placed(assign(model, MAP))
-    assert found["c"] == found["d"] == ("det", "neighbour")
-
-
-def test_glue_that_leaves_the_graph_stays_with_its_producer() -> None:
-    model = read(
-        "(float[2] x) => (float[2] b, float[2] y)",
-        '["/det/Relu"] a = Relu(x) b = Neg(a) ["/plan/Exp"] y = Exp(b)',
-    )
-    assert placed(assign(model, MAP))["b"] == ("det", "neighbour")
-
-
-def test_a_shared_constant_goes_with_its_first_consumer() -> None:
-    model = read(
-        "(float[2] x) => (float[2] z)",
-        ' k = Constant<value_floats = [1.0, 2.0]>() ["/neck/Relu"] a = Relu(x)'
-        ' ["/det/Add"] y = Add(a, k) ["/plan/Add"] z = Add(y, k)',
-    )
-    assert placed(assign(model, MAP))["k"] == ("det", "neighbour")
-
-
-def test_nodes_in_branches_go_by_scope_or_with_what_holds_them() -> None:
-    model = read(
-        "(bool c, float[2] x) => (float[2] y)",
-        '["/det/If"] y = If(c) <'
-        'then_branch = t () => (float[2] a) { ["/plan/Relu"] a = Relu(x) },'
-        " else_branch = e () => (float[2] b) { b = Neg(x) }>",
-    )
-    found = placed(assign(model, MAP))
-    assert found["a"] == ("plan", "scope")
-    assert found["b"][1] == "neighbour"
-
-
-def test_what_hangs_on_nothing_goes_with_the_node_before_it() -> None:
-    model = read(
-        "(float[2] x, float[2] w) => (float[2] y, float[2] z)",
-        '["/det/Relu"] y = Relu(x) z = Neg(w)',
-    )
-    assert placed(assign(model, MAP))["z"] == ("det", "neighbour")
-
-
-def test_an_imported_graph_says_it_itself() -> None:
-    model = read("(float[2] x) => (float[2] y)", '["/det/Relu"] y = Relu(x)')
-    model.graph[0].metadata_props[MODULE] = "plan"
-    assert placed(assign(model, MAP)) == {"y": ("plan", "stamp")}
-
-
-def test_a_stamp_of_another_map_is_not_heard() -> None:
-    model = read("(float[2] x) => (float[2] y)", '["/det/Relu"] y = Relu(x)')
-    model.graph[0].metadata_props[MODULE] = "occ"
-    assert placed(assign(model, MAP)) == {"y": ("det", "scope")}
+@pytest.mark.parametrize(
+    ("stamp", "place"), [("plan", ("plan", "stamp")), ("occ", ("det", "scope"))]
+)
+def test_an_imported_graph_says_it_itself_by_its_map(
+    stamp: str, place: tuple[str, str]
+) -> None:
+    model = read(ONE, '["/det/Relu"] y = Relu(x)')
+    model.graph[0].metadata_props[MODULE] = stamp
+    assert placed(assign(model, MAP)) == {"y": place}
 
 
 def test_the_result_tells_nodes_and_rules() -> None:
     model = read(
-        "(float[2] x) => (float[2] y)",
+        ONE,
         '["/neck/Relu"] a = Relu(x) ["/det/Neg"] b = Neg(a) y = Abs(b)',
     )
     found = assign(model, MAP)
@@ -162,7 +134,7 @@ def test_a_required_pattern_that_matches_nothing_is_an_error() -> None:
     mine = ModuleMap.parse(
         '[modules.det]\nrole = "prediction"\npatterns = ["det", "det.cls"]', "mine"
     )
-    model = read("(float[2] x) => (float[2] y)", '["/det/reg/Relu"] y = Relu(x)')
+    model = read(ONE, '["/det/reg/Relu"] y = Relu(x)')
     with pytest.raises(ModuleMapError) as caught:
         assign(model, mine)
     assert str(caught.value) == (
@@ -178,7 +150,7 @@ def test_a_prefix_that_hides_every_name_is_named() -> None:
         "mine",
     )
     body = '["/net/agent/neck/Relu"] a = Relu(x) ["/net/agent/det/cls/Neg"] b = Neg(a)'
-    model = read("(float[2] x) => (float[2] y)", f"{body} y = Abs(b)")
+    model = read(ONE, f"{body} y = Abs(b)")
     with pytest.raises(ModuleMapError) as caught:
         assign(model, mine)
     assert str(caught.value).endswith(
@@ -195,7 +167,7 @@ def test_a_prefix_that_hides_every_name_is_named() -> None:
 
 def test_a_preset_behind_a_prefix_is_told_of_it() -> None:
     model = read(
-        "(float[2] x) => (float[2] y)",
+        ONE,
         '["/net/perception/Relu"] a = Relu(x) ["/net/join_traj/Neg"] y = Neg(a)',
     )
     with pytest.raises(ModuleMapError, match=r'behind.*write strip = \["net"\]'):
@@ -208,7 +180,7 @@ def test_a_required_pattern_may_match_and_lose() -> None:
         '[modules.plan]\nrole = "prediction"\npatterns = ["Head.plan"]',
         "mine",
     )
-    model = read("(float[2] x) => (float[2] y)", '["/Head/plan/Relu"] y = Relu(x)')
+    model = read(ONE, '["/Head/plan/Relu"] y = Relu(x)')
     assert placed(assign(model, mine)) == {"y": ("plan", "scope")}
 
 

@@ -1,4 +1,7 @@
+from collections.abc import Callable
+
 import onnx_ir as ir
+import pytest
 
 from me2e_compress.graph.modules import Item, ModuleMap, assign, itemise
 
@@ -24,54 +27,32 @@ def model() -> ir.Model:
     return made
 
 
-def two_each(node: ir.Node) -> int | None:
-    return 2
-
-
 def test_shared_weights_count_once_and_sizes_are_no_parameters() -> None:
     graph = model()
-    found = itemise(graph, MAP, assign(graph, MAP).module_of, two_each)
+    found = itemise(graph, MAP, assign(graph, MAP).module_of, lambda node: 2)
+    # nodes, parameters, bytes of weights, MACs, nodes of unknown MACs
     assert found == (
-        Item(
-            "neck", nodes=1, parameters=2, weight_bytes=8, macs=2, unknown_macs_nodes=0
-        ),
-        Item(
-            "det", nodes=3, parameters=2, weight_bytes=16, macs=6, unknown_macs_nodes=0
-        ),
-        Item(
-            "occ", nodes=0, parameters=0, weight_bytes=0, macs=0, unknown_macs_nodes=0
-        ),
+        *(Item("neck", 1, 2, 8, 2, 0), Item("det", 3, 2, 16, 6, 0)),
+        Item("occ", 0, 0, 0, 0, 0),
     )
 
 
-def cost(item: Item) -> tuple[int | None, int | None]:
-    return item.macs, item.unknown_macs_nodes
-
-
-def test_unknown_macs_leave_a_lower_bound_and_say_how_many_nodes_it_lacks() -> None:
+@pytest.mark.parametrize(
+    ("macs", "expected"),
+    [
+        (lambda node: None if node.op_type == "Sub" else 1, [(1, 0), (2, 1), (0, 0)]),
+        (lambda node: None, [(None, 1), (None, 3), (0, 0)]),
+        (None, [(None, None)] * 3),
+    ],
+    ids=["a lower bound", "none known is not zero", "nobody counts"],
+)
+def test_macs_that_are_not_known(
+    macs: Callable[[ir.Node], int | None] | None,
+    expected: list[tuple[int | None, int | None]],
+) -> None:
     graph = model()
-    placed = assign(graph, MAP).module_of
-
-    def unknown_sub(node: ir.Node) -> int | None:
-        return None if node.op_type == "Sub" else 1
-
-    found = itemise(graph, MAP, placed, unknown_sub)
-    assert list(map(cost, found)) == [(1, 0), (2, 1), (0, 0)]
-
-
-def test_macs_of_which_none_is_known_are_not_zero() -> None:
-    graph = model()
-    placed = assign(graph, MAP).module_of
-
-    found = itemise(graph, MAP, placed, lambda node: None)
-    assert list(map(cost, found)) == [(None, 1), (None, 3), (0, 0)]
-
-
-def test_macs_that_nobody_counts_are_not_measured() -> None:
-    graph = model()
-
-    found = itemise(graph, MAP, assign(graph, MAP).module_of)
-    assert list(map(cost, found)) == [(None, None)] * 3
+    items = itemise(graph, MAP, assign(graph, MAP).module_of, macs)
+    assert [(each.macs, each.unknown_macs_nodes) for each in items] == expected
 
 
 def test_int8_weights_are_parameters() -> None:
