@@ -19,32 +19,13 @@ __all__ = ["cli", "command"]
 
 
 @pytest.mark.parametrize(
-    "line", ["inspect highway --modelled-energy 7nm", "score results --modelled a=1"]
-)
-def test_modelled_energy_is_a_usage_error(line: str, cli: Cli) -> None:
-    refused = cli(line)
-
-    assert refused.code == 2
-    assert "is gone since 0.3.0: use" in refused.err
-
-
-@pytest.mark.parametrize("line", ["plan highway", "compress highway -o m.onnx"])
-@pytest.mark.parametrize("flag", ["--weight-only-gemv", "--weight-only-gemv=1"])
-def test_an_option_that_is_gone_is_a_usage_error(
-    line: str, flag: str, cli: Cli
-) -> None:
-    refused = cli(f"{line} {flag}")
-
-    assert refused.code == 2
-    assert (
-        "--weight-only-gemv is gone since 0.3.0: use --rules 'safe{without=[gemv]}'"
-        in refused.err
-    )
-
-
-@pytest.mark.parametrize(
     ("line", "instead"),
     [
+        ("inspect highway --modelled-energy 7nm", ""),
+        ("score results --modelled a=1", ""),
+        ("plan highway --weight-only-gemv", "--rules 'safe{without=[gemv]}'"),
+        ("plan highway --weight-only-gemv=1", "--rules 'safe{without=[gemv]}'"),
+        ("compress highway -o m.onnx --weight-only-gemv", "--rules 'safe{without="),
         ("search highway frames -o r.toml --max-mb 5 --on-road", "a study"),
         ("study s.toml -o out --records out/records", "python -m benchmarks.paper"),
         ("export vad-tiny --opset 13 -o m.onnx", "python -m models.export"),
@@ -53,7 +34,7 @@ def test_an_option_that_is_gone_is_a_usage_error(
         ("compare a.onnx b.onnx frames --plugins c.so", "--provider 'cpu{plugins=["),
     ],
 )
-def test_an_option_of_another_command_that_is_gone(
+def test_an_option_that_is_gone_is_a_usage_error(
     line: str, instead: str, cli: Cli
 ) -> None:
     refused = cli(line)

@@ -11,10 +11,6 @@ from me2e_compress.registry import Option, Registry, describe
 from tests.registry.shapes import GROUP, SHAPES, Circle, Colour, Point, Shape, Square
 
 
-def test_a_class_is_found_by_its_name() -> None:
-    assert SHAPES.get("square") is Square
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -141,8 +137,5 @@ def test_an_entry_is_described() -> None:
     )
     assert square.options[0].doc == "Metres, above zero."
     assert square.options[5].type == "Path | None"
-
-
-def test_what_must_be_given_has_no_default() -> None:
     (radius,) = describe(SHAPES)[1].options
-    assert radius == Option("radius", "float", None, "")
+    assert radius == Option("radius", "float", None, "")  # it must be given
