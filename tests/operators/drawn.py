@@ -10,7 +10,8 @@ from me2e_compress.operators import Dialect
 from me2e_compress.operators.grid_sampler import ScaledGrid
 
 Arrays = dict[str, npt.NDArray[Any]]
-Draw = Callable[[Dialect, np.random.Generator], tuple[Arrays, Mapping[str, Any]]]
+Drawn = tuple[Arrays, Mapping[str, Any]]
+Random = np.random.Generator
 
 
 def single(**arrays: npt.NDArray[Any]) -> Arrays:
@@ -21,9 +22,7 @@ def single(**arrays: npt.NDArray[Any]) -> Arrays:
     return {name: a.astype(kinds.get(a.dtype, a.dtype)) for name, a in arrays.items()}
 
 
-def aggregation(
-    dialect: Dialect, random: np.random.Generator
-) -> tuple[Arrays, Mapping[str, Any]]:
+def aggregation(dialect: Dialect, random: Random) -> Drawn:
     cameras, levels, groups = random.integers(1, 4, 3)
     batch, anchors, points = random.integers(1, 3, 3)
     sizes = random.integers(0, 5, (cameras, levels, 2)).astype(np.int32)
@@ -44,26 +43,20 @@ def aggregation(
     return arrays, {}
 
 
-def rotate(
-    dialect: Dialect, random: np.random.Generator
-) -> tuple[Arrays, Mapping[str, Any]]:
+def rotate(dialect: Dialect, random: Random) -> Drawn:
     image = random.normal(size=random.integers(1, 7, 3))
     angle, center = random.uniform(-180, 180, 1), random.uniform(0, 5, 2)
     mode = {"interpolation": int(random.integers(2))}
     return single(img=image, angle=angle, center=center), mode
 
 
-def inverse(
-    dialect: Dialect, random: np.random.Generator
-) -> tuple[Arrays, Mapping[str, Any]]:
+def inverse(dialect: Dialect, random: Random) -> Drawn:
     size = int(random.integers(1, 6))
     matrix = random.normal(size=(2, 3, size, size)) + 4 * np.eye(size)
     return single(matrix=matrix), {}
 
 
-def sampler(
-    dialect: Dialect, random: np.random.Generator
-) -> tuple[Arrays, Mapping[str, Any]]:
+def sampler(dialect: Dialect, random: Random) -> Drawn:
     dims = (dialect.operands[0].rank or 4) - 2
     batch, channels, *sizes = random.integers(1, 5, 2 + dims)
     grid = random.uniform(-1.6, 1.6, (batch, *random.integers(1, 4, dims), dims))
@@ -78,9 +71,7 @@ def sampler(
     ), attributes
 
 
-def selection(
-    dialect: Dialect, random: np.random.Generator
-) -> tuple[Arrays, Mapping[str, Any]]:
+def selection(dialect: Dialect, random: Random) -> Drawn:
     batch, rows, width, taken = (int(each) for each in random.integers(1, 6, 4))
     arrays = single(
         feat=random.normal(size=(batch, rows, width)),
@@ -90,9 +81,7 @@ def selection(
     return arrays, {"P": taken}
 
 
-def pool(
-    dialect: Dialect, random: np.random.Generator
-) -> tuple[Arrays, Mapping[str, Any]]:
+def pool(dialect: Dialect, random: Random) -> Drawn:
     cells = random.permutation(12)[:5]
     lengths = random.integers(1, 4, 5)
     total = int(lengths.sum())
@@ -111,9 +100,7 @@ def pool(
     return single(**whole), {"out_height": 3, "out_width": 4}
 
 
-def attention(
-    dialect: Dialect, random: np.random.Generator
-) -> tuple[Arrays, Mapping[str, Any]]:
+def attention(dialect: Dialect, random: Random) -> Drawn:
     batch, queries, keys, width, heads = (
         int(each) for each in random.integers(1, 6, 5)
     )
@@ -126,9 +113,7 @@ def attention(
     ), {"heads": heads} if dialect.attributes else {}
 
 
-def convolution(
-    dialect: Dialect, random: np.random.Generator
-) -> tuple[Arrays, Mapping[str, Any]]:
+def convolution(dialect: Dialect, random: Random) -> Drawn:
     groups, parts = (int(each) for each in random.integers(1, 3, 2))
     kernel, padding = random.integers(1, 4, 2), random.integers(0, 2, 2)
     stride, dilation = random.integers(1, 3, 2), random.integers(1, 3, 2)
@@ -148,9 +133,7 @@ def convolution(
     return arrays, dict(zip((a.name for a in dialect.attributes), values, strict=True))
 
 
-def winograd(
-    dialect: Dialect, random: np.random.Generator
-) -> tuple[Arrays, Mapping[str, Any]]:
+def winograd(dialect: Dialect, random: Random) -> Drawn:
     batch, deep, out, high, wide = random.integers(1, 6, 5)
     pads = tuple(int(each) for each in random.integers(1, 3, 4))
     return single(
@@ -160,7 +143,7 @@ def winograd(
     ), {"pads": pads, "relu": int(random.integers(2))}
 
 
-DRAWS: dict[str, Draw] = {
+DRAWS: dict[str, Callable[[Dialect, Random], Drawn]] = {
     "deformable-aggregation": aggregation,
     "rotate": rotate,
     "inverse": inverse,

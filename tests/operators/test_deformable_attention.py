@@ -220,6 +220,12 @@ def node_of(dialect: str, **changed: npt.NDArray[Any]) -> ir.Node:
             {"spatial_shapes": np.ones((3, 2), np.int32)},
             "do not go with 3 levels",
         ),
+        (
+            "me2e-raw",
+            None,
+            {"mask": np.ones((1, 1, 1, 1, 3), np.float32)},
+            "mask has 3 of axis 4, which do not",
+        ),
     ],
 )
 def test_what_a_dialect_does_not_take_is_named(
@@ -232,12 +238,6 @@ def test_what_a_dialect_does_not_take_is_named(
     if attribute is not None:
         node.attributes.add(attribute)
     with pytest.raises(PreconditionError, match=message):
-        expand(node, opset=17, by="test")
-
-
-def test_operands_that_do_not_repeat_to_the_sizes_of_a_call_are_named() -> None:
-    node = node_of("me2e-raw", mask=np.ones((1, 1, 1, 1, 3), np.float32))
-    with pytest.raises(PreconditionError, match="mask has 3 of axis 4, which do not"):
         expand(node, opset=17, by="test")
 
 
@@ -268,14 +268,11 @@ def test_the_domain_and_the_version_tell_the_dialect(
     assert found[1].name == name
 
 
-def test_int64_sizes_tell_the_patched_library() -> None:
+def test_sizes_tell_the_patched_library_and_a_standard_operator_is_none() -> None:
     node = node_of("derryhub", spatial_shapes=np.array([[2, 3], [1, 2]]))
     found = find(node)
     assert found is not None
     assert found[1].name == "dl4agx-uniad"
-
-
-def test_a_standard_operator_is_none_of_them() -> None:
     assert find(ir.node("GridSample", [])) is None
 
 

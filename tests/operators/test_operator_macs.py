@@ -7,7 +7,7 @@ import pytest
 
 from me2e_compress.graph import infer_shapes, macs, static_shape
 from me2e_compress.graph.shapes import Dims
-from me2e_compress.operators import operators
+from me2e_compress.operators import OPERATORS
 
 Shapes = list[Dims | None]
 
@@ -52,9 +52,7 @@ GRID, CUBE = (2, 4, 5, 2), (2, 4, 5, 6, 3)
 def test_macs_by_hand(
     name: str, shapes: Shapes, attributes: dict[str, Any], expected: int
 ) -> None:
-    operator = next(each for each in operators() if each.name == name)
-
-    assert operator.macs(shapes, attributes) == expected
+    assert OPERATORS.build(name, {}).macs(shapes, attributes) == expected
 
 
 @pytest.mark.parametrize(
@@ -71,9 +69,8 @@ def test_macs_by_hand(
     ],
 )
 def test_open_shapes_have_none(name: str, shapes: Shapes) -> None:
-    operator = next(each for each in operators() if each.name == name)
-
-    assert operator.macs(shapes, {"interpolation_mode": 0, "interpolation": 0}) is None
+    attributes = {"interpolation_mode": 0, "interpolation": 0}
+    assert OPERATORS.build(name, {}).macs(shapes, attributes) is None
 
 
 ROTATED = """

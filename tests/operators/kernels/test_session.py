@@ -52,19 +52,10 @@ def expected(arrays: Arrays) -> npt.NDArray[np.floating]:
 
 
 @needs_kernels
-def test_two_threads_answer_what_one_does() -> None:
+def test_sessions_and_threads_answer_alike() -> None:
     model, arrays = call()
-
-    one, two = (Session(model, threads=count).run(arrays) for count in (1, 2))
-
-    assert np.array_equal(one["result"], two["result"])
-
-
-@needs_kernels
-def test_sessions_run_at_once() -> None:
-    model, arrays = call()
+    first = Session(model, threads=1).run(arrays)["result"]
     sessions = [Session(model, threads=2) for _ in range(2)]
-    first = sessions[0].run(arrays)["result"]
 
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda each: each.run(arrays)["result"], sessions * 4))
@@ -209,7 +200,7 @@ def test_what_a_library_of_the_user_names_is_left_to_it(tmp_path: Path) -> None:
         ("noexec", "neither the cache folder nor memory may hold code that runs: no"),
     ],
 )
-def test_without_kernels_bodies_run(
+def test_without_kernels_bodies_run_and_doctor_says_why(
     why: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuses() -> None:
@@ -223,19 +214,13 @@ def test_without_kernels_bodies_run(
         monkeypatch.setattr(trampoline, "trampoline", refuses)
     model, arrays = call()
     assert kernels.why_not() == said
+    checkups = {each.what: each for each in doctor().checkups}
+    assert checkups["compiled kernels"].found is None
+    assert checkups["compiled kernels"].advice.endswith(said)
 
     found = Session(model, threads=1).run(arrays)["result"]
 
     assert np.allclose(found, expected(arrays), atol=1e-4)
-
-
-def test_doctor_says_why_no_kernel_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trampoline, "find_spec", lambda name: None)
-
-    (found,) = (each for each in doctor().checkups if each.what == "compiled kernels")
-
-    assert found.found is None
-    assert found.advice.endswith("pip install 'me2e-compress[fast]'")
 
 
 @needs_kernels
