@@ -40,8 +40,11 @@ def can_carry(graph: ir.Graph) -> bool:
     longest: dict[ir.Value, int] = {}
     total = 0
     for node in nodes_in(graph):
-        if node.op_type in _FILL:
-            size = _filled(node)
+        if node.op_type in _FILL:  # the elements that constants ask for, at most
+            arrays = map(array_of, node.inputs)
+            counts = [each for each in arrays if each is not None]
+            whole = [each for each in counts if each.dtype.kind == "i"]
+            size = math.prod(int(n.max(initial=1)) for n in whole if n.size < 64)
         elif node.op_type in _CARRY and node.attributes.get_int("axis", 0) in (0, -1):
             read = [longest.get(each, _length(each)) for each in node.inputs if each]
             size = sum(read) if node.op_type == "Concat" else max(read, default=0)
@@ -60,13 +63,6 @@ def _length(value: ir.Value) -> int:
         return 1
     size = value.shape[0] if len(value.shape) == 1 else 0
     return size if isinstance(size, int) else 1
-
-
-def _filled(node: ir.Node) -> int:
-    """Return how many elements constants ask for, at most; 0 where none does."""
-    arrays = [array_of(input_at(node, at)) for at in range(len(node.inputs))]
-    counts = [each for each in arrays if each is not None and each.dtype.kind == "i"]
-    return math.prod(int(each.max(initial=1)) for each in counts if each.size < 64)
 
 
 # What is known of operators that ONNX does not have: plugins and fused operators.
@@ -362,8 +358,18 @@ def extent(node: ir.Node, *, weight: bool) -> Extent:
     """
     left, right = open_shape(node.inputs[0]), open_shape(node.inputs[1])
     if node.op_type == "Gemm":
-        return _gemm(node, left, right)
-    columns, depth = (None, None) if right is None else _sides(right)
+        flip_left, flip_right = (
+            bool(node.attributes.get_int(name, 0)) for name in ("transA", "transB")
+        )
+        columns, depth = (None, None) if right is None else right[:2]
+        if not flip_right:
+            columns, depth = depth, columns
+        return Extent(None if left is None else left[int(flip_left)], columns, depth)
+    # A vector on the right is one column
+    columns, depth = None, None
+    if right is not None:
+        wide = len(right) > 1
+        columns, depth = (right[-1], right[-2]) if wide else (1, product(right))
     if not left:
         return Extent(None, columns, depth)
     shared = weight and right is not None and product(right[:-2]) == 1
@@ -388,18 +394,3 @@ def product(dims: Dims) -> int | None:
     """Multiply dimensions; None if one of them is open."""
     known = [dim for dim in dims if dim is not None]
     return math.prod(known) if len(known) == len(dims) else None
-
-
-def _sides(right: Dims) -> tuple[int | None, int | None]:
-    """Return N and K of a right operand; a vector is one column."""
-    return (right[-1], right[-2]) if len(right) > 1 else (1, product(right))
-
-
-def _gemm(node: ir.Node, left: Dims | None, right: Dims | None) -> Extent:
-    flip_left = bool(node.attributes.get_int("transA", 0))
-    flip_right = bool(node.attributes.get_int("transB", 0))
-    return Extent(
-        None if left is None else left[1 if flip_left else 0],
-        None if right is None else right[0 if flip_right else 1],
-        None if right is None else right[1 if flip_right else 0],
-    )

@@ -53,7 +53,11 @@ def sample_levels(
     # Prefer a kernel, then GridSample, then Gather
     known, first = array_of(sizes), array_of(starts)
     if call.compiled and value.dtype in (None, ir.DataType.FLOAT):
-        result = _by_kernel(call, value, sizes, starts, locations, weights)
+        inputs = (value, sizes, starts, locations, weights)
+        result = call.add("MultiScaleDeformableAttention", inputs, domain=DOMAIN)
+        outer = [call.known_size(weights, axis) for axis in range(3)]
+        result.shape = ir.Shape([*outer, call.known_size(value, 3)])
+        result.type = ir.TensorType(ir.DataType.FLOAT)
     elif known is None or first is None or call.opset < GRID_SAMPLE_OPSET:
         result = _by_gather(call, value, sizes, starts, locations, weights)
     else:
@@ -63,15 +67,6 @@ def sample_levels(
         ]
         result = _by_grid_sample(call, value, maps, locations, weights)
     return call.cast(result, kind) if kind is not None else result
-
-
-def _by_kernel(call: FusedCall, *inputs: ir.Value) -> ir.Value:
-    value, weights = inputs[0], inputs[-1]
-    result = call.add("MultiScaleDeformableAttention", inputs, domain=DOMAIN)
-    sizes = [call.known_size(weights, axis) for axis in range(3)]
-    result.shape = ir.Shape([*sizes, call.known_size(value, 3)])
-    result.type = ir.TensorType(ir.DataType.FLOAT)
-    return result
 
 
 def _by_grid_sample(

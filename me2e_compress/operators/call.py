@@ -226,14 +226,6 @@ def names_in(where: ir.Graph | ir.Function) -> set[str]:
     return {*values, *(value.name or "" for value in where.inputs)}
 
 
-def _type(value: ir.Value) -> None:
-    """Write the type and shape of a constant."""
-    known = array_of(value)
-    if known is not None:
-        value.type = ir.TensorType(ir.DataType.from_numpy(known.dtype))
-        value.shape = ir.Shape(known.shape)
-
-
 def _whole(value: ir.Value) -> Array | None:
     """Return the integers of a constant: axes, sizes and shapes."""
     return array_of(value) if value.dtype == ir.DataType.INT64 else None
@@ -241,9 +233,11 @@ def _whole(value: ir.Value) -> Array | None:
 
 def _infer(node: ir.Node, opset: int) -> None:
     """Infer a node's outputs from the types of its operands and integer constants."""
-    for value in node.inputs:
-        if value is not None and value.type is None:
-            _type(value)
+    for value in node.inputs:  # a constant of a file may have neither type nor shape
+        known = array_of(value) if value is not None and value.type is None else None
+        if value is not None and known is not None:
+            value.type = ir.TensorType(ir.DataType.from_numpy(known.dtype))
+            value.shape = ir.Shape(known.shape)
     try:
         found = infer_node(node, opset, known=_whole)
     except REFUSALS:

@@ -82,13 +82,10 @@ def _one(
     for (along, part), size in zip(others, reversed(sizes[:-1]), strict=True):
         index = call.add("Add", [index, call.add("Mul", [along, step])])
         share = call.add("Mul", [share, part])
-        step = call.value_of(call.product(_size(step), size))
+        known = step.const_value
+        step_size = step if known is None else int(known.numpy().item())
+        step = call.value_of(call.product(step_size, size))
     return index, share
-
-
-def _size(value: ir.Value) -> Size:
-    known = value.const_value
-    return value if known is None else int(known.numpy().item())
 
 
 def _neighbours(

@@ -80,7 +80,9 @@ class FusedMultiHeadAttention(Operator):
         """Call the kernel, or write both products and the softmax."""
         query, key, value = present(inputs)
         heads = _heads(attributes)
-        if _has_kernel(call, query, heads):
+        width = call.known_size(query, -1)
+        fits = width is not None and 0 < width <= WIDEST_HEAD * heads
+        if call.compiled and fits and query.dtype in (None, ir.DataType.FLOAT):
             rows = [_split(call, each, heads) for each in (query, key, value)]
             result = call.add(ATTENTION, rows, domain=DOMAIN)
             result.type, result.shape = rows[0].type, rows[0].shape
@@ -108,12 +110,6 @@ class FusedMultiHeadAttention(Operator):
         result = (weights / weights.sum(axis=-1, keepdims=True)) @ value
         joined: NdArray = result.transpose(0, 2, 1, 3)
         return joined.reshape(*joined.shape[:2], -1)
-
-
-def _has_kernel(call: FusedCall, query: ir.Value, heads: int) -> bool:
-    width = call.known_size(query, -1)
-    fits = width is not None and 0 < width <= WIDEST_HEAD * heads
-    return call.compiled and fits and query.dtype in (None, ir.DataType.FLOAT)
 
 
 def _split(call: FusedCall, rows: ir.Value, heads: int) -> ir.Value:

@@ -134,7 +134,9 @@ def translate(
     own, attributes = _own_call(call, dialect)
     # Write it in the new dialect
     inputs = to.inputs_from_own(call, own, attributes)
-    options = {**to.options_from_own(attributes), **_plugin_attributes(to)}
+    options = dict(to.options_from_own(attributes))
+    if to.domain != OWN_DOMAIN:
+        options |= zip(PLUGIN_ATTRIBUTES, (to.version, to.namespace), strict=True)
     result = call.add(to.op_type, inputs, options, domain=to.domain)
     made = result.producer()
     assert made is not None
@@ -197,13 +199,6 @@ def _own_call(call: FusedCall, dialect: Dialect) -> tuple[Values, Attributes]:
     attributes = dialect.attributes_of(call.node)
     inputs = dialect.inputs_to_own(call, tuple(call.node.inputs), attributes)
     return inputs, dialect.options_to_own(attributes)
-
-
-def _plugin_attributes(dialect: Dialect) -> dict[str, str]:
-    if dialect.domain == OWN_DOMAIN:
-        return {}
-    both = (dialect.version, dialect.namespace)
-    return dict(zip(PLUGIN_ATTRIBUTES, both, strict=True))
 
 
 def _take_place(call: FusedCall, result: ir.Value) -> None:

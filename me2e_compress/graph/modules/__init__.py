@@ -2,12 +2,13 @@
 
 from me2e_compress.graph.modules.assign import (
     Assignment,
+    Item,
     Placement,
     assign,
     detect,
+    itemise,
     map_of,
 )
-from me2e_compress.graph.modules.inventory import Item, itemise
 from me2e_compress.graph.modules.module_map import (
     Module,
     ModuleMap,

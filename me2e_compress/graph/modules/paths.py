@@ -44,21 +44,14 @@ class PathGlob:
 
     def reach(self, path: tuple[str, ...]) -> int | None:
         """Count a path's components up to the end of the deepest match, if any."""
+        wanted, count = self.components, len(self.components)
         if self._is_plain:
-            count = len(self.components)
-            return count if path[:count] == self.components else None
-        last = len(path) - len(self.components) if self.anywhere else 0
-        for start in range(last, -1, -1):
-            if self._matches_at(path, start):
-                return start + len(self.components)
+            return count if path[:count] == wanted else None
+        for start in range(len(path) - count if self.anywhere else 0, -1, -1):
+            window = path[start : start + count]
+            if len(window) == count and all(map(fnmatchcase, window, wanted)):
+                return start + count
         return None
-
-    def _matches_at(self, path: tuple[str, ...], start: int) -> bool:
-        window = path[start : start + len(self.components)]
-        return len(window) == len(self.components) and all(
-            part == wanted or fnmatchcase(part, wanted)
-            for part, wanted in zip(window, self.components, strict=True)
-        )
 
 
 def is_malformed(text: str) -> bool:
@@ -94,7 +87,12 @@ def scope_of(node: ir.Node) -> str:
     if props:
         # the dynamo exporter's metadata, the node itself left out
         if (scopes := props.get(_SCOPES)) is not None:
-            return _last_path(_parse_list(scopes)[:-1])
+            try:
+                parsed: object = ast.literal_eval(scopes)
+            except (ValueError, SyntaxError):
+                parsed = []
+            paths = [str(each) for each in parsed] if isinstance(parsed, list) else []
+            return _last_path(paths[:-1])
         if (namespace := props.get(_NAMESPACE)) is not None:
             paths = [part.partition(": ")[0] for part in namespace.split("/")]
             return _last_path(paths[:-1])
@@ -143,11 +141,3 @@ def _from_name(name: str | None) -> str:
 
 def _last_path(paths: list[str]) -> str:
     return next((path for path in reversed(paths) if path), "")
-
-
-def _parse_list(text: str) -> list[str]:
-    try:
-        parsed: object = ast.literal_eval(text)
-    except (ValueError, SyntaxError):
-        return []
-    return [str(item) for item in parsed] if isinstance(parsed, list) else []

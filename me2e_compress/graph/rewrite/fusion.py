@@ -3,7 +3,6 @@
 import dataclasses
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypeAlias
 
 import numpy as np
 import onnx_ir as ir
@@ -189,7 +188,11 @@ def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
     pattern wants for itself. Shapes must be inferred; bodies are rewritten too, all in
     place. ``by`` is the pass's name.
     """
-    run = _Run(Facts(opset_of(model)), by, value_names(model.graph), _by_root(fusions))
+    table: dict[tuple[str, str], list[Fusion]] = {}
+    for fusion in fusions:
+        for root in sorted(fusion.pattern.roots()):
+            table.setdefault(root, []).append(fusion)
+    run = _Run(Facts(opset_of(model)), by, value_names(model.graph), table)
     fused = Fused(unread=remove_dead(model.graph))
     for _ in range(ROUNDS):
         done: Counter[str] = Counter()
@@ -203,9 +206,6 @@ def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
     return fused
 
 
-_Table: TypeAlias = Mapping[tuple[str, str], Sequence[Fusion]]
-
-
 @dataclasses.dataclass(frozen=True)
 class _Run:
     """What stays the same while a model is fused."""
@@ -213,7 +213,7 @@ class _Run:
     facts: Facts
     by: str
     names: set[str]
-    table: _Table
+    table: Mapping[tuple[str, str], Sequence[Fusion]]
 
     def round(self, body: ir.Graph, refused: Counter[str]) -> Counter[str]:
         """Try every node once; count what was done, and enter what was refused."""
@@ -235,27 +235,15 @@ class _Run:
         reason = fusion.check(found, self.facts) if fusion.check else None
         if reason is None:
             reason = fusion.rewrite(found, Kit(body, found, self.by, self.names))
-        if reason is None:
-            _clear(found, body)
-            return True
-        refused[reason] += 1
-        return False
-
-
-def _clear(found: Match, body: ir.Graph) -> None:
-    """Remove the nodes of a match that nothing reads any more, readers first."""
-    while dead := [
-        node
-        for node in found.nodes
-        if node.graph is body and not any(is_read(each) for each in node.outputs)
-    ]:
-        for node in dead:
-            remove_node(node)
-
-
-def _by_root(fusions: Sequence[Fusion]) -> _Table:
-    table: dict[tuple[str, str], list[Fusion]] = {}
-    for fusion in fusions:
-        for root in sorted(fusion.pattern.roots()):
-            table.setdefault(root, []).append(fusion)
-    return table
+        if reason is not None:
+            refused[reason] += 1
+            return False
+        # The nodes of the match that nothing reads any more go, readers first
+        while dead := [
+            each
+            for each in found.nodes
+            if each.graph is body and not any(map(is_read, each.outputs))
+        ]:
+            for each in dead:
+                remove_node(each)
+        return True

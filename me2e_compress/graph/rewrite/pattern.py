@@ -413,7 +413,10 @@ def _solve(
 ) -> Match | None:
     """Match the first goal in each of its ways until the rest matches too."""
     if not goals:
-        return found if _is_closed(found, inner) else None
+        # Nothing else may read what the inner nodes make
+        last = found.root.outputs[0]
+        closed = all(value is last or _is_inside(value, found) for value in inner)
+        return found if closed else None
     (pattern, value), rest = goals[0], goals[1:]
     if pattern in found.values:
         if not pattern.agree(found.values[pattern], value):
@@ -428,13 +431,6 @@ def _solve(
         if solved is not None:
             return solved
     return None
-
-
-def _is_closed(found: Match, inner: tuple[ir.Value, ...]) -> bool:
-    """Check that nothing else reads what the inner nodes make."""
-    return all(
-        value is found.root.outputs[0] or _is_inside(value, found) for value in inner
-    )
 
 
 def _is_inside(value: ir.Value, found: Match) -> bool:
