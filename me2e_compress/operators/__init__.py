@@ -4,11 +4,10 @@ An operator is one node of a graph: in the toolkit's own form, in the domain ``m
 or in the dialect of a TensorRT plugin library.
 """
 
-from me2e_compress.operators.base import Cost, Operator
-from me2e_compress.operators.call import FusedCall
-from me2e_compress.operators.dialect import OWN_DOMAIN, Attribute, Dialect, Operand
-from me2e_compress.operators.lookup import (
+from me2e_compress.operators.base import (
     OPERATORS,
+    Cost,
+    Operator,
     dialect_names,
     dialect_of,
     find,
@@ -19,6 +18,8 @@ from me2e_compress.operators.lookup import (
     position_inputs,
     score_inputs,
 )
+from me2e_compress.operators.call import FusedCall
+from me2e_compress.operators.dialect import OWN_DOMAIN, Attribute, Dialect, Operand
 from me2e_compress.operators.replace import (
     FusedNode,
     expand,

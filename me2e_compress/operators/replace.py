@@ -10,7 +10,7 @@ from me2e_compress.graph.nodes import STANDARD, is_read, nodes_in
 from me2e_compress.graph.rewrite import replace_value, value_names
 from me2e_compress.graph.shapes import open_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
-from me2e_compress.operators.base import Operator
+from me2e_compress.operators.base import Operator, find
 from me2e_compress.operators.call import Attributes, FusedCall, names_in
 from me2e_compress.operators.dialect import (
     OWN_DOMAIN,
@@ -18,7 +18,6 @@ from me2e_compress.operators.dialect import (
     Dialect,
     Values,
 )
-from me2e_compress.operators.lookup import find
 
 _LEAST_OPSET = 13
 """ReduceSum and Unsqueeze take their axes as inputs from here on."""

@@ -9,7 +9,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import ModuleMap, PathGlob, scope_of
-from me2e_compress.graph.modules.paths import entering, leaving
+from me2e_compress.graph.modules.module_map import entering, leaving
 
 _NAMED = 4
 """Number of values that a message lists."""

@@ -7,8 +7,8 @@ import onnx
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.graph import weight_files
-from me2e_compress.graph.weight_files import write_inline
+from me2e_compress.graph import files
+from me2e_compress.graph.files import write_inline
 from tests.nets import conv_attention
 
 DTYPES = ("float32", "float64", "float16", "int64", "int32", "int8", "uint8", "bool")
@@ -41,7 +41,7 @@ def full() -> ir.Model:
 def test_the_bytes_are_those_of_onnx(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, limit: int, loaded: bool
 ) -> None:
-    monkeypatch.setattr(weight_files, "LARGE_BYTES", limit)
+    monkeypatch.setattr(files, "LARGE_BYTES", limit)
     model = full()
     if loaded:
         onnx.save(ir.to_proto(model), tmp_path / "first.onnx")

@@ -12,11 +12,12 @@ from me2e_compress.graph.modules.assign import (
 from me2e_compress.graph.modules.module_map import (
     Module,
     ModuleMap,
+    PathGlob,
     Role,
     Substitute,
     presets,
+    scope_of,
 )
-from me2e_compress.graph.modules.paths import PathGlob, scope_of
 
 __all__ = [
     "Assignment",

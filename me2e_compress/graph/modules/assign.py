@@ -8,8 +8,13 @@ from typing import Literal
 import onnx_ir as ir
 
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.graph.modules.module_map import ModuleMap, presets
-from me2e_compress.graph.modules.paths import PathGlob, parameter_path, scope_of
+from me2e_compress.graph.modules.module_map import (
+    ModuleMap,
+    PathGlob,
+    parameter_path,
+    presets,
+    scope_of,
+)
 from me2e_compress.graph.nodes import has_subgraph
 from me2e_compress.graph.provenance import MODULE
 from me2e_compress.graph.summary import total_macs
