@@ -121,7 +121,8 @@ def _product(node: ir.Node) -> int | None:
     left, out = static_shape(node.inputs[0]), static_shape(node.outputs[0])
     if left is None or out is None:
         return None
-    flipped = node.op_type == "Gemm" and node.attributes.get_int("transA", 0)
+    gemm = node.op_type == "Gemm"
+    flipped = gemm and bool(node.attributes.get_int("transA", 0))
     return math.prod(out) * (left[0 if flipped else -1] if left else 1)
 
 

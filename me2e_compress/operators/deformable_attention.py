@@ -100,26 +100,15 @@ class RawAttention(Dialect):
         offsets = call.reshape(pixels, (batch, queries, heads, -1))
         reference = call.full((batch, queries, 1, 2), 0.0, locations)
         # The plugin applies the softmax itself
-        raw = self._before_softmax(call, weights)
-        raw = call.reshape(raw, (batch, queries, heads, -1))
-        given = {
-            "value": value,
-            "spatial_shapes": shapes,
-            "reference_points": reference,
-            "sampling_offsets": offsets,
-            "attention_weights": raw,
-        }
-        return self.in_types(call, given)
-
-    def _before_softmax(self, call: FusedCall, weights: ir.Value) -> ir.Value:
-        found = _before_softmax(call, weights, 2)
-        if found is None:
+        raw = _before_softmax(call, weights)
+        if raw is None:
             raise PreconditionError(
                 f"node {call.node.name}: {self.op_type} of {self.source} takes weights"
                 f" before their softmax, and {weights.name} is not of a softmax over"
                 " all levels and points"
             )
-        return found
+        raw = call.reshape(raw, (batch, queries, heads, -1))
+        return self.in_types(call, (value, shapes, reference, offsets, raw))
 
     def arrays_to_own(self, arrays: Arrays, attributes: Attributes) -> Arrays:
         """Compute the locations, the softmax and the start of each level."""
@@ -219,16 +208,16 @@ def _starts(call: FusedCall, shapes: ir.Value) -> ir.Value:
 _LAYOUT = ("Expand", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze")
 
 
-def _before_softmax(call: FusedCall, weights: ir.Value, axes: int) -> ir.Value | None:
+def _before_softmax(call: FusedCall, weights: ir.Value) -> ir.Value | None:
     """Write the scores of a softmax in the layout of its weights, if there is one.
 
-    The last ``axes`` axes of ``weights`` are one row of the softmax.
+    The last two axes of ``weights`` are one row of the softmax.
     """
     shape = static_shape(weights)
     if shape is None:
         return None
     # Walk back over layout operators that keep rows whole
-    row, chain, source = math.prod(shape[-axes:]), list[ir.Node](), weights
+    row, chain, source = math.prod(shape[-2:]), list[ir.Node](), weights
     while node := maker(source, *_LAYOUT):
         read = node.inputs[0]
         if read is None or not _keeps_rows(node, row):

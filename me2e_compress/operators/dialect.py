@@ -1,7 +1,7 @@
 """Dialects of fused operators: how a plugin library spells them."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy.typing as npt
@@ -134,8 +134,7 @@ class Dialect:
         self, call: FusedCall, inputs: Values, attributes: Attributes
     ) -> Values:
         """Write the conversion of the own form's inputs to this dialect's."""
-        kinds = dict(zip((each.name for each in self.operands), inputs, strict=False))
-        return self.in_types(call, kinds)
+        return self.in_types(call, inputs)
 
     def by_kernel(self, call: FusedCall, inputs: Values) -> ir.Value | None:
         """Call a compiled kernel that takes these inputs; None if there is none."""
@@ -180,18 +179,12 @@ class Dialect:
         """Return the element type of this dialect's output: that of the first input."""
         return None if inputs[0] is None else inputs[0].dtype
 
-    def in_types(
-        self, call: FusedCall, inputs: Mapping[str, ir.Value | None]
-    ) -> Values:
-        """Cast integer operands, given by name, to a type that this dialect accepts."""
-        cast = []
-        for operand in self.operands:
-            value = inputs.get(operand.name)
-            if (
-                value is not None
-                and value.dtype in INTEGERS
-                and value.dtype not in operand.types
-            ):
+    def in_types(self, call: FusedCall, inputs: Values) -> Values:
+        """Cast integer operands to a type that this dialect accepts."""
+        cast = list[ir.Value | None]()
+        for operand, value in zip(self.operands, inputs, strict=False):
+            kind = None if value is None else value.dtype
+            if value is not None and kind in INTEGERS and kind not in operand.types:
                 value = call.cast(value, operand.types[0])
             cast.append(value)
         while cast and cast[-1] is None:

@@ -38,17 +38,12 @@ def fused_nodes(model: ir.Model) -> list[FusedNode]:
     """Return the fused nodes of a graph, of its bodies and of its functions."""
     names = value_names(model.graph)
     names.update(node.name or "" for node in nodes_in(model.graph))
-    found = _found_in(model.graph, opset_of(model), names)
-    for function in model.functions.values():
-        found += _found_in(function, opset_of(function), names_in(function))
-    return found
-
-
-def _found_in(
-    body: ir.Graph | ir.Function, opset: int, names: set[str]
-) -> list[FusedNode]:
+    bodies: list[tuple[ir.Graph | ir.Function, int, set[str]]]
+    bodies = [(model.graph, opset_of(model), names)]
+    bodies += [(f, opset_of(f), names_in(f)) for f in model.functions.values()]
     return [
         FusedNode(node, *row, opset, names)
+        for body, opset, names in bodies
         for node in nodes_in(body)
         if (row := find(node)) is not None
     ]
