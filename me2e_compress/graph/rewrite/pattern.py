@@ -37,10 +37,6 @@ from me2e_compress.graph.nodes import (
 # A value as a product: a constant times other values.
 
 
-_POWERS = (2.0, 3.0)
-"""Powers that count as so many factors."""
-
-
 @dataclasses.dataclass
 class Factors:
     """``scale`` times the factors, each as often as it is listed.
@@ -62,47 +58,31 @@ def factors_of(value: ir.Value) -> Factors | None:
     Inner products are opened only where nothing else reads them. None if nothing
     multiplies.
     """
-    node = maker(value, "Mul", "Div", "Pow")
-    if node is None or not _opens(node):
-        return None
-    found = Factors(1.0, [], [])
-    _open(node, found)
-    return found
-
-
-def _opens(node: ir.Node) -> bool:
-    """Return whether a node multiplies its first input; a Mul both."""
-    if node.op_type == "Mul":
-        return True
-    number = scalar_of(node.inputs[1])
-    return bool(number) if node.op_type == "Div" else number in _POWERS
-
-
-def _open(node: ir.Node, found: Factors) -> None:
-    found.nodes.append(node)
-    left, right = node.inputs[0], node.inputs[1]
-    number = scalar_of(right) if node.op_type != "Mul" else None
-    if number is None:
-        _enter(left, found)
-        _enter(right, found)
-    elif node.op_type == "Div":
-        found.scale /= number
-        _enter(left, found)
-    elif left is not None:
-        found.factors.extend([left] * int(number))
-
-
-def _enter(value: ir.Value | None, found: Factors) -> None:
-    if value is None:
-        return
-    constant = scalar_of(value)
-    inner = sole_maker(value, "Mul", "Div", "Pow") if constant is None else None
-    if constant is not None:
-        found.scale *= constant
-    elif inner is not None and _opens(inner):
-        _open(inner, found)
-    else:
-        found.factors.append(value)
+    found, waiting = Factors(1.0, [], []), list[ir.Value | None]([value])
+    while waiting:
+        each = waiting.pop()
+        number = None if each is None else scalar_of(each)
+        if each is None or number is not None:
+            found.scale *= 1.0 if number is None else number
+            continue
+        make = maker if each is value else sole_maker
+        node = make(each, "Mul", "Div", "Pow")
+        kind = "" if node is None else node.op_type
+        left, right = (None, None) if node is None else node.inputs[:2]
+        second = scalar_of(right)
+        # A Mul multiplies both inputs, a Div and a Pow the first one
+        if kind == "Mul":
+            waiting += (right, left)
+        elif kind == "Div" and second:
+            found.scale /= second
+            waiting.append(left)
+        elif kind == "Pow" and left is not None and second in (2.0, 3.0):
+            found.factors += [left] * int(second or 0)
+        else:
+            found.factors.append(each)
+            continue
+        found.nodes += (node,) if node is not None else ()
+    return found if found.nodes else None
 
 
 _IN_ANY_ORDER = frozenset(
