@@ -126,7 +126,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
             if external:
                 ir.save(model, draft, format="protobuf", external_data=data.name)
             else:
-                write_inline(_inlined(model), draft)
+                write_inline(inlined(model) if stored else model, draft)
         # The earlier model keeps its weights until the new one stands in its place.
         draft_data = draft.with_name(data.name)
         if draft_data.exists():
@@ -206,15 +206,11 @@ def _blocks(path: Path) -> Iterator[bytes]:
             yield block
 
 
-def _inlined(model: ir.Model) -> ir.Model:
-    if not is_external(model):
-        return model
+def inlined(model: ir.Model) -> ir.Model:
+    """Return a copy whose weights are all in memory."""
     copy = model.clone()
-    for graph in copy.graphs():
-        for value in graph.initializers.values():
-            tensor = value.const_value
-            if isinstance(tensor, ir.ExternalTensor):
-                value.const_value = ir.tensor(tensor.numpy(), name=value.name)
+    for tensor, replace in list(_places(copy)):
+        replace(ir.tensor(tensor.numpy().copy(), name=tensor.name))
     return copy
 
 

@@ -14,6 +14,7 @@ from onnx_graphsurgeon.util.exception import OnnxGraphSurgeonException
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance
+from me2e_compress.graph.files import inlined
 
 
 def restore(
@@ -133,12 +134,7 @@ def to_graphsurgeon(model: ir.Model) -> gs.Graph:
     Weights are read into memory. graphsurgeon knows no overloads, so the second
     function of a name is called ``name__overload`` there.
     """
-    copy = model.clone()
-    for graph in (copy.graph, *copy.graph.subgraphs()):
-        for value in graph.initializers.values():
-            if isinstance(value.const_value, ir.ExternalTensor):
-                array = value.const_value.numpy().copy()
-                value.const_value = ir.tensor(array, name=value.name)
+    copy = inlined(model)
     _surgeon_rename(copy, {key: _spelled(key) for key in copy.functions if key[2]})
     return gs.import_onnx(ir.to_proto(copy))
 

@@ -65,11 +65,7 @@ def drawn(dialect: Dialect, random: np.random.Generator) -> DrawnCall:
 def graph_of(call: DrawnCall, dialect: Dialect, opset: int) -> ir.Model:
     """Build the graph of one node whose inputs are those of the graph."""
     values = [
-        ir.Value(
-            name=name,
-            shape=ir.Shape(array.shape),
-            type=ir.TensorType(ir.DataType.from_numpy(array.dtype)),
-        )
+        ir.val(name, ir.DataType.from_numpy(array.dtype), array.shape)
         for name, array in call.inputs.items()
     ]
     # one node with one output, in a graph of two opset imports
