@@ -15,6 +15,14 @@ from me2e_compress.operators.call import AttributeValue
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
+def in_float32(arrays: Mapping[str, Any]) -> dict[str, npt.NDArray[Any]]:
+    """Return arrays whose doubles are floats."""
+    return {
+        name: array.astype(np.float32) if array.dtype == np.float64 else array
+        for name, array in arrays.items()
+    }
+
+
 def graph_of(
     dialect: Dialect,
     arrays: Arrays,

@@ -22,7 +22,7 @@ from me2e_compress.operators.deformable_attention import (
     RawAttention,
 )
 from me2e_compress.operators.raw_attention import RawOwnForm
-from tests.operators.running import body_and_reference, graph_of, run
+from tests.operators.running import body_and_reference, graph_of, in_float32, run
 from tests.profiles import scaled
 
 OPERATOR = DeformableAttention()
@@ -82,10 +82,7 @@ def arrays_of(dialect: Dialect, call: dict[str, Any]) -> dict[str, npt.NDArray[A
             "sampling_locations": random.uniform(-0.3, 1.3, (*head, count, points, 2)),
             "attention_weights": random.uniform(size=(*head, count, points)),
         }
-    return {
-        name: array.astype(np.float32) if array.dtype == np.float64 else array
-        for name, array in {"value": value, **parts}.items()
-    }
+    return in_float32({"value": value, **parts})
 
 
 def repeating(

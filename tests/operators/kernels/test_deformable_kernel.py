@@ -14,7 +14,7 @@ from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.operators.raw_attention import raw_own_form
 from me2e_compress.runtime import runnable
 from me2e_compress.runtime.session import Session
-from tests.operators.running import graph_of
+from tests.operators.running import graph_of, in_float32
 from tests.operators.test_deformable_attention import arrays_of
 from tests.profiles import scaled
 
@@ -69,15 +69,14 @@ def test_aggregation_over_cameras_takes_the_same_kernel() -> None:
     sizes = np.array([[[4, 6], [2, 3]], [[3, 5], [0, 2]]], np.int32)
     areas = sizes.astype(np.int64).prod(axis=-1)
     starts = (areas.ravel().cumsum() - areas.ravel()).reshape(2, 2)
-    float32 = np.float32
-    arrays: dict[str, Any] = {
-        "mc_ms_feat": random.normal(size=(2, areas.sum(), 12)).astype(float32),
+    inputs = {
+        "mc_ms_feat": random.normal(size=(2, areas.sum(), 12)),
         "spatial_shape": sizes,
         "scale_start_index": starts.astype(np.int32),
         "sampling_location": random.uniform(-0.2, 1.2, (2, 200, 5, 2, 2)),
-        "weights": random.normal(size=(2, 200, 5, 2, 2, 3)).astype(float32),
+        "weights": random.normal(size=(2, 200, 5, 2, 2, 3)),
     }
-    arrays["sampling_location"] = arrays["sampling_location"].astype(float32)
+    arrays = in_float32(inputs)
     operator = DeformableAggregation()
     model = graph_of(operator.dialects[0], arrays, opset=17)
     _, needed = runnable.compiled_or_expanded(model, compiled=True)
@@ -98,10 +97,7 @@ def test_what_has_no_weight_is_not_read() -> None:
         "sampling_locations": random.uniform(-0.2, 1.2, (2, 300, 3, 2, 4, 2)),
         "attention_weights": random.uniform(0, 1, (2, 300, 3, 2, 4)),
     }
-    arrays = {
-        name: array.astype(np.float32) if array.dtype == np.float64 else array
-        for name, array in inputs.items()
-    }
+    arrays = in_float32(inputs)
     weights = arrays["attention_weights"]
     weights[random.uniform(size=weights.shape) < 0.6] = 0
     weights[:, :, :, 1] = 0  # a camera that nobody looks at
@@ -128,10 +124,7 @@ def raw_call() -> dict[str, Any]:
         "attention_scores": random.normal(300, 9, (1, 90, 23, 1, 16)),
         "mask": np.where(shown, random.uniform(size=shown.shape), 0),
     }
-    return {
-        name: array.astype(np.float32) if array.dtype == np.float64 else array
-        for name, array in drawn.items()
-    }
+    return in_float32(drawn)
 
 
 def test_levels_share_offsets_and_a_camera_without_weight_is_not_read() -> None:
@@ -209,10 +202,11 @@ def test_int8_values_are_read_as_they_are(kind: str, made: str) -> None:
         "stored": random.integers(low, high + 1, (2, 63, 24)).astype(kind),
         "sizes": np.array([[5, 11], [2, 4]], np.int32),
         "starts": np.array([0, 55], np.int32),
-        "at": random.uniform(-0.2, 1.2, (2, 50, 3, 2, 4, 2)).astype(np.float32),
-        "w": random.uniform(0, 1, (2, 50, 3, 2, 4)).astype(np.float32),
-        "by_channel": random.uniform(0.01, 0.03, 24).astype(np.float32),
+        "at": random.uniform(-0.2, 1.2, (2, 50, 3, 2, 4, 2)),
+        "w": random.uniform(0, 1, (2, 50, 3, 2, 4)),
+        "by_channel": random.uniform(0.01, 0.03, 24),
     }
+    feeds = in_float32(feeds)
     ready, needed = runnable.compiled_or_expanded(model, compiled=True)
     assert [each.op_type for each in needed] == [
         f"MultiScaleDeformableAttention{kind.capitalize()}"
