@@ -64,8 +64,10 @@ def test_data_outside_the_model_s_folder_are_neither_read_nor_hashed(
 
 
 def holds_numbers(model: ir.Model) -> bool:
-    weights = [each.graph.initializers["w"].const_value for each in (model, weighted())]
-    return np.array_equal(*(each.numpy() for each in weights if each is not None))
+    one, other = (m.graph.initializers["w"].const_value for m in (model, weighted()))
+    assert one is not None
+    assert other is not None
+    return np.array_equal(one.numpy(), other.numpy())
 
 
 def test_links_within_the_folder_are_followed_and_a_hub_s_cache(home: Path) -> None:
