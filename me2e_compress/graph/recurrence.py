@@ -126,9 +126,7 @@ def recurrent_inputs(model: ir.Model) -> dict[str, str]:
     return recurrence(model.metadata_props, *sides(model))
 
 
-def sides(
-    model: ir.Model,
-) -> tuple[dict[str, SessionPort], dict[str, SessionPort]]:
+def sides(model: ir.Model) -> tuple[dict[str, SessionPort], dict[str, SessionPort]]:
     """Return the inputs and the outputs of known rank of a graph in memory."""
     inputs, outputs = (
         {str(each.name): port_of(each) for each in values if each.shape is not None}

@@ -6,13 +6,7 @@ from collections.abc import Callable, Iterable
 
 import onnx_ir as ir
 
-from me2e_compress.graph.nodes import (
-    VIEWS,
-    input_at,
-    is_plugin,
-    nodes_in,
-    nodes_inside,
-)
+from me2e_compress.graph.nodes import VIEWS, input_at, is_plugin, nodes_in, nodes_inside
 from me2e_compress.graph.shapes import knowledge, static_shape
 
 Counter = Callable[[ir.Node], int | None]

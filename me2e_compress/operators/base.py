@@ -14,13 +14,7 @@ from me2e_compress.graph.shapes import Dims, open_shape, product
 from me2e_compress.graph.summary import total_bytes
 from me2e_compress.graph.validity import PLUGIN_DOMAIN
 from me2e_compress.operators.call import Attributes, FusedCall
-from me2e_compress.operators.dialect import (
-    OWN_DOMAIN,
-    Arrays,
-    Dialect,
-    NdArray,
-    Values,
-)
+from me2e_compress.operators.dialect import OWN_DOMAIN, Arrays, Dialect, NdArray, Values
 from me2e_compress.registry import Registry
 
 

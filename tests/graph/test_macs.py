@@ -51,10 +51,7 @@ def only_node(text: str) -> ir.Node:
             ' { y = Einsum<equation="bij, bjk -> bik">(x, w) }',
             2 * 7 * 4 * 5,
         ),
-        (
-            'm (float[7,4] x) => (float[4,7] y) { y = Einsum<equation="ij->ji">(x) }',
-            0,
-        ),
+        ('m (float[7,4] x) => (float[4,7] y) { y = Einsum<equation="ij->ji">(x) }', 0),
         (
             "m (uint8[1,3,8,8] x, float s, uint8 z, int8[4,3,3,3] w)"
             " => (uint8[1,4,6,6] y) { y = QLinearConv(x, s, z, w, s, z, s, z) }",

@@ -57,11 +57,7 @@ def test_ports_that_do_not_fit_are_named_with_what_they_are() -> None:
     ("name", "outputs", "why"),
     [
         ("prev_a", {}, "no output is called prev_a_out or next_a, and the metadata"),
-        (
-            "a",
-            {"a_out": FLAG},
-            "output a_out is tensor.bool. of rank 1, input a",
-        ),
+        ("a", {"a_out": FLAG}, "output a_out is tensor.bool. of rank 1, input a"),
         ("a", {"a_out": STATE}, "a_out is not fed back to it: the metadata"),
         ("img", {"plan": STATE}, "^$"),
     ],

@@ -40,16 +40,8 @@ backbone (float[1,4] img, float[1,4] next_bev) => (float[1,4] feats)
             "head.feats: backbone and neck both give feats: say backbone.feats or"
             " neck.feats, by [edges]",
         ),
-        (
-            TWO_PARTS,
-            {"backbone": BACKBONE_LOOP},
-            "the parts wait for one another",
-        ),
-        (
-            TWO_PARTS.replace("head.onnx", "hat.onnx"),
-            {},
-            "hat.onnx: no such file",
-        ),
+        (TWO_PARTS, {"backbone": BACKBONE_LOOP}, "the parts wait for one another"),
+        (TWO_PARTS.replace("head.onnx", "hat.onnx"), {}, "hat.onnx: no such file"),
         (
             TWO_PARTS + '[edges]\nfeets = "feats"\n',
             {},

@@ -113,10 +113,7 @@ def repeating(
 
 @settings(max_examples=scaled(10))
 @given(
-    dialect=dialects,
-    call=calls,
-    opset=st.sampled_from([13, 17]),
-    known=st.booleans(),
+    dialect=dialects, call=calls, opset=st.sampled_from([13, 17]), known=st.booleans()
 )
 def test_the_body_of_every_dialect_is_its_reference(
     dialect: Dialect, call: dict[str, Any], opset: int, known: bool

@@ -70,10 +70,7 @@ def test_a_method_that_is_gone_is_one_line(cli: Cli) -> None:
             "quantize-int8{weight_only_gemv=true}",
             "weight_only_gemv is gone since 0.3.0: use without=[gemv]",
         ),
-        (
-            "fold-constants{growth=0}",
-            "growth is gone since 0.3.0: use bytes_per_node",
-        ),
+        ("fold-constants{growth=0}", "growth is gone since 0.3.0: use bytes_per_node"),
         (
             "static-geometry",
             "static-geometry is gone since 0.3.0: use freeze-inputs, with --frames",

@@ -24,10 +24,7 @@ import numpy as np
 from numba import types
 
 from me2e_compress.operators.kernels import abi
-from me2e_compress.operators.kernels.abi import (
-    ADDRESS,
-    EACH,
-)
+from me2e_compress.operators.kernels.abi import ADDRESS, EACH
 from me2e_compress.operators.kernels.intrinsics import (
     WORD,
     Word,

@@ -119,10 +119,7 @@ def test_an_imported_graph_says_it_itself_by_its_map(
 
 
 def test_the_result_tells_nodes_and_rules() -> None:
-    model = read(
-        ONE,
-        '["/neck/Relu"] a = Relu(x) ["/det/Neg"] b = Neg(a) y = Abs(b)',
-    )
+    model = read(ONE, '["/neck/Relu"] a = Relu(x) ["/det/Neg"] b = Neg(a) y = Abs(b)')
     found = assign(model, MAP)
     assert found.rules() == {"scope": 2, "neighbour": 1}
     assert [node.outputs[0].name for node in found.nodes("det")] == ["b", "y"]
@@ -167,8 +164,7 @@ def test_a_prefix_that_hides_every_name_is_named() -> None:
 
 def test_a_preset_behind_a_prefix_is_told_of_it() -> None:
     model = read(
-        ONE,
-        '["/net/perception/Relu"] a = Relu(x) ["/net/join_traj/Neg"] y = Neg(a)',
+        ONE, '["/net/perception/Relu"] a = Relu(x) ["/net/join_traj/Neg"] y = Neg(a)'
     )
     with pytest.raises(ModuleMapError, match=r'behind.*write strip = \["net"\]'):
         assign(model, ModuleMap.load("tcp"))
