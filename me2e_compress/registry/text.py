@@ -133,13 +133,9 @@ class _Reader:
         self.text, self.at, self.depth = text, 0, 0
 
     def item(self) -> ParsedItem:
-        name = self.match(_NAME)
-        if name is None:
-            self.fail("a name is expected")
+        name = self.expect(_NAME, "a name is expected")
         if self.take(":"):
-            value = self.match(_SHORT)
-            if value is None:
-                self.fail(f"a value is expected behind {name}:")
+            value = self.expect(_SHORT, f"a value is expected behind {name}:")
             return ParsedItem(name, value=value)
         return ParsedItem(name, self.options() if self.take("{") else {})
 
@@ -159,9 +155,7 @@ class _Reader:
     def key(self) -> str:
         if name := self.match(_KEY):
             return name
-        if quoted := self.match(_QUOTED):
-            return self.string(quoted)
-        self.fail("option=value is expected")
+        return self.string(self.expect(_QUOTED, "option=value is expected"))
 
     def value(self) -> object:
         if self.take("["):
@@ -170,14 +164,17 @@ class _Reader:
             return self.options()
         if quoted := self.match(_QUOTED):
             return self.string(quoted)
-        word = self.match(_WORD)
-        if word is None:
-            self.fail("a value is expected")
+        word = self.expect(_WORD, "a value is expected")
         if self.text.startswith("{", self.at):
             return word + self.braces()
         if len(word) > _DIGITS and word[:9].strip("+-_").isdecimal():
             self.fail(f"a number of more than {_DIGITS} digits")
-        return _literal(word)
+        # A truth value, null or a number; else a word
+        if word in _LITERALS:
+            return _LITERALS[word]
+        if _INTEGER.fullmatch(word):
+            return int(word)
+        return float(word) if _FLOAT.fullmatch(word) else word
 
     def sequence(self) -> list[object]:
         values: list[object] = []
@@ -222,23 +219,21 @@ class _Reader:
     def match(self, pattern: re.Pattern[str]) -> str | None:
         """Pass what comes next, and the space before it, if it matches."""
         space = _SPACE.match(self.text, self.at)
-        found = pattern.match(self.text, space.end() if space else self.at)
-        if found is None:
+        match = pattern.match(self.text, space.end() if space else self.at)
+        if match is None:
             return None
-        self.at = found.end()
-        return found.group()
+        self.at = match.end()
+        return match.group()
+
+    def expect(self, pattern: re.Pattern[str], otherwise: str) -> str:
+        """Pass what comes next, which must match."""
+        text = self.match(pattern)
+        if text is None:
+            self.fail(otherwise)
+        return text
 
     def fail(self, expected: str) -> NoReturn:
         rest = self.text[self.at :]
         where = f"from {rest[:_SHOWN]!r} on" if rest else "to the end"
         whole = self.text if len(self.text) <= 200 else f"{self.text[:200]}..."
         raise TextError(f"cannot read {whole!r} {where}: {expected}")
-
-
-def _literal(word: str) -> object:
-    """Return the number, truth value or null that a word is, or else the word."""
-    if word in _LITERALS:
-        return _LITERALS[word]
-    if _INTEGER.fullmatch(word):
-        return int(word)
-    return float(word) if _FLOAT.fullmatch(word) else word
