@@ -8,7 +8,6 @@ from me2e_compress.graph.digest import digest
 from me2e_compress.graph.files import (
     data_names,
     file_bytes,
-    is_external,
     load,
     save,
     sha256_of,
@@ -62,7 +61,6 @@ __all__ = [
     "infer_shapes",
     "input_at",
     "interface",
-    "is_external",
     "is_standard",
     "load",
     "macs",

@@ -106,7 +106,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
     path = Path(path)
     if not path.parent.is_dir():
         raise GraphError(f"{path}: no such folder {path.parent}")
-    stored = list(external_tensors(model))
+    stored = external_tensors(model)
     names, own = data_names(path), {os.path.realpath(each.path) for each in stored}
     for data in names:
         if os.path.realpath(data) in own:
@@ -152,11 +152,6 @@ def _ours(model: ir.Model) -> Iterator[None]:
 def data_names(path: Path) -> tuple[Path, Path]:
     """Return where the weights of a model may lie; what it is written over has one."""
     return path.with_name(f"{path.name}.data"), path.with_name(f"{path.name}.1.data")
-
-
-def is_external(model: ir.Model) -> bool:
-    """Return whether some of the weights lie in a file of their own."""
-    return any(True for _ in external_tensors(model))
 
 
 def file_bytes(path: Path) -> int:
@@ -224,10 +219,9 @@ SMALL_BYTES = 1024
 ONNX's checker would look for their file in the working directory."""
 
 
-def external_tensors(model: ir.Model) -> Iterator[ir.ExternalTensor]:
+def external_tensors(model: ir.Model) -> list[ir.ExternalTensor]:
     """List the weights whose data lie in a file of their own."""
-    for tensor, _ in _places(model):
-        yield tensor
+    return [tensor for tensor, _ in _places(model)]
 
 
 def settle(model: ir.Model, path: Path) -> None:
