@@ -58,15 +58,15 @@ def factors_of(value: ir.Value) -> Factors | None:
     Inner products are opened only where nothing else reads them. None if nothing
     multiplies.
     """
-    found, waiting = Factors(1.0, [], []), list[ir.Value | None]([value])
+    result, waiting = Factors(1.0, [], []), list[ir.Value | None]([value])
     while waiting:
-        each = waiting.pop()
-        number = None if each is None else scalar_of(each)
-        if each is None or number is not None:
-            found.scale *= 1.0 if number is None else number
+        factor = waiting.pop()
+        number = None if factor is None else scalar_of(factor)
+        if factor is None or number is not None:
+            result.scale *= 1.0 if number is None else number
             continue
-        make = maker if each is value else sole_maker
-        node = make(each, "Mul", "Div", "Pow")
+        make = maker if factor is value else sole_maker
+        node = make(factor, "Mul", "Div", "Pow")
         kind = "" if node is None else node.op_type
         left, right = (None, None) if node is None else node.inputs[:2]
         second = scalar_of(right)
@@ -74,15 +74,16 @@ def factors_of(value: ir.Value) -> Factors | None:
         if kind == "Mul":
             waiting += (right, left)
         elif kind == "Div" and second:
-            found.scale /= second
+            result.scale /= second
             waiting.append(left)
         elif kind == "Pow" and left is not None and second in (2.0, 3.0):
-            found.factors += [left] * int(second or 0)
+            result.factors += [left] * int(second or 0)
         else:
-            found.factors.append(each)
+            result.factors.append(factor)
             continue
-        found.nodes += (node,) if node is not None else ()
-    return found if found.nodes else None
+        if node is not None:
+            result.nodes.append(node)
+    return result if result.nodes else None
 
 
 _IN_ANY_ORDER = frozenset(

@@ -50,7 +50,7 @@ class JoinedStack:
     def __init__(self, parts: Parts, content: StackFile) -> None:
         self.parts = parts
         self.outputs = [
-            End(part, name) for part, each in parts.items() for name in each.outputs
+            End(part, name) for part, file in parts.items() for name in file.outputs
         ]
         # What feeds what, in which order
         edges = {
@@ -63,12 +63,12 @@ class JoinedStack:
             for text, output in content.state.items()
             for taker in self._ends(text, f"[state] {text}")
         }
-        if both := [each for each in state if each in edges]:
+        if both := [taker for taker in state if taker in edges]:
             raise GraphError(f"{both[0]} is fed by [edges] and by [state]")
         self.sources = {
             End(part, name): self._source(End(part, name), edges, state)
-            for part, each in parts.items()
-            for name in each.inputs
+            for part, file in parts.items()
+            for name in file.inputs
         }
         self.order = self._order()
         self.inputs = self._inputs()
@@ -98,7 +98,7 @@ class JoinedStack:
         """
         content = StackFile.load(path)
         try:
-            parts = {each.name: Part.load(each, path) for each in content.part}
+            parts = {entry.name: Part.load(entry, path) for entry in content.part}
             joined = cls(parts, content)
         except GraphError as error:
             raise GraphError(f"{path}: {error}") from error
@@ -108,7 +108,7 @@ class JoinedStack:
     @property
     def paths(self) -> tuple[Path, ...]:
         """The files that were read."""
-        return tuple(each.path for each in self.parts.values())
+        return tuple(file.path for file in self.parts.values())
 
     def feeds(self) -> Iterator[tuple[str, str, str, str]]:
         """Yield part, input, source and form of what is fed, in the order of runs.
@@ -134,7 +134,7 @@ class JoinedStack:
         ends = self.outputs
         if not outputs:
             ends = [
-                End(part, n) for part, each in self.parts.items() for n in each.inputs
+                End(part, n) for part, file in self.parts.items() for n in file.inputs
             ]
         matches = [end for end in ends if end.name == text]
         matches = matches or [end for end in ends if str(end) == text]
@@ -157,8 +157,8 @@ class JoinedStack:
         if taker in edges:
             return edges[taker]
         declared = self.parts[taker.part].recurrent().get(taker.name)
-        givers = [each for each in self.outputs if each.name == taker.name]
-        givers = [each for each in givers if each.part != taker.part]
+        givers = [end for end in self.outputs if end.name == taker.name]
+        givers = [end for end in givers if end.part != taker.part]
         if taker in state or declared is not None or not givers:
             return End("", taker.name)
         if len(givers) > 1:
@@ -208,8 +208,8 @@ class JoinedStack:
         outputs = {names[end]: self._port(end, output=True) for end in self.outputs}
         # Metadata of the files come first; [state] overrides them
         pairs = dict[str, str | None]()
-        for part, each in self.parts.items():
-            for name, output in each.recurrent().items():
+        for part, file in self.parts.items():
+            for name, output in file.recurrent().items():
                 if output is None:
                     pairs.setdefault(name, None)
                     continue
@@ -244,7 +244,7 @@ class JoinedStack:
         for _ in self.parts:
             reached |= {b for a, b in pairs if a in reached}
             reached |= {a for a, b in pairs if b in reached}
-        if alone := [each for each in others if each not in reached]:
+        if alone := [part for part in others if part not in reached]:
             outputs, inputs = self.parts[first].outputs, self.parts[alone[0]].inputs
             raise GraphError(
                 f"nothing joins {alone[0]} to {first}: [edges] must say which of"
@@ -287,8 +287,8 @@ def _metadata(parts: Parts) -> dict[str, str]:
         return value if isinstance(value, dict) else {}
 
     merged = dict[str, str]()
-    for each in parts.values():
-        for key, text in each.model.metadata_props.items():
+    for file in parts.values():
+        for key, text in file.model.metadata_props.items():
             before, now = table(merged.get(key, "")), table(text)
             agree = all(now.get(name, value) == value for name, value in before.items())
             both = json.dumps(before | now)
@@ -308,7 +308,7 @@ def _merged(stack: JoinedStack) -> ir.Model:
     ``/Mul``. Weights are shared with the files' graphs, not copied.
     """
     parts, names, inputs = stack.parts, stack.names, stack.inputs
-    models = {part: each.model.clone() for part, each in parts.items()}
+    models = {part: file.model.clone() for part, file in parts.items()}
     _write_one_opset(parts, models)
     functions = _functions(models)
     _rename_apart(models, {*names.values(), *inputs})
@@ -350,7 +350,7 @@ def _merged(stack: JoinedStack) -> ir.Model:
         opset_imports=imports,
     )
     joined.sort()
-    newest = max(each.ir_version for each in models.values())
+    newest = max(model.ir_version for model in models.values())
     return ir.Model(joined, ir_version=newest, functions=functions)
 
 
@@ -379,13 +379,13 @@ def _rename_apart(models: Mapping[str, ir.Model], public: Collection[str]) -> No
         seen = Counter(
             name
             for items in named.values()
-            for name in {each.name for each in items if each.name}
+            for name in {item.name for item in items if item.name}
         )
         used = {*seen, *reserved}
         for part, items in named.items():
             known = dict[str, str]()
-            for each in items:
-                name = each.name
+            for item in items:
+                name = item.name
                 if not name or (seen[name] == 1 and name not in reserved):
                     continue
                 if name not in known:
@@ -394,12 +394,12 @@ def _rename_apart(models: Mapping[str, ir.Model], public: Collection[str]) -> No
                         free += "_"
                     used.add(free)
                     known[name] = free
-                each.name = known[name]
+                item.name = known[name]
 
-    apart({part: list(_inner_values(each)) for part, each in models.items()}, public)
+    apart({part: list(_inner_values(model)) for part, model in models.items()}, public)
     nodes = {
-        part: [node for body in graphs_of(each.graph) for node in body]
-        for part, each in models.items()
+        part: [node for body in graphs_of(model.graph) for node in body]
+        for part, model in models.items()
     }
     apart(nodes, ())
 
@@ -437,7 +437,7 @@ def _text(function: ir.Function) -> bytes:
 
 def _write_one_opset(parts: Parts, models: Mapping[str, ir.Model]) -> None:
     """Write every part in the newest opset of all, or refuse."""
-    opsets = {part: opset_of(each) for part, each in models.items()}
+    opsets = {part: opset_of(model) for part, model in models.items()}
     newest = max(opsets, key=opsets.__getitem__)
     for part, opset in opsets.items():
         if opset == opsets[newest] or not opset:

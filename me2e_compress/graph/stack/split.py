@@ -92,7 +92,7 @@ def _cut(model: ir.Model, file: Part, inputs: Values, outputs: Values) -> ir.Mod
 def _rename(graph: ir.Graph, file: Part, inputs: Values, outputs: Values) -> None:
     """Give inputs and outputs the names of the part's file, in its order."""
     inner = [value for node in graph for value in node.outputs]
-    others = {str(each.name): each for each in (*graph.initializers.values(), *inner)}
+    others = {str(v.name): v for v in (*graph.initializers.values(), *inner)}
 
     def name_it(value: ir.Value, name: str) -> None:
         # An inner value of that name gives way

@@ -88,7 +88,7 @@ class StackFile(pydantic.BaseModel):
 
     @pydantic.model_validator(mode="after")
     def _once(self) -> Self:
-        names = [each.name for each in self.part]
+        names = [entry.name for entry in self.part]
         if twice := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"two parts are called {twice[0]}")
         return self
