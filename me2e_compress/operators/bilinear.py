@@ -172,13 +172,8 @@ def _neighbours(
         (call.add("Add", [low, one]), part),
     ):
         # A neighbour outside of the map counts as zero
-        inside = call.add(
-            "And",
-            [
-                call.add("GreaterOrEqual", [edge, call.numbers(0.0, pixel)]),
-                call.add("Less", [edge, size]),
-            ],
-        )
+        above = call.add("GreaterOrEqual", [edge, call.numbers(0.0, pixel)])
+        inside = call.add("And", [above, call.add("Less", [edge, size])])
         found.append((call.cast(edge, ir.DataType.INT64), inside, share))
     return found
 

@@ -97,29 +97,24 @@ class Rotate(Operator):
         cosine, sine = call.add("Cos", [turn]), call.add("Sin", [turn])
         kind = angle.dtype or ir.DataType.FLOAT
         # Pixel centres relative to the centre of rotation
-        middles = []  # of a pixel, from the center of rotation
+        middles = []
         for axis, at in zip((2, 1), call.split_last(center, 2), strict=True):
             counted = call.cast(call.counting(call.size(image, axis)), kind)
             half = call.add("Add", [counted, call.numbers(0.5, counted)])
             middles.append((call.add("Sub", [half, at]), at))
         (across, x), (down, y) = middles
         down = call.unsqueeze(down, (1,))
+
         # Rotate, and move back
-        turned = (
-            call.add(
-                "Sub",
-                [call.add("Mul", [cosine, across]), call.add("Mul", [sine, down])],
-            ),
-            call.add(
-                "Add",
-                [call.add("Mul", [sine, across]), call.add("Mul", [cosine, down])],
-            ),
-        )
+        def turned(how: str, one: ir.Value, two: ir.Value) -> ir.Value:
+            products = [call.add("Mul", [one, across]), call.add("Mul", [two, down])]
+            return call.add(how, products)
+
+        ends = turned("Sub", cosine, sine), turned("Add", sine, cosine)
         half = call.numbers(0.5, angle)
-        moved = (call.add("Sub", [at, half]) for at in (x, y))
         one, two = (
-            call.add("Add", [at, start])
-            for at, start in zip(turned, moved, strict=True)
+            call.add("Add", [end, call.add("Sub", [start, half])])
+            for end, start in zip(ends, (x, y), strict=True)
         )
         return one, two
 
