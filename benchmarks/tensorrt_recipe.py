@@ -1,7 +1,10 @@
 """The recipes that ship with their int8 for TensorRT, as the kept figures are."""
 
+import dataclasses
+
 from me2e_compress.manager import recipe
 from me2e_compress.passes import Pass
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
 
 
 def for_tensorrt(name: str) -> tuple[Pass, ...]:
@@ -11,6 +14,8 @@ def for_tensorrt(name: str) -> tuple[Pass, ...]:
         RecipeError: there is no such recipe.
     """
     return tuple(
-        each.with_options({"target": "tensorrt"}) if each.quantizes else each
+        dataclasses.replace(each, target="tensorrt")
+        if isinstance(each, QuantizeInt8)
+        else each
         for each in recipe.load(name)
     )

@@ -11,19 +11,20 @@ from typing import TypeAlias
 import onnx_ir as ir
 
 from me2e_compress.calibration.stream import Recording
+from me2e_compress.display import counted
 from me2e_compress.errors import FramesError, GraphError, Me2eError
 from me2e_compress.fidelity.first_difference import find_first_difference
 from me2e_compress.graph.nodes import DRAWS, bodies_of, reads_of
-from me2e_compress.manager import runtime_levels
-from me2e_compress.manager.output_errors import (
+from me2e_compress.manager import pieces, runtime_levels
+from me2e_compress.manager.report import Verification
+from me2e_compress.manager.verification_inputs import (
     TOLERANCES,
+    Outputs,
+    VerificationInputs,
     errors,
     relative,
     tolerances,
 )
-from me2e_compress.manager.pieces import Pieces, show
-from me2e_compress.manager.report import Verification
-from me2e_compress.manager.verification_inputs import Outputs, VerificationInputs
 from me2e_compress.runtime.session import Session, replay, run_once
 
 NUDGES = 3
@@ -53,14 +54,14 @@ def verify(
     (:mod:`me2e_compress.manager.pieces`), then without onnxruntime's own optimizations
     (:mod:`me2e_compress.manager.runtime_levels`).
     """
-    found = _verify_outputs(passes, before, after, inputs)
+    result = _verify_outputs(passes, before, after, inputs)
     if not after.functions.keys() - before.functions.keys():
-        return found
-    gaps, allowed = dict(found.errors), dict(found.tolerances)
+        return result
+    gaps, allowed = dict(result.errors), dict(result.tolerances)
     for op_type, error, tolerance in _body_errors(before, after, inputs):
         name = f"the body of {op_type}"
         gaps[name], allowed[name] = max(gaps.get(name, 0.0), error), tolerance
-    return dataclasses.replace(found, errors=gaps, tolerances=allowed)
+    return dataclasses.replace(result, errors=gaps, tolerances=allowed)
 
 
 def _verify_outputs(
@@ -69,33 +70,50 @@ def _verify_outputs(
     after: ir.Model,
     inputs: VerificationInputs,
 ) -> Verification:
-    # a session is gone before the next one opens
+    # At the runtime's full level; a session is gone before the next one opens
     left = list(inputs.run(before))
     allowed = tolerances(left[0])
     try:
         gaps = errors(left, inputs.run(after))
     except GraphError:
         gaps = dict.fromkeys(left[0], float("inf"))
-    found = Verification(
+    result = Verification(
         passes, inputs.kind, gaps, allowed,
         random=random_outputs(before), sizes=tuple(map(dict, inputs.sizes)),
     )  # fmt: skip
-    if passed(found):
-        return found
-    pieces = _by_pieces(found, before, after, inputs)
-    if pieces.proven is not None:
-        return pieces.proven
+    if result.passed:
+        return result
+    # Piece by piece, then without what rounding alone moves as far
+    proven, breach = _by_pieces(result, before, after, inputs)
+    if proven is not None:
+        return proven
     rounding = unsteadiness(before, left, inputs)
     unsteady = tuple(
-        name for name in found.judged if allowed[name] < gaps[name] <= rounding[name]
+        name for name in result.judged if allowed[name] < gaps[name] <= rounding[name]
     )
-    steady = dataclasses.replace(found, unsteady=unsteady)
-    if pieces.breach:
-        return found if passed(steady) else steady
-    if passed(steady):
+    steady = dataclasses.replace(result, unsteady=unsteady)
+    if breach:
+        return result if steady.passed else steady
+    if steady.passed:
         return steady
-    found = steady
-    return _without_optimizations(found, before, after, inputs)
+    # By the nodes as they stand, where onnxruntime's rewrites are what differs
+    try:
+        plain_gaps = errors(inputs.run(before, "none"), inputs.run(after, "none"))
+    except GraphError:
+        return steady
+    plain = dataclasses.replace(steady, errors=plain_gaps)
+    if not plain.passed:
+        return steady
+    wrong = [name for name in steady.judged if gaps[name] > allowed[name]]
+    graphs = {"before the passes": before, "after the passes": after}
+    remarks = [
+        sentence
+        for what, model in graphs.items()
+        for sentence in runtime_levels.disagreements(
+            what, model, wrong, allowed, inputs
+        )
+    ]
+    return dataclasses.replace(plain, remarks=tuple(remarks))
 
 
 def unsteadiness(
@@ -106,7 +124,7 @@ def unsteadiness(
     Args:
         model: the graph.
         answers: what it gave on them.
-        inputs: what it was fed.
+        inputs: what it was run on.
 
     Returns:
         Output name -> the largest max|a-b|/max|a| of ``NUDGES`` trials.
@@ -119,81 +137,57 @@ def unsteadiness(
     return worst
 
 
-@dataclasses.dataclass(frozen=True)
-class _ByPieces:
-    """What comparing pieces says: a proof, a breach, or neither."""
-
-    proven: Verification | None = None
-    breach: bool = False
-
-
 def _by_pieces(
     result: Verification, before: ir.Model, after: ir.Model, inputs: VerificationInputs
-) -> _ByPieces:
-    """Judge each piece between steps.
+) -> tuple[Verification | None, bool]:
+    """Judge each piece between steps: a proof, or none and whether there is a breach.
 
     A piece that differs by more than rounding moves it is a breach of the promise,
     however far rounding moves the outputs behind it.
     """
+    steps = pieces.steps_behind_changes(before, after)
+    if not steps:
+        return None, False
     try:
-        pieces = Pieces.of(before, after)
-        if pieces is None:
-            return _ByPieces()
-        errors = pieces.errors(inputs)
-        gaps = {name: errors.outputs[name] for name in result.judged} | errors.operands
-        limits = result.tolerances | errors.tolerances
-        wrong = [name for name, gap in gaps.items() if gap > limits[name]]
+        (gaps,), limits = pieces.piece_errors(before, [(after, inputs)], steps, inputs)
+        operands = list(pieces.operand_names(steps).values())
+        limits = result.tolerances | limits
+        wrong = [n for n in (*result.judged, *operands) if gaps[n] > limits[n]]
         if not wrong:
-            remarks = (errors.remark,)
-            return _ByPieces(
-                dataclasses.replace(result, errors=errors.outputs, remarks=remarks)
+            worst = max(operands, key=lambda name: gaps[name])
+            remark = (
+                "compared piece by piece, since behind a quantizer or a choice rounding"
+                f" alone is a whole step: {counted(len(operands), 'operand')} of such"
+                f" nodes are the same (off by {gaps[worst]:.1e} of its range at"
+                f" most, {worst}; allowed {limits[worst]:.0e})"
             )
-        moved = pieces.rounding(inputs, NUDGES)
+            outputs = {name: gaps[name] for name in gaps if name not in operands}
+            return dataclasses.replace(result, errors=outputs, remarks=(remark,)), False
+        # Inputs and weights of the first graph, changed in their last places
+        trials = [
+            (pieces.nudged_weights(before, seed), inputs.nudged(seed))
+            for seed in range(NUDGES)
+        ]
+        moved, _ = pieces.piece_errors(before, trials, steps, inputs)
     except (FramesError, GraphError):
-        return _ByPieces()
-    rounding = moved.outputs | moved.operands
-    return _ByPieces(breach=any(gaps[name] > rounding[name] for name in wrong))
-
-
-def _without_optimizations(
-    found: Verification, before: ir.Model, after: ir.Model, inputs: VerificationInputs
-) -> Verification:
-    """Judge by the nodes as they stand, where onnxruntime's rewrites are what differs.
-
-    Returns:
-        The verification given, where the graphs differ all the same.
-    """
-    try:
-        gaps = errors(inputs.run(before, "none"), inputs.run(after, "none"))
-    except GraphError:
-        return found
-    plain = dataclasses.replace(found, errors=gaps)
-    if not passed(plain):
-        return found
-    allowed = found.tolerances
-    graphs = {"before the passes": before, "after the passes": after}
-    wrong = [name for name in found.judged if found.errors[name] > allowed[name]]
-    remarks = runtime_levels.disagreements(graphs, wrong, allowed, inputs)
-    return dataclasses.replace(plain, remarks=remarks)
+        return None, False
+    return None, any(gaps[n] > max(trial[n] for trial in moved) for n in wrong)
 
 
 def where(before: ir.Model, after: ir.Model, inputs: VerificationInputs) -> str:
-    """Name the first module of a changed graph whose values differ, if one is found."""
+    """Name the first module of a changed graph whose values differ, if there is one."""
     try:
-        found = find_first_difference(before, after, inputs.frames, inputs.provider)
+        first = find_first_difference(
+            before, after, inputs.frames, inputs.provider
+        ).first
     except Me2eError:
         return ""
-    return "" if found.first is None else f"; first difference: {found.first}"
+    return "" if first is None else f"; first difference: {first}"
 
 
 def skipped(passes: tuple[str, ...], why: str) -> Verification:
     """Say that nothing was measured, and why."""
     return Verification(passes, "none", {}, {}, why)
-
-
-def passed(result: Verification) -> bool:
-    """Say whether every output that is judged stayed within its tolerance."""
-    return all(result.errors[n] <= result.tolerances[n] for n in result.judged)
 
 
 def random_outputs(model: ir.Model) -> tuple[str, ...]:
@@ -251,8 +245,8 @@ def _body_errors(
         assert call is not None
         for place, value in enumerate(call.inputs):
             if value is not None:
-                show(bare, value, _name(node, place))
-        show(bare, call.outputs[0], _name(node, None))
+                pieces.show(bare, value, _name(node, place))
+        pieces.show(bare, call.outputs[0], _name(node, None))
     first = dataclasses.replace(inputs, frames=inputs.frames[:1])
     (values,) = first.run(bare)
     for identifier, node in calls.items():

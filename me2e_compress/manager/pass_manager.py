@@ -26,7 +26,7 @@ from me2e_compress.manager.equivalence import TryFirst
 from me2e_compress.manager.recipe import to_text
 from me2e_compress.manager.report import LossyPass, Report, Step, Verification
 from me2e_compress.manager.verification_inputs import VerificationInputs
-from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.base import Context, Pass
 from me2e_compress.passes.import_normalize import ImportNormalize, needs_import
 
 NOT_ASKED = "no frame was asked for (--verify-frames 0)"
@@ -73,34 +73,31 @@ class PassManager:
             VerificationError: a pass broke the contract or changed the outputs.
         """
         with collector_paused():
-            report = self._run(model.clone(), context, progress or _silent)
+            say = progress or (lambda done, total, what: None)
+            report = self._run(model.clone(), context, say)
             return dataclasses.replace(report, read_as=lowered(model))
 
     def _run(self, model: ir.Model, context: Context, progress: Progress) -> Report:
         graph.infer_shapes(model)
-        passes = self._with_import(model)
-        books = _Books(self, context, checkpoint=model)
+        passes = self.passes
+        first = passes[0].name if passes else ""
+        if needs_import(model) and first != ImportNormalize.name:
+            passes = (ImportNormalize(), *passes)
+        run = _Run(self, context, checkpoint=model)
         for done, current in enumerate(passes):
             progress(done, len(passes), current.name)
             if not current.exact:
-                books.verify(model)
-            model = books.transact(current, model)
+                run.verify(model)
+            model = run.transact(current, model)
         progress(len(passes), len(passes), "verify")
-        books.verify(model)
+        run.verify(model)
         return Report(
             model,
             to_text(passes),
-            tuple(books.steps),
-            tuple(books.verifications),
-            tuple(books.lossy),
+            tuple(run.steps),
+            tuple(run.verifications),
+            tuple(run.lossy),
         )
-
-    def _with_import(self, model: ir.Model) -> tuple[Pass, ...]:
-        known = not needs_import(model)
-        first = self.passes[0].name if self.passes else ""
-        if known or first == ImportNormalize.name:
-            return self.passes
-        return (ImportNormalize(), *self.passes)
 
 
 @contextlib.contextmanager
@@ -118,11 +115,7 @@ def collector_paused() -> Iterator[None]:
             gc.enable()
 
 
-def _silent(done: int, total: int, what: str) -> None:
-    """Tell nobody."""
-
-
-class _Books:
+class _Run:
     """The state of one run: steps done, and the stretch not verified yet."""
 
     def __init__(
@@ -145,15 +138,19 @@ class _Books:
         """
         # Run and check: a copy is changed, and the contract compares both.
         start = process_time()
-        found = attempt(current, model, self.context, self._digest)
-        if isinstance(found, PassError | VerificationError):
-            blame_file(current.name, model, found)
-            raise self._with_reproducer(current, model, found) from found.__cause__
-        if isinstance(found, Me2eError):
-            raise found
+        try:
+            result, self._digest = attempt(current, model, self.context, self._digest)
+        except (PassError, VerificationError) as error:
+            blame_file(current.name, model, error)
+            raise self._with_reproducer(current, model, error) from error.__cause__
         # Commit: what the next pass is given has its shapes, and is hashed once.
-        result, self._digest = found.result, found.digest
-        self._enter(current, result, process_time() - start)
+        size, self._size = self._size, graph.size(result.model)
+        self.steps.append(
+            Step(
+                *(current.name, to_text((current,)), current.exact, result.changes),
+                *(process_time() - start, size, self._size, result.notes),
+            )
+        )
         if not current.exact:
             self.lossy.append(LossyPass(current, model, result.changes))
         elif result.changes and self.manager.verify_frames:
@@ -176,7 +173,7 @@ class _Books:
             self.manager.try_first(model, what, self._frames())
         found, runnable, inputs = self._compare(stretch, model)
         self.verifications.append(found)
-        if equivalence.passed(found) or inputs is None:
+        if found.passed or inputs is None:
             return
         current, guilty, changed = _bisect(runnable, model, inputs)
         worst = max(found.judged, key=lambda name: found.errors[name])
@@ -226,16 +223,6 @@ class _Books:
         begins = "what is proven begins with what it made"
         return tuple(f"not proven: {names[0]}, {n}: {reason}; {begins}" for n in notes)
 
-    def _enter(self, current: Pass, result: PassResult, seconds: float) -> None:
-        after = graph.size(result.model)
-        self.steps.append(
-            Step(
-                *(current.name, to_text((current,)), current.exact, result.changes),
-                *(seconds, self._size, after, result.notes),
-            )
-        )
-        self._size = after
-
     def _with_reproducer(
         self, current: Pass, model: ir.Model, error: Me2eError
     ) -> Me2eError:
@@ -264,7 +251,7 @@ def _bisect(
     while bad - good > 1:
         middle = (good + bad) // 2
         trial = equivalence.verify((), models[0], models[middle], inputs)
-        good, bad = (middle, bad) if equivalence.passed(trial) else (good, middle)
+        good, bad = (middle, bad) if trial.passed else (good, middle)
     return *stretch[good], models[bad]
 
 
@@ -272,16 +259,16 @@ def _fails_alike(
     current: Pass, part: ir.Model, context: Context, error: Me2eError
 ) -> bool:
     """Say whether a part of the graph shows the failure that the whole shows."""
-    result = attempt(current, part, context)
-    if isinstance(result, Me2eError):
-        return type(result) is type(error)
+    try:
+        result, _ = attempt(current, part, context)
+    except Me2eError as other:
+        return type(other) is type(error)
     if not current.exact or isinstance(error, PassError):
         return False
     try:
         inputs = VerificationInputs.of(
             part, None, context.seed, 1, provider=context.provider
         )
-        found = equivalence.verify((), part, result.result.model, inputs)
+        return not equivalence.verify((), part, result.model, inputs).passed
     except (GraphError, PreconditionError):
         return False
-    return not equivalence.passed(found)

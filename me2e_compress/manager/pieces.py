@@ -9,14 +9,12 @@ outputs have.
 """
 
 import dataclasses
-import functools
 from collections.abc import Mapping, Sequence
-from typing import Self
+from typing import TypeAlias
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.display import counted
 from me2e_compress.graph.nodes import (
     FLOATS,
     array_of,
@@ -27,9 +25,13 @@ from me2e_compress.graph.nodes import (
 )
 from me2e_compress.graph.provenance import is_same
 from me2e_compress.graph.rewrite import sweep
-from me2e_compress.manager.output_errors import TOLERANCES, relative
-from me2e_compress.manager.verification_inputs import VerificationInputs, nudge
-from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.manager.verification_inputs import (
+    TOLERANCES,
+    VerificationInputs,
+    nudge,
+    relative,
+)
+from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import Session
 
 STEPS = frozenset(
@@ -46,41 +48,7 @@ _OPERAND, _ANSWER = "piece/operand", "piece/answer"
 
 
 @dataclasses.dataclass(frozen=True)
-class PieceErrors:
-    """How far two graphs are apart between their steps, over all frames.
-
-    Attributes:
-        outputs: max|a-b|/max|a| by output.
-        operands: the same of what steps read, by operand and first output of the step.
-        tolerances: how large those may be, by their dtypes.
-    """
-
-    outputs: dict[str, float]
-    operands: dict[str, float]
-    tolerances: dict[str, float]
-
-    def worst(self, other: Self) -> Self:
-        """Return the larger errors of the two."""
-        return type(self)(
-            _larger(self.outputs, other.outputs),
-            _larger(self.operands, other.operands),
-            other.tolerances,
-        )
-
-    @property
-    def remark(self) -> str:
-        """What was compared, and the operand that is farthest off."""
-        worst = max(self.operands, key=lambda name: self.operands[name])
-        return (
-            "compared piece by piece, since behind a quantizer or a choice rounding"
-            f" alone is a whole step: {counted(len(self.operands), 'operand')} of such"
-            f" nodes are the same (off by {self.operands[worst]:.1e} of its range at"
-            f" most, {worst}; allowed {self.tolerances[worst]:.0e})"
-        )
-
-
-@dataclasses.dataclass(frozen=True)
-class _Step:
+class Step:
     """A step that both graphs have, by the names of its outputs.
 
     ``operands`` are the places of those inputs that are not one constant in both.
@@ -90,85 +58,69 @@ class _Step:
     operands: tuple[int, ...]
 
 
-@dataclasses.dataclass(frozen=True)
-class Pieces:
-    """A graph, another one, and the steps behind what differs in them.
+Errors: TypeAlias = dict[str, float]
+"""max|a-b|/max|a| by output, and by operand of a step (`operand_names`)."""
 
-    Both run their nodes as they stand, one frame after the other; recurrent state, too,
-    is that of the first. Methods raise GraphError where onnxruntime cannot run one.
+
+def operand_names(steps: Sequence[Step]) -> dict[str, str]:
+    """Map what a graph gives of the operands of steps to how messages call them."""
+    return {
+        _name(_OPERAND, index, place): f"operand {place} of {step.outputs[0]}"
+        for index, step in enumerate(steps)
+        for place in step.operands
+    }
+
+
+def piece_errors(
+    before: ir.Model,
+    others: Sequence[tuple[ir.Model, VerificationInputs]],
+    steps: Sequence[Step],
+    inputs: VerificationInputs,
+) -> tuple[list[Errors], Errors]:
+    """Run a graph once, and others on what its steps gave; nodes run as they stand.
+
+    Args:
+        before: the first graph; recurrent state, too, is its own.
+        others: graphs that have its steps, and what each is run on.
+        steps: those that both have.
+        inputs: what the first is run on.
+
+    Returns:
+        The largest errors of each over all frames, and how large those of operands may
+        be, by their dtypes.
+
+    Raises:
+        GraphError: onnxruntime cannot run one.
     """
-
-    before: ir.Model
-    after: ir.Model
-    steps: tuple[_Step, ...]
-
-    @classmethod
-    def of(cls, before: ir.Model, after: ir.Model) -> Self | None:
-        """Return the pieces of two graphs; None where no step is behind a change."""
-        steps = steps_behind_changes(before, after)
-        return cls(before, after, steps) if steps else None
-
-    def errors(self, inputs: VerificationInputs) -> PieceErrors:
-        """Compare what the second graph computes with what the first does."""
-        (errors,) = self._errors(inputs, [(self.after, inputs)])
-        return errors
-
-    def rounding(self, inputs: VerificationInputs, trials: int) -> PieceErrors:
-        """Measure how far rounding alone moves each piece: the largest of some trials.
-
-        Inputs and weights of the first graph are changed in their last places.
-        """
-        moved = [(_nudged(self.before, t), inputs.nudged(t)) for t in range(trials)]
-        return functools.reduce(PieceErrors.worst, self._errors(inputs, moved))
-
-    def _errors(
-        self,
-        inputs: VerificationInputs,
-        others: Sequence[tuple[ir.Model, VerificationInputs]],
-    ) -> list[PieceErrors]:
-        """Run the first graph once, and others on what its steps gave."""
-        results = [PieceErrors({}, {}, {}) for _ in others]
-        provider, steps = inputs.provider, self.steps
-        sessions = [
-            Session(
-                _continued(model, steps),
-                optimize="none", release=True, provider=provider,
-            )
-            for model, _ in others
-        ]  # fmt: skip
-        state: Mapping[str, Array] = {}
-        runs = inputs.run(_observed(self.before, steps), "none")
-        for index, left in enumerate(runs):
-            for place, (_, own) in enumerate(others):
-                session = sessions[place]
-                right = session.run(_feeds(own.frames[index], state, left, session))
-                results[place] = results[place].worst(self._frame_errors(left, right))
-            recurrent = sessions[0].recurrent.items()
-            state = {name: left[answer] for name, answer in recurrent}
-        return results
-
-    def _frame_errors(
-        self, left: Mapping[str, Array], right: Mapping[str, Array]
-    ) -> PieceErrors:
-        steps = {
-            _name(_OPERAND, index, place): f"operand {place} of {step.outputs[0]}"
-            for index, step in enumerate(self.steps)
-            for place in step.operands
-        }
-        errors = {name: relative(left[name], value) for name, value in right.items()}
-        limits = {name: TOLERANCES.get(right[name].dtype.name, 0.0) for name in steps}
-        return PieceErrors(
-            {name: error for name, error in errors.items() if name not in steps},
-            {steps[name]: errors[name] for name in steps},
-            {steps[name]: limit for name, limit in limits.items()},
+    names, provider = operand_names(steps), inputs.provider
+    worst, allowed = [Errors() for _ in others], Errors()
+    sessions = [
+        Session(
+            _continued(model, steps), optimize="none", release=True, provider=provider
         )
+        for model, _ in others
+    ]
+    state: Mapping[str, Array] = {}
+    for index, left in enumerate(inputs.run(_observed(before, steps), "none")):
+        for session, errors, (_, own) in zip(sessions, worst, others, strict=True):
+            # A frame, and state and answers of the first graph
+            frame = own.frames[index]
+            if frame.starts_scene:
+                state = session.first_state(frame.arrays)
+            answers = {name: left[name] for name in left if name in session.inputs}
+            right = session.run({**frame.arrays, **state, **answers})
+            for name, value in right.items():
+                called = names.get(name, name)
+                error = relative(left[name], value)
+                errors[called] = max(errors.get(called, 0.0), error)
+                if name in names:
+                    allowed[called] = TOLERANCES.get(value.dtype.name, 0.0)
+        recurrent = sessions[0].recurrent.items()
+        state = {name: left[answer] for name, answer in recurrent}
+    return worst, allowed
 
 
-def _larger(one: Mapping[str, float], other: Mapping[str, float]) -> dict[str, float]:
-    return {name: max(one.get(name, 0.0), error) for name, error in other.items()}
-
-
-def _nudged(model: ir.Model, seed: int) -> ir.Model:
+def nudged_weights(model: ir.Model, seed: int) -> ir.Model:
     """Return a copy whose float weights are moved by a few units in the last place."""
     copy, signs = model.clone(), np.random.default_rng(seed)
     for value in copy.graph.initializers.values():
@@ -178,26 +130,13 @@ def _nudged(model: ir.Model, seed: int) -> ir.Model:
     return copy
 
 
-def _feeds(
-    frame: Frame,
-    state: Mapping[str, Array],
-    left: Mapping[str, Array],
-    session: Session,
-) -> dict[str, Array]:
-    """Return what another graph reads: a frame, state and answers of the first."""
-    if frame.starts_scene:
-        state = session.first_state(frame.arrays)
-    answers = {name: value for name, value in left.items() if name in session.inputs}
-    return {**frame.arrays, **state, **answers}
-
-
-def steps_behind_changes(before: ir.Model, after: ir.Model) -> tuple[_Step, ...]:
-    """Find the steps of both graphs that read what a pass changed, first ones alone.
+def steps_behind_changes(before: ir.Model, after: ir.Model) -> tuple[Step, ...]:
+    """Return the steps of both graphs that read what a pass changed, first ones alone.
 
     Behind a step nothing counts as changed, until another node is.
     """
     makers = {value.name: node for node in before.graph for value in node.outputs}
-    changed, steps = set[ir.Value](), list[_Step]()
+    changed, steps = set[ir.Value](), list[Step]()
     for node in after.graph:
         twin = makers.get(node.outputs[0].name) if node.outputs else None
         moved = not changed.isdisjoint(reads_of(node))
@@ -207,7 +146,7 @@ def steps_behind_changes(before: ir.Model, after: ir.Model) -> tuple[_Step, ...]
             if operands is not None:
                 if moved or _reads_others(twin, node):
                     outputs = tuple(str(v.name) for v in node.outputs if v.name)
-                    steps.append(_Step(outputs, operands))
+                    steps.append(Step(outputs, operands))
                 continue
         if moved or twin is None or not alike or _reads_others(twin, node):
             changed.update(node.outputs)
@@ -238,17 +177,18 @@ def _is_alike(twin: ir.Node, node: ir.Node, before: ir.Model, after: ir.Model) -
 
 def _reads_others(twin: ir.Node, node: ir.Node) -> bool:
     """Return whether one of two nodes reads another value, or another constant."""
-    return any(
-        (mine is None) != (theirs is None)
-        or (mine is not None and theirs is not None and not _is_one(mine, theirs))
-        for mine, theirs in zip(twin.inputs, node.inputs, strict=True)
-    )
-
-
-def _is_one(mine: ir.Value, theirs: ir.Value) -> bool:
-    if mine.name != theirs.name or mine.is_initializer() != theirs.is_initializer():
-        return False
-    return mine.const_value is theirs.const_value or _is_one_constant(mine, theirs)
+    for mine, theirs in zip(twin.inputs, node.inputs, strict=True):
+        if mine is None or theirs is None:
+            if mine is not theirs:
+                return True
+            continue
+        kinds = mine.is_initializer(), theirs.is_initializer()
+        same = mine.const_value is theirs.const_value
+        if mine.name != theirs.name or kinds[0] != kinds[1]:
+            return True
+        if not same and not _is_one_constant(mine, theirs):
+            return True
+    return False
 
 
 def _is_one_constant(mine: ir.Value, theirs: ir.Value) -> bool:
@@ -272,7 +212,9 @@ def _operands(twin: ir.Node, node: ir.Node) -> tuple[int, ...] | None:
     return tuple(places)
 
 
-def _observed(model: ir.Model, steps: tuple[_Step, ...]) -> ir.Model:
+def _observed(
+    model: ir.Model, steps: Sequence[Step], *, answers: bool = True
+) -> ir.Model:
     """Return a copy that also gives what each step reads, and what it gives."""
     copy = model.clone()
     values = {value.name: value for node in copy.graph for value in node.outputs}
@@ -281,20 +223,15 @@ def _observed(model: ir.Model, steps: tuple[_Step, ...]) -> ir.Model:
         assert node is not None
         for place in step.operands:
             show(copy, node.inputs[place], _name(_OPERAND, index, place))
-        for place, name in enumerate(step.outputs):
+        for place, name in enumerate(step.outputs if answers else ()):
             show(copy, values[name], _name(_ANSWER, index, place))
     return copy
 
 
-def _continued(model: ir.Model, steps: tuple[_Step, ...]) -> ir.Model:
+def _continued(model: ir.Model, steps: Sequence[Step]) -> ir.Model:
     """Return a copy that gives what each step reads, and is fed what each gives."""
-    copy = model.clone()
+    copy = _observed(model, steps, answers=False)
     values = {value.name: value for node in copy.graph for value in node.outputs}
-    for index, step in enumerate(steps):
-        node = values[step.outputs[0]].producer()
-        assert node is not None
-        for place in step.operands:
-            show(copy, node.inputs[place], _name(_OPERAND, index, place))
     for index, step in enumerate(steps):
         for place, name in enumerate(step.outputs):
             _feed(copy, values[name], _name(_ANSWER, index, place))

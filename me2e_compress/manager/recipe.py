@@ -16,7 +16,6 @@ import dataclasses
 import json
 from collections.abc import Iterable, Mapping
 from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from me2e_compress.errors import RecipeError
@@ -45,31 +44,33 @@ def load(name: str | Path) -> tuple[Pass, ...]:
         RecipeError: no such recipe, not TOML, or a pass or option nobody knows.
     """
     path, beside = Path(name), Path()
-    source: Traversable | None = None
-    if path.is_file():
-        beside = path.parent
-    elif str(name) in shipped():
-        source = resources.files("me2e_compress") / "recipes" / f"{name}.toml"
-    else:
-        raise RecipeError(
-            f"no recipe {name}: no such file; we ship {', '.join(shipped())}"
-        )
     try:
-        content = documents.from_toml(
-            documents.content(path) if source is None else source.read_bytes()
-        )
+        if path.is_file():
+            content, beside = documents.content(path), path.parent
+        elif str(name) in shipped():
+            folder = resources.files("me2e_compress") / "recipes"
+            content = (folder / f"{name}.toml").read_bytes()
+        else:
+            raise RecipeError(
+                f"no recipe {name}: no such file; we ship {', '.join(shipped())}"
+            )
+        entries = documents.from_toml(content).get("pass")
     except documents.MalformedError as error:
         raise RecipeError(f"{name} is not TOML: {error}") from error
-    entries = content.get("pass")
     listed = entries if isinstance(entries, list) else []
     if not listed or not all(isinstance(entry, dict) for entry in listed):
         raise RecipeError(f"{name} has no [[pass]]")
     built: list[Pass] = []
     for entry in listed:
         options = dict(entry)
-        built.append(
-            _beside(PASSES.build(str(options.pop("name", "")), options), beside)
-        )
+        current = PASSES.build(str(options.pop("name", "")), options)
+        # Files that it names are in the folder of its recipe
+        files = {
+            field.name: beside / value
+            for field in dataclasses.fields(current)
+            if isinstance(value := getattr(current, field.name), Path)
+        }
+        built.append(dataclasses.replace(current, **files))
     return tuple(built)
 
 
@@ -89,16 +90,15 @@ def to_text(passes: Iterable[Pass]) -> str:
 
 def to_toml(passes: Iterable[Pass]) -> str:
     """Write passes as a recipe file; options at their default are left out."""
-    return "\n".join(map(_entry, passes))
-
-
-def _entry(each: Pass) -> str:
-    lines = ["[[pass]]", f"name = {_value(each.name)}"]
-    for field in fields_of(type(each)):
-        value = getattr(each, field.name)
-        if value is not None and is_written(field, value):
-            lines.append(f"{field.name} = {_value(value)}")
-    return "\n".join(lines) + "\n"
+    entries: list[str] = []
+    for current in passes:
+        lines = ["[[pass]]", f"name = {_value(current.name)}"]
+        for field in fields_of(type(current)):
+            value = getattr(current, field.name)
+            if value is not None and is_written(field, value):
+                lines.append(f"{field.name} = {_value(value)}")
+        entries.append("\n".join(lines) + "\n")
+    return "\n".join(entries)
 
 
 def _value(value: object) -> str:
@@ -113,13 +113,3 @@ def _value(value: object) -> str:
     if isinstance(value, bool | int | float):
         return str(value).lower()
     return json.dumps(str(value), ensure_ascii=False)
-
-
-def _beside(current: Pass, folder: Path) -> Pass:
-    """Look for the files that a pass names in the folder of its recipe."""
-    files = {
-        field.name: folder / value
-        for field in dataclasses.fields(current)
-        if isinstance(value := getattr(current, field.name), Path)
-    }
-    return dataclasses.replace(current, **files)

@@ -9,14 +9,7 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.display import (
-    AT_LEAST,
-    Table,
-    counted,
-    giga,
-    megabytes,
-    table,
-)
+from me2e_compress.display import AT_LEAST, Table, counted, giga, megabytes, table
 from me2e_compress.graph import Size
 from me2e_compress.passes.base import Pass
 
@@ -106,6 +99,11 @@ class Verification:
         return tuple(name for name in self.errors if name not in left_out)
 
     @property
+    def passed(self) -> bool:
+        """Whether every output that is judged stayed within its tolerance."""
+        return all(self.errors[n] <= self.tolerances[n] for n in self.judged)
+
+    @property
     def unproven(self) -> str | None:
         """Why no output says that the passes are exact; None where one does."""
         if self.skipped is not None:
@@ -158,7 +156,7 @@ class Report:
 
     def tables(self) -> tuple[Table, ...]:
         """Return pass by pass what changed, and how exact passes were checked."""
-        return steps_table(self.steps), verification_table(self.verifications)
+        return _steps_table(self.steps), _verification_table(self.verifications)
 
     def record(self, source: Path, output: Path) -> dict[str, object]:
         """Give everything but the weights, ready for JSON.
@@ -167,13 +165,13 @@ class Report:
             source: the file that was compressed.
             output: the file that was written; both are hashed as they are on disk.
         """
+        files = [
+            {"file": file.name, "sha256": graph.sha256_of(file)}
+            for file in (source, output)
+        ]
         return {
-            "source": {
-                "file": source.name,
-                "sha256": graph.sha256_of(source),
-                "read_as": self.read_as,
-            },
-            "output": {"file": output.name, "sha256": graph.sha256_of(output)},
+            "source": files[0] | {"read_as": self.read_as},
+            "output": files[1],
             "pipeline": self.pipeline,
             "steps": [dataclasses.asdict(step) for step in self.steps],
             "verifications": [
@@ -195,7 +193,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def steps_table(steps: Sequence[Step]) -> Table:
+def _steps_table(steps: Sequence[Step]) -> Table:
     """Show pass by pass what changed and what it cost, and what the passes say."""
     said = [f"{step.name}: {note}" for step in steps for note in step.notes]
     notes = [f"{counted(len(said), 'note')} from the passes: -v"] if said else []
@@ -221,7 +219,7 @@ def steps_table(steps: Sequence[Step]) -> Table:
     )
 
 
-def verification_table(verifications: Iterable[Verification]) -> Table:
+def _verification_table(verifications: Iterable[Verification]) -> Table:
     """Show how far exact passes moved the outputs."""
     rows, notes = list[tuple[str, ...]](), dict[str, None]()
     for check in verifications:

@@ -2,33 +2,13 @@
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph.nodes import reads_of
-
-# Cut a part out of a graph, to be run alone.
-
-
-def part_of(
-    model: ir.Model, inputs: Sequence[ir.Value], outputs: Sequence[ir.Value]
-) -> ir.Model:
-    """Return the nodes between some values of a graph as a model of their own.
-
-    Weights, functions and opsets come along. ValueError where the outputs need more
-    than these inputs.
-    """
-    body = ir.convenience.extract(model.graph, inputs, outputs)
-    body.opset_imports.update(model.graph.opset_imports)
-    return ir.Model(
-        body,
-        ir_version=model.ir_version,
-        functions=[function.clone() for function in model.functions.values()],
-    )
-
 
 PIPELINE = "pipeline.txt"
 """Says what fails, and by that whose folder it is."""
@@ -80,39 +60,40 @@ def window(model: ir.Model, start: int, stop: int) -> ir.Model | None:
         value.name: value
         for node in nodes
         for value in node.outputs
-        if value.name and (value.is_graph_output() or _leaves(value, inside))
+        if value.name
+        and (
+            value.is_graph_output()
+            or not inside.issuperset(value.consumers() or [None])
+        )
     }
     crossing = [*inputs.values(), *outputs.values()]
     if not outputs or any(v.type is None or v.shape is None for v in crossing):
         return None
-    part = part_of(model, list(inputs.values()), list(outputs.values()))
+    # Weights, functions and opsets come along
+    body = ir.convenience.extract(
+        model.graph, list(inputs.values()), list(outputs.values())
+    )
+    body.opset_imports.update(model.graph.opset_imports)
+    functions = [function.clone() for function in model.functions.values()]
+    part = ir.Model(body, ir_version=model.ir_version, functions=functions)
     part.metadata_props["me2e.reproducer"] = "part of a graph"
     return part
-
-
-def _leaves(value: ir.Value, inside: set[ir.Node]) -> bool:
-    readers = value.consumers()
-    return not readers or any(reader not in inside for reader in readers)
 
 
 def write(folder: Path, model: ir.Model, pipeline: str, seed: int, why: str) -> Path:
     """Write the piece, the pipeline that fails on it and the reason into a folder."""
     name = re.sub(r"[^a-z0-9]+", "-", pipeline.lower()).strip("-")[:60]
-    target = _free(folder / f"reproducer-{name}", pipeline)
-    target.mkdir(parents=True, exist_ok=True)
-    graph.save(model, target / "model.onnx")
-    (target / PIPELINE).write_text(pipeline + "\n", encoding="utf-8")
-    (target / "why.txt").write_text(f"{why}\nseed {seed}\n", encoding="utf-8")
-    return target
-
-
-def _free(wanted: Path, pipeline: str) -> Path:
-    """Return a folder that is not there, or holds the reproducer of this pipeline."""
+    wanted = folder / f"reproducer-{name}"
     target, count = wanted, 1
+    # A folder that is not there, or holds the reproducer of this pipeline
     while os.path.lexists(target):
         about = target / PIPELINE
         if about.is_file() and about.read_bytes() == f"{pipeline}\n".encode():
             break
         count += 1
         target = wanted.with_name(f"{wanted.name}-{count}")
+    target.mkdir(parents=True, exist_ok=True)
+    graph.save(model, target / "model.onnx")
+    (target / PIPELINE).write_text(pipeline + "\n", encoding="utf-8")
+    (target / "why.txt").write_text(f"{why}\nseed {seed}\n", encoding="utf-8")
     return target

@@ -4,7 +4,7 @@ It rewrites a graph when it opens it, at levels that do more and more; a rewrite
 wrong for a graph (there were some in every release) is not the fault of a pass.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 
 import onnx_ir as ir
@@ -12,55 +12,44 @@ import onnx_ir as ir
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import is_read, makers_of
 from me2e_compress.graph.rewrite import sweep
-from me2e_compress.manager.output_errors import errors, relative
-from me2e_compress.manager.verification_inputs import VerificationInputs
-from me2e_compress.runtime.frames import Array
+from me2e_compress.manager.verification_inputs import (
+    VerificationInputs,
+    errors,
+    relative,
+)
 from me2e_compress.runtime.session import Level, Session
 
 LEVELS: tuple[Level, ...] = ("basic", "extended", "layout", "all")
 
 
 def disagreements(
-    graphs: Mapping[str, ir.Model],
+    what: str,
+    model: ir.Model,
     outputs: Iterable[str],
     allowed: Mapping[str, float],
     inputs: VerificationInputs,
-) -> tuple[str, ...]:
-    """Say which graphs onnxruntime answers otherwise when it optimizes them, and where.
+) -> Iterator[str]:
+    """Say where onnxruntime answers a graph otherwise when it optimizes it.
 
     Args:
-        graphs: by what a sentence calls them.
+        what: how a sentence calls the graph.
+        model: the graph.
         outputs: those that are looked at.
         allowed: by how much of its largest value an output may differ.
-        inputs: what the graphs are fed.
+        inputs: what the graph is run on.
 
-    Returns:
-        A sentence for each graph and output: the first level, and the first node.
+    Yields:
+        A sentence for each output: the first level, and the first node.
     """
-    names = list(outputs)
-    return tuple(
-        sentence
-        for what, model in graphs.items()
-        for sentence in _of_graph(what, model, names, allowed, inputs)
-    )
-
-
-def _of_graph(
-    what: str,
-    model: ir.Model,
-    names: list[str],
-    allowed: Mapping[str, float],
-    inputs: VerificationInputs,
-) -> Iterator[str]:
-    plain, waiting = list(inputs.run(model, "none")), names
+    plain, waiting = list(inputs.run(model, "none")), list(outputs)
     for level in LEVELS:
         try:
             gaps = errors(plain, inputs.run(model, level))
         except GraphError:
             yield f"onnxruntime cannot run the graph {what} at its level {level}"
             return
-        for name in [each for each in waiting if gaps[each] > allowed[each]]:
-            waiting = [each for each in waiting if each != name]
+        for name in [name for name in waiting if gaps[name] > allowed[name]]:
+            waiting.remove(name)
             node = first_node(model, name, level, allowed[name], inputs)
             where = "" if node is None else f", from node {node.name} ({node.op_type})"
             yield (
@@ -90,11 +79,18 @@ def first_node(
     behind = [node for node in model.graph if node in makers]
 
     def differs(node: ir.Node) -> bool:
-        part = _up_to(model, node)
-        opened = partial(Session, part, provider=inputs.provider)
-        if int8_kernels:
-            opened = partial(opened, int8_kernels=True)
-        return _gap(opened, feeds, level) > allowed
+        opened = partial(
+            Session,
+            _up_to(model, node),
+            provider=inputs.provider,
+            int8_kernels=int8_kernels,
+        )
+        try:
+            plain = opened(optimize="none").run(feeds)
+            optimized = opened(optimize=level).run(feeds)
+        except (GraphError, FramesError):
+            return False  # an output of a type that cannot be compared, say
+        return any(relative(plain[n], optimized[n]) > allowed for n in plain)
 
     if not behind or not differs(behind[-1]):
         return None
@@ -115,15 +111,3 @@ def _up_to(model: ir.Model, node: ir.Node) -> ir.Model:
     part.graph.outputs.extend(made[name] for name in sorted(filter(None, names)))
     sweep(part)
     return part
-
-
-def _gap(
-    opened: Callable[..., Session], feeds: Mapping[str, Array], level: Level
-) -> float:
-    try:
-        plain, optimized = (
-            opened(optimize=each).run(feeds) for each in ("none", level)
-        )
-    except (GraphError, FramesError):
-        return 0.0  # an output of a type that cannot be compared, say
-    return max(relative(plain[name], optimized[name]) for name in plain)

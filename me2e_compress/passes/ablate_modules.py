@@ -15,15 +15,15 @@ from me2e_compress.graph.modules import ModuleMap, Substitute
 from me2e_compress.graph.nodes import LAYOUT_OPERATORS, makers_of, reads_of
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.edges import Edge, add_edge
-from me2e_compress.passes.parts import Part, within
-from me2e_compress.passes.substitutes import (
-    constant_like,
+from me2e_compress.passes.parts import (
+    Part,
+    Substitution,
+    layout_of,
     means_of,
     module_of,
     replace_readers,
     result_of,
-    shaped_like,
-    zeros_like,
+    within,
 )
 
 PLANNER = "planner"
@@ -93,9 +93,17 @@ class AblateModules(Pass):
             FramesError: means have no source, or it belongs to another graph.
         """
         # Check the options against the graph and the module map
-        self._check_options()
+        if self.means is not None and self.fill != "means":
+            raise RecipeError(f"{self.name}: means goes with fill=means only")
+        if not self.drop and not self.edges:
+            raise RecipeError(f"{self.name}: drop is empty, and there are no edges")
         known = [context.modules.module(name) for name in self.drop]
-        _require_nodes(model, self.drop)
+        present = sorted({provenance.module_of(node) for node in model.graph} - {""})
+        if lacking := [name for name in self.drop if name not in present]:
+            there = ", ".join(present)
+            raise PreconditionError(
+                f"no node belongs to module {lacking[0]}; the graph has {there}"
+            )
         for pattern in self.keep:
             result_of(model, Part(pattern))
         before, seeing = graph.node_count(model), _seeing(model, context.modules)
@@ -120,55 +128,60 @@ class AblateModules(Pass):
         rewrite.sweep(model)
         model.graph.sort()
         # The planner must still depend on the cameras
-        _check_sight(model, context.modules, seeing, self.drop)
+        self._check_sight(model, context.modules, seeing)
         removed = before - graph.node_count(model)
-        said = counted(abs(removed), "node")
-        notes.append(f"{said} {'removed' if removed >= 0 else 'added'}")
+        verb = "removed" if removed >= 0 else "added"
+        notes.append(f"{counted(abs(removed), 'node')} {verb}")
         return PassResult(model, max(1, removed), tuple(notes), tuple(gone))
 
-    def _check_options(self) -> None:
-        if self.means is not None and self.fill != "means":
-            raise RecipeError(f"{self.name}: means goes with fill=means only")
-        if not self.drop and not self.edges:
-            raise RecipeError(f"{self.name}: drop is empty, and there are no edges")
+    def _check_sight(
+        self, model: ir.Model, modules: ModuleMap, before: tuple[str, ...]
+    ) -> None:
+        still = _seeing(model, modules)
+        if blind := [name for name in before if name not in still]:
+            features = ", ".join(modules.names("feature"))
+            how = f"without {', '.join(self.drop)}" if self.drop else "by these edges"
+            raise PreconditionError(
+                f"{how} the plan is cut: {blind[0]} depends on nothing of {features}"
+                f" any more; keep a module, or add an edge to the {PLANNER}"
+            )
 
     def _goes(self, node: ir.Node | None) -> bool:
         if node is None or provenance.module_of(node) not in self.drop:
             return False
         return not any(within(node, pattern) for pattern in self.keep)
 
-    def _dropped(self, value: ir.Value) -> bool:
-        return self._goes(value.producer())
-
-    def _readers(self, value: ir.Value) -> list[ir.Node]:
-        return sorted(value.consumers(), key=self._goes)
-
     def _fill(self, model: ir.Model, context: Context) -> list[str]:
-        where, exits = model.graph, self._exits(model)
-        if self.fill == "means":
-            means, how = means_of(model, exits, context, self.means)
-            for value in exits:
-                mean = means[str(value.name)]
-                replace_readers(value, constant_like(where, value, mean))
-            return [f"{value.name} reads as {how}" for value in exits]
-        for value in exits:
-            replace_readers(value, self._zeros(where, value))
-        return [f"{value.name} reads as zeros" for value in exits]
-
-    def _zeros(self, where: ir.Graph, value: ir.Value) -> ir.Value:
-        return zeros_like(where, value, self._readers(value), self.name)
-
-    def _exits(self, model: ir.Model) -> list[ir.Value]:
-        return [
+        exits = [
             value
             for node in model.graph
             if self._goes(node)
             for value in node.outputs
             if not all(self._goes(reader) for reader in value.consumers())
         ]
+        if self.fill != "means":
+            for value in exits:
+                replace_readers(value, self._instead(model, value).zeros(value))
+            return [f"{value.name} reads as zeros" for value in exits]
+        means, how = means_of(model, exits, context, self.means)
+        for value in exits:
+            array, (shape, dtype) = means[str(value.name)], layout_of(value)
+            if array.dtype != dtype or array.shape != shape:
+                raise PreconditionError(
+                    f"a constant {array.dtype} {list(array.shape)} cannot stand for"
+                    f" {value.name}, which is {dtype} {list(shape)}"
+                )
+            name = f"{value.name}_mean"
+            replace_readers(value, rewrite.add_constant(model.graph, array, name))
+        return [f"{value.name} reads as {how}" for value in exits]
+
+    def _instead(self, model: ir.Model, value: ir.Value) -> Substitution:
+        """Return what writes for the readers of a value, those that stay first."""
+        readers = sorted(value.consumers(), key=self._goes)
+        return Substitution(model.graph, readers, self.name)
 
     def _cut_outputs(self, model: ir.Model) -> list[str]:
-        owned = [value for value in model.graph.outputs if self._dropped(value)]
+        owned = [value for value in model.graph.outputs if self._goes(value.producer())]
         names = [str(value.name) for value in owned]
         who, what = ", ".join(self.drop), ", ".join(names)
         if owned and len(owned) == len(model.graph.outputs) and self.drop_outputs:
@@ -190,17 +203,21 @@ class AblateModules(Pass):
         self, model: ir.Model, wanted: Substitute, modules: ModuleMap
     ) -> str:
         if wanted.reader is not None and wanted.by is not None:
-            return self._read_instead(model, wanted, modules)
+            reader = Part.of(wanted.reader, modules)
+            if all(self._goes(node) for node in model.graph if reader.holds(node)):
+                return f"{wanted.reader} is not there: nothing is substituted for it"
+            edge = Edge(wanted.by, reader.name, "replace", of=wanted.scope)
+            return add_edge(model, edge, modules, self._goes, self.name)
         # Zeros take the place where the map names no substitute
         old = result_of(model, Part.of(wanted.scope, modules))
-        if self._dropped(old):
+        if self._goes(old.producer()):
             return f"{wanted.scope} is dropped itself: nothing is substituted"
         if wanted.by is None:
-            replace_readers(old, self._zeros(model.graph, old))
+            replace_readers(old, self._instead(model, old).zeros(old))
             return f"{wanted.scope} reads as zeros"
         # A substitute must stay in the graph and not read the old result
         new = result_of(model, Part.of(wanted.by, modules), like=old)
-        if self._dropped(new):
+        if self._goes(new.producer()):
             raise PreconditionError(
                 f"{wanted.by} cannot substitute for {wanted.scope}: it is of module"
                 f" {module_of(new)}, which is dropped too"
@@ -210,31 +227,12 @@ class AblateModules(Pass):
             raise PreconditionError(
                 f"{wanted.by} cannot substitute for {wanted.scope}: it reads its result"
             )
-        readers = self._readers(old)
-        replace_readers(old, shaped_like(model.graph, new, old, readers, self.name))
+        replace_readers(old, self._instead(model, old).shaped_like(new, old))
         return f"{wanted.scope} replaced by {wanted.by}"
 
-    def _read_instead(
-        self, model: ir.Model, wanted: Substitute, modules: ModuleMap
-    ) -> str:
-        reader = Part.of(str(wanted.reader), modules)
-        if not any(reader.holds(node) and not self._goes(node) for node in model.graph):
-            return f"{wanted.reader} is not there: nothing is substituted for it"
-        edge = Edge(str(wanted.by), reader.name, "replace", of=wanted.scope)
-        return add_edge(model, edge, modules, self._goes, self.name)
 
-
-def _require_nodes(model: ir.Model, drop: tuple[str, ...]) -> None:
-    present = sorted({provenance.module_of(node) for node in model.graph} - {""})
-    for name in drop:
-        if name not in present:
-            raise PreconditionError(
-                f"no node belongs to module {name}; the graph has {', '.join(present)}"
-            )
-
-
-def _hand_over(model: ir.Model, goes: Callable[[ir.Node], bool]) -> int:
-    """Move layout nodes of dropped modules into their readers' modules; count them.
+def _hand_over(model: ir.Model, goes: Callable[[ir.Node], bool]) -> None:
+    """Move layout nodes of dropped modules into their readers' modules.
 
     Exporters write an equal cast of two modules once, with the scope of the first.
     """
@@ -248,15 +246,12 @@ def _hand_over(model: ir.Model, goes: Callable[[ir.Node], bool]) -> int:
         if node.op_type in _LAYOUT and goes(node) and outside:
             carriers[node] = None
     # Stamp them with the module of their first remaining reader
-    count = 0
     for node in reversed(carriers):
         readers = [reader for reader in node.outputs[0].consumers() if not goes(reader)]
         past = provenance.read(node)
         if readers and past is not None:
             module = provenance.module_of(readers[0])
             provenance.stamp(node, dataclasses.replace(past, module=module))
-            count += 1
-    return count
 
 
 def _seeing(model: ir.Model, modules: ModuleMap) -> tuple[str, ...]:
@@ -268,18 +263,3 @@ def _seeing(model: ir.Model, modules: ModuleMap) -> tuple[str, ...]:
         if module_of(value) == PLANNER
         and any(provenance.module_of(node) in features for node in makers_of([value]))
     )
-
-
-def _check_sight(
-    model: ir.Model, modules: ModuleMap, before: tuple[str, ...], drop: tuple[str, ...]
-) -> None:
-    """Raise a PreconditionError unless the plan still depends on the cameras."""
-    seeing = _seeing(model, modules)
-    blind = [name for name in before if name not in seeing]
-    if blind:
-        features = ", ".join(modules.names("feature"))
-        how = f"without {', '.join(drop)}" if drop else "by these edges"
-        raise PreconditionError(
-            f"{how} the plan is cut: {blind[0]} depends on nothing of {features} any"
-            f" more; keep a module, or add an edge to the {PLANNER}"
-        )

@@ -51,8 +51,9 @@ class AttachBodies(Pass):
         for identifier, calls in kinds.items():
             if identifier in model.functions:
                 continue
-            op_type = calls[0].node.op_type
-            if _is_bare(calls[0].node):
+            node = calls[0].node
+            op_type = node.op_type
+            if not node.domain or ORIGINAL_DOMAIN in node.metadata_props:
                 notes.append(
                     f"no body for {len(calls)} {op_type}: it has no domain of its own"
                 )
@@ -75,29 +76,14 @@ class AttachBodies(Pass):
         ]
         # One call of the operator inside a function of the same signature
         result = ir.Value(name="y")
-        node = ir.Node(
-            first.node.domain,
-            first.node.op_type,
-            [value for value, _ in inputs],
-            list(first.node.attributes.values()),
-            outputs=[result],
-            overload=first.node.overload,
-            name=first.operator.name,
-        )
+        values, identifier = [v for v, _ in inputs], first.node.op_identifier()
+        given = list(first.node.attributes.values())
+        node = ir.Node(*identifier[:2], values, given, outputs=[result])
+        node.overload, node.name = identifier[2], first.operator.name
         opsets = {"": first.opset}
-        body = ir.Graph(
-            [value for value, _ in inputs], [result], nodes=[node], opset_imports=opsets
-        )
-        function = ir.Function(
-            node.domain,
-            node.op_type,
-            node.overload,
-            graph=body,
-            attributes=[
-                ir.Attr(name, each.type, each.value)
-                for name, each in node.attributes.items()
-            ],
-        )
+        body = ir.Graph(values, [result], nodes=[node], opset_imports=opsets)
+        attributes = [ir.Attr(each.name, each.type, each.value) for each in given]
+        function = ir.Function(*identifier, graph=body, attributes=attributes)
         # Store shared constants, then expand the operator
         for value, known in inputs:
             if known is not None:
@@ -105,10 +91,6 @@ class AttachBodies(Pass):
         operators.expand(node, opset=first.opset, by=self.name)
         hold_constants(function)
         return function
-
-
-def _is_bare(node: ir.Node) -> bool:
-    return not node.domain or ORIGINAL_DOMAIN in node.metadata_props
 
 
 def _alike(calls: Sequence[FusedNode]) -> list[list[FusedNode]]:

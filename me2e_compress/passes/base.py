@@ -2,9 +2,8 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import onnx_ir as ir
 
@@ -12,7 +11,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.stream import Recording
-from me2e_compress.errors import FramesError, RecipeError
+from me2e_compress.errors import FramesError
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.runtime.providers import CPU, Provider
 
@@ -50,15 +49,13 @@ class Context:
         """
         # Saved ranges must belong to this graph and these frames
         if saved is not None:
-            found = Ranges.load(saved)
-            found.check(
-                model=graph.digest(model),
-                tensors=tensors,
-                method=method,
-                source=None if self.frames is None else self.frames.fingerprint,
-                named=saved,
+            ranges, frames = Ranges.load(saved), self.frames
+            source = None if frames is None else frames.fingerprint
+            digest = graph.digest(model)
+            ranges.check(
+                model=digest, tensors=tensors, method=method, source=source, named=saved
             )
-            return found
+            return ranges
         if self.frames is None:
             raise FramesError(
                 f"{name} needs recorded frames (--frames) or saved ranges (--ranges):"
@@ -127,20 +124,10 @@ class Pass(abc.ABC):
 
     def files(self) -> tuple[Path, ...]:
         """Return the files that its options name."""
-        values = [getattr(self, name) for name in self.option_names()]
+        values = (getattr(self, name) for name in self.option_names())
         return tuple(value for value in values if isinstance(value, Path))
 
     @classmethod
     def option_names(cls) -> tuple[str, ...]:
         """Return the names of the options, in order."""
         return tuple(field.name for field in dataclasses.fields(cls))
-
-    def with_options(self, options: Mapping[str, object]) -> Self:
-        """Return this pass with other options; an unknown one is a RecipeError."""
-        known = self.option_names()
-        if unknown := [name for name in options if name not in known]:
-            raise RecipeError(
-                f"{self.name} has no option {unknown[0]!r}; it has"
-                f" {', '.join(known) or 'none'}"
-            )
-        return dataclasses.replace(self, **options)

@@ -38,23 +38,15 @@ class ConvertFloat32(Pass):
         nodes = [n for n in model.graph if types.inputs(n) or types.outputs(n)]
         retyping = Retyping(model, types, self.name)
         retyping.run(nodes, keep_io=True)
-        changes = retyping.changed + _bypass_idle_casts(model)
+        # Casts that cast to what they read have become idle
+        changes = retyping.changed + sum(
+            rewrite.bypass(node.outputs[0], source)
+            for node in list(model.graph)
+            if node.op_type == "Cast"
+            and (source := node.inputs[0]) is not None
+            and source.dtype == node.outputs[0].dtype == FLOAT
+        )
         if changes:
             rewrite.sweep(model)
         computing = sum(node.op_type != "Cast" for node in nodes)
         return PassResult(model, changes, (f"{counted(computing, 'node')} in float32",))
-
-
-def _bypass_idle_casts(model: ir.Model) -> int:
-    idle = [
-        node
-        for node in model.graph
-        if node.op_type == "Cast"
-        and node.inputs[0] is not None
-        and node.inputs[0].dtype == node.outputs[0].dtype == FLOAT
-    ]
-    return sum(
-        rewrite.bypass(node.outputs[0], source)
-        for node in idle
-        if (source := node.inputs[0]) is not None
-    )

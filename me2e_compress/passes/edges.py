@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -11,12 +11,11 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError, RecipeError
-from me2e_compress.graph import provenance, rewrite
+from me2e_compress.graph import rewrite
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.nodes import makers_of
 from me2e_compress.graph.shapes import REFUSALS, infer_node
-from me2e_compress.passes.parts import Part, fit, listed, stretched
-from me2e_compress.passes.substitutes import finished, reshaped, shaped_like
+from me2e_compress.passes.parts import Part, Substitution, fit, listed, stretched
 
 # Propagate the size of an axis that grew through the rest of a graph.
 
@@ -34,10 +33,23 @@ def carry(model: ir.Model, grown: ir.Value, old: ir.Value, what: str) -> None:
             continue
         if node.op_type == "Reshape":
             _reshape(model.graph, node, was, what)
-        shapes = _inferred(model, node, what)
+        cause: Exception | None = None
+        try:
+            kinds = infer_node(node, graph.opset_of(model))
+        except REFUSALS as error:
+            kinds, cause = {}, error
+        if not kinds:
+            read = listed([value for value in node.inputs if value is not None])
+            raise PreconditionError(
+                f"{what} does not fit {node.name} ({node.op_type}), which reads {read}"
+            ) from cause
         for value in node.outputs:
             # A shape may change only where it stays known and internal
-            before, after = graph.static_shape(value), shapes.get(str(value.name))
+            kind = kinds.get(str(value.name))
+            dims = [] if kind is None else kind.tensor_type.shape.dim
+            static = kind is not None and all(d.HasField("dim_value") for d in dims)
+            after = tuple(dim.dim_value for dim in dims) if static else None
+            before = graph.static_shape(value)
             if before == after or not value.name:
                 continue
             if after is None or before is None or value.is_graph_output():
@@ -78,25 +90,6 @@ def _reshape(
     shape[places[0]] = after[axis]
     name = f"{node.outputs[0].name}_shape"
     node.replace_input_with(1, rewrite.add_constant(where, shape, name))
-
-
-def _inferred(model: ir.Model, node: ir.Node, what: str) -> dict[str, tuple[int, ...]]:
-    cause: Exception | None = None
-    try:
-        found = infer_node(node, graph.opset_of(model))
-    except REFUSALS as error:
-        found, cause = {}, error
-    if not found:
-        read = listed([value for value in node.inputs if value is not None])
-        raise PreconditionError(
-            f"{what} does not fit {node.name} ({node.op_type}), which reads {read}"
-        ) from cause
-    # Only static shapes count
-    return {
-        name: tuple(dim.dim_value for dim in kind.tensor_type.shape.dim)
-        for name, kind in found.items()
-        if all(dim.HasField("dim_value") for dim in kind.tensor_type.shape.dim)
-    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,13 +160,19 @@ def add_edge(
         )
     # Redirect only the readers inside the reading part
     uses = [(node, index) for node, index in old.uses() if node in readers]
-    joined = _join(model.graph, edge, new, old, readers, by)
+    joined = _join(Substitution(model.graph, readers, by), edge, new, old)
     for node, index in uses:
         node.replace_input_with(index, joined)
     model.graph.sort()
     if edge.how == "append":
         carry(model, joined, old, f"edge {edge.label}: {listed([new])}")
-    return _description(edge, new, old)
+    # How it reads now
+    before, after = listed([old]), listed([new])
+    if edge.how == "append":
+        return f"{edge.reader} reads {after} behind {before}"
+    if edge.how == "add":
+        return f"{edge.reader} reads {after} added to {before}"
+    return f"{edge.reader} reads {after} in the place of {before}"
 
 
 def _ends(
@@ -186,8 +185,11 @@ def _ends(
 ) -> tuple[ir.Value, ir.Value]:
     """Find the value to read, and the one that it joins or replaces."""
     # Both parts must exist and exchange values
-    if all(goes(node) for node in model.graph if source.holds(node)):
-        raise PreconditionError(f"edge {edge.label}: {_lacks(model, source)}")
+    made_by = [node for node in model.graph if source.holds(node)]
+    if all(map(goes, made_by)):
+        lacks = f"the graph has no {source.name}"
+        lacks = f"{source.name} is dropped too" if made_by else lacks
+        raise PreconditionError(f"edge {edge.label}: {lacks}")
     read = reader.entries(model)
     left = [v for v in source.exits(model) if not goes(v.producer())]
     if not read or not left:
@@ -222,12 +224,6 @@ def _ends(
     return left[new_at], made[old_at]
 
 
-def _lacks(model: ir.Model, source: Part) -> str:
-    if any(source.holds(node) for node in model.graph):
-        return f"{source.name} is dropped too"
-    return f"the graph has no {source.name}"
-
-
 def _fit(edge: Edge, new: ir.Value, old: ir.Value) -> int:
     """Return how well two values can be joined; 0 means not at all."""
     if edge.how != "append":
@@ -251,35 +247,19 @@ def _as_queries(new: ir.Value, old: ir.Value) -> tuple[int, ...] | None:
 
 
 def _join(
-    where: ir.Graph,
-    edge: Edge,
-    new: ir.Value,
-    old: ir.Value,
-    readers: Sequence[ir.Node],
-    by: str,
+    substitution: Substitution, edge: Edge, new: ir.Value, old: ir.Value
 ) -> ir.Value:
     want = graph.static_shape(old) or ()
     if edge.how == "replace":
-        return shaped_like(where, new, old, readers, by)
+        return substitution.shaped_like(new, old)
     if edge.how == "add":
         padded = stretched(graph.static_shape(new) or (), want) or want
-        shaped = reshaped(where, new, padded, readers, by)
-        node = ir.node("Add", [old, shaped])
+        node = ir.node("Add", [old, substitution.reshaped(new, padded)])
     else:
         padded = _as_queries(new, old) or ()
-        shaped = reshaped(where, new, padded, readers, by)
-        node = ir.node("Concat", [old, shaped], {"axis": edge.axis})
+        values = [old, substitution.reshaped(new, padded)]
+        node = ir.node("Concat", values, {"axis": edge.axis})
         size = list(want)
         size[edge.axis] += padded[edge.axis]
         want = tuple(size)
-    provenance.inherit(node, readers, by=by)
-    return finished(where, node, want, old, f"{old.name}_joined")
-
-
-def _description(edge: Edge, new: ir.Value, old: ir.Value) -> str:
-    before, after = listed([old]), listed([new])
-    if edge.how == "append":
-        return f"{edge.reader} reads {after} behind {before}"
-    if edge.how == "add":
-        return f"{edge.reader} reads {after} added to {before}"
-    return f"{edge.reader} reads {after} in the place of {before}"
+    return substitution.add(node, want, old, f"{old.name}_joined")

@@ -1,5 +1,6 @@
 """Give open dimensions a size, so that shapes can be folded."""
 
+import contextlib
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
@@ -48,7 +49,10 @@ class FixShapes(Pass):
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Write the sizes wherever the dimensions occur, then infer shapes."""
         # Sizes that an earlier run wrote need no change
-        known = _fixed(model)
+        known: dict[str, object] = {}
+        with contextlib.suppress(json.JSONDecodeError):
+            kept = json.loads(model.metadata_props.get(FIXED, "{}"))
+            known = kept if isinstance(kept, dict) else {}
         wanted = {k: size for k, size in self.dims.items() if known.get(k) != size}
         if not wanted:
             return PassResult(model, 0)
@@ -60,7 +64,19 @@ class FixShapes(Pass):
             )
         # Blame the sizes only if the graph was sound before
         sound = _refusal(model) is None
-        count = _write(model, wanted)
+        for node in model.graph.all_nodes():
+            for value in node.outputs:
+                value.shape = _sized(value.shape, wanted, "")
+        for body in model.graph.subgraphs():
+            for value in body.inputs:
+                value.shape = _sized(value.shape, wanted, "")
+        count = 0
+        for value in model.graph.inputs:
+            before, value.shape = (
+                value.shape,
+                _sized(value.shape, wanted, f"{value.name}"),
+            )
+            count += value.shape is not before
         if sound and (reason := _refusal(model)) is not None:
             sizes = ", ".join(f"{name}={size}" for name, size in wanted.items())
             raise PreconditionError(f"{self.name}: the graph refuses {sizes}: {reason}")
@@ -86,22 +102,10 @@ def open_dimensions(model: ir.Model) -> dict[str, int]:
 def sized_inputs(model: ir.Model, sizes: Mapping[str, int]) -> ir.Model:
     """Return a graph of only the inputs of another, with open dimensions sized."""
     inputs = [
-        ir.Value(
-            name=each.name,
-            type=each.type,
-            shape=_sized(each.shape, sizes, f"{each.name}"),
-        )
-        for each in model.graph.inputs
+        ir.Value(name=v.name, type=v.type, shape=_sized(v.shape, sizes, f"{v.name}"))
+        for v in model.graph.inputs
     ]
     return ir.Model(ir.Graph(inputs, [], nodes=[]), ir_version=model.ir_version)
-
-
-def _fixed(model: ir.Model) -> dict[str, object]:
-    try:
-        found = json.loads(model.metadata_props.get(FIXED, "{}"))
-    except json.JSONDecodeError:
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def with_sizes(passes: Sequence[Pass], dims: Mapping[str, int]) -> tuple[Pass, ...]:
@@ -122,47 +126,25 @@ def _symbols(dim: ir.SymbolicDim) -> tuple[str, ...]:
         return (dim.value,)
 
 
-def _write(model: ir.Model, sizes: Mapping[str, int]) -> int:
-    for node in model.graph.all_nodes():
-        for value in node.outputs:
-            value.shape = _sized(value.shape, sizes, "")
-    for each in model.graph.subgraphs():
-        for value in each.inputs:
-            value.shape = _sized(value.shape, sizes, "")
-    count = 0
-    for value in model.graph.inputs:
-        before, value.shape = value.shape, _sized(value.shape, sizes, f"{value.name}")
-        count += value.shape is not before
-    return count
-
-
 def _sized(
     shape: ir.Shape | None, sizes: Mapping[str, int], owner: str
 ) -> ir.Shape | None:
     """Return a shape with symbols replaced by sizes; the same object if unchanged."""
     if shape is None:
         return None
-    dims = [
-        _size(dim, sizes, f"{owner}:{axis}") if isinstance(dim, ir.SymbolicDim) else dim
-        for axis, dim in enumerate(shape)
-    ]
+    dims: list[int | ir.SymbolicDim] = []
+    for axis, dim in enumerate(shape):
+        size: object = dim
+        if isinstance(dim, ir.SymbolicDim) and dim.value is None:
+            size = sizes.get(f"{owner}:{axis}", dim)
+        elif isinstance(dim, ir.SymbolicDim) and dim.value in sizes:
+            size = sizes[str(dim.value)]
+        elif isinstance(dim, ir.SymbolicDim):  # an expression such as 2*s0 + 1
+            given = {name: sizes[name] for name in _symbols(dim) if name in sizes}
+            size = dim.evaluate(given) if given else dim
+        dims.append(size if isinstance(size, int) else dim)
     same = all(a is b for a, b in zip(dims, shape, strict=True))
     return shape if same else ir.Shape(dims)
-
-
-def _size(
-    dim: ir.SymbolicDim, sizes: Mapping[str, int], place: str
-) -> int | ir.SymbolicDim:
-    if dim.value is None:
-        return sizes.get(place, dim)
-    if dim.value in sizes:
-        return sizes[dim.value]
-    # Evaluate expressions such as 2*s0 + 1
-    symbols = _symbols(dim)
-    if not any(name in sizes for name in symbols):
-        return dim
-    found = dim.evaluate({name: sizes[name] for name in symbols if name in sizes})
-    return found if isinstance(found, int) else dim
 
 
 def _refusal(model: ir.Model) -> str | None:

@@ -14,7 +14,7 @@ from me2e_compress.graph.rewrite import graphs_of, remove_dead, value_names
 from me2e_compress.graph.summary import value_bytes
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.hoist_linear.rebuilding import NodeWriter, Rewriter
-from me2e_compress.passes.hoist_linear.repeated_axes import broadcasts
+from me2e_compress.passes.hoist_linear.repeats import broadcasts
 from me2e_compress.passes.work import (
     MOVED_BYTES_PER_NODE,
     SMALL_PRODUCTS_PER_NODE,
@@ -112,7 +112,7 @@ class _Form:
     @property
     def moves(self) -> bool:
         """Whether rows are transposed, and the product is transposed back."""
-        return self.order != tuple(range(len(self.order)))
+        return list(self.order) != sorted(self.order)
 
     @property
     def price(self) -> float:
@@ -133,16 +133,17 @@ def _flatten(product: ir.Node, rewriter: Rewriter) -> ir.Node | None:
     shapes, (left, right) = _shapes(product), product.inputs[:2]
     if shapes is None or left is None or right is None:
         return None
-    # Rows of the left operand, or the right operand's vectors as rows
+    # Rows of the left operand, or the right operand's vectors as rows; of the batch
+    # axes that the matrix lacks, the last ones or all become rows
     ways = [(left, shapes[0], right, shapes[1], False)]
     if shapes[1][-1] == 1:
         ways.append((right, _turned(shapes[1]), left, _turned(shapes[0]), True))
     forms = [_form(*way, all_axes=each) for way in ways for each in (False, True)]
-    found = min(filter(None, forms), key=lambda form: form.price, default=None)
-    before = small_products(*shapes) / SMALL_PRODUCTS_PER_NODE
-    if found is None or found.price >= before:
+    best = min(filter(None, forms), key=lambda form: form.price, default=None)
+    now = small_products(*shapes) / SMALL_PRODUCTS_PER_NODE
+    if best is None or best.price >= now:
         return None
-    return _write(product, found, rewriter)
+    return _write(product, best, rewriter)
 
 
 def _form(
@@ -154,7 +155,6 @@ def _form(
     *,
     all_axes: bool,
 ) -> _Form | None:
-    """Make rows of the batch axes that the matrix lacks: the last ones, or all."""
     rank = max(len(rows_shape), len(matrix_shape))
     *lead, count, width = _widened(rows_shape, rank)
     shared = _widened(matrix_shape, rank)[:-2]
@@ -165,29 +165,26 @@ def _form(
     if len(kept) == len(pairs):
         return None
     others = [n for n in range(len(pairs)) if n not in kept]
-    return _Form(
-        rows,
-        (*(one for one, _ in pairs), count, width),
-        (*kept, *others, len(pairs), len(pairs) + 1),
-        len(kept),
-        matrix,
-        (*(pairs[n][1] for n in kept), *matrix_shape[-2:]),
-        turned,
-    )
+    axes = (*(one for one, _ in pairs), count, width)
+    order = (*kept, *others, len(pairs), len(pairs) + 1)
+    sizes = (*(pairs[n][1] for n in kept), *matrix_shape[-2:])
+    return _Form(rows, axes, order, len(kept), matrix, sizes, turned)
 
 
 class _Writer(NodeWriter):
     """Writes around a product; constants that only it reads stay constants."""
 
     def __init__(self, rewriter: Rewriter, product: ir.Node) -> None:
-        super().__init__(rewriter, (product,), product.outputs[0].name)
+        super().__init__(rewriter, product, product.outputs[0].name)
 
-    def shape(self, value: ir.Value, shape: Shape) -> ir.Value:
+    def shape(
+        self, value: ir.Value, shape: Shape, op_type: str = "Reshape"
+    ) -> ir.Value:
         """Return a value in another shape."""
         known = array_of(value)
         owned = len(value.uses()) == 1 and not value.is_graph_output()
         if known is None or not owned or static_shape(value) == shape:
-            return super().shape(value, shape)
+            return super().shape(value, shape, op_type)
         return self.rewriter.store(known.reshape(shape), value.name or "constant")
 
 
@@ -223,10 +220,10 @@ def _read_unrepeated(product: ir.Node, rewriter: Rewriter) -> int:
         shapes, value = _shapes(product), product.inputs[index]
         if shapes is None or value is None:
             continue
-        found = _before_repeats(value, shapes[index])
-        if found is None:
+        unrepeated = _before_repeats(value, shapes[index])
+        if unrepeated is None:
             continue
-        source, small = found
+        source, small = unrepeated
         pair = (small, shapes[1]) if index == 0 else (shapes[0], small)
         batch = np.broadcast_shapes(*(shape[:-2] for shape in pair))
         same = batch == np.broadcast_shapes(*(shape[:-2] for shape in shapes))

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable
 from typing import ClassVar
 
 import onnx_ir as ir
@@ -53,26 +52,21 @@ class TranslatePlugins(Pass):
         Raises:
             PreconditionError: the library lacks an operator or cannot express a call.
         """
-
-        def translate(fused: operators.FusedNode) -> bool:
-            to = operators.dialect_of(fused.operator, self.dialect)
+        counts: Counter[str] = Counter()
+        for fused in operators.fused_nodes(model):
+            node, operator = fused.node, fused.operator
+            to = operators.dialect_of(operator, self.dialect)
             if to is None:
-                raise PreconditionError(self._lacks(fused))
-            if to == fused.dialect:
-                return False
-            operators.translate(
-                fused.node, to, opset=fused.opset, by=self.name, names=fused.names
-            )
-            return True
-
-        return _rewritten(model, translate, f"in the dialect {self.dialect}")
-
-    def _lacks(self, fused: operators.FusedNode) -> str:
-        there = ", ".join(each.name for each in fused.operator.all_dialects())
-        return (
-            f"node {fused.node.name}: the dialect {self.dialect} has no"
-            f" {fused.operator.name} ({fused.node.op_type}); it is in {there}"
-        )
+                there = ", ".join(each.name for each in operator.all_dialects())
+                raise PreconditionError(
+                    f"node {node.name}: the dialect {self.dialect} has no"
+                    f" {operator.name} ({node.op_type}); it is in {there}"
+                )
+            if to != fused.dialect:
+                opset, names = fused.opset, fused.names
+                operators.translate(node, to, opset=opset, by=self.name, names=names)
+                counts[operator.name] += 1
+        return _finished(model, counts, f"in the dialect {self.dialect}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,25 +86,19 @@ class ExpandOperators(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Expand the nodes of the graph, of its bodies and of its functions."""
-
-        def expand(fused: operators.FusedNode) -> bool:
-            operators.expand(
-                fused.node, opset=fused.opset, by=self.name, names=fused.names
-            )
-            return True
-
-        return _rewritten(model, expand, "expanded")
+        counts: Counter[str] = Counter()
+        for fused in operators.fused_nodes(model):
+            opset, names = fused.opset, fused.names
+            operators.expand(fused.node, opset=opset, by=self.name, names=names)
+            counts[fused.operator.name] += 1
+        return _finished(model, counts, "expanded")
 
 
-def _rewritten(
-    model: ir.Model, rewrite_node: Callable[[operators.FusedNode], bool], said: str
-) -> PassResult:
-    """Rewrite fused nodes, count those that changed, and drop what nothing reads."""
-    counts: Counter[str] = Counter()
-    for fused in operators.fused_nodes(model):
-        counts[fused.operator.name] += rewrite_node(fused)
-    if counts.total():
+def _finished(model: ir.Model, counts: Counter[str], done: str) -> PassResult:
+    """Drop what nothing reads any more, and say what was done how often."""
+    if counts:
         operators.import_domains(model)
         rewrite.sweep(model)
-    done = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-    return PassResult(model, counts.total(), (f"{said}: {done}",) if done else ())
+    listed = ", ".join(f"{count} {name}" for name, count in counts.items())
+    notes = (f"{done}: {listed}",) if counts else ()
+    return PassResult(model, counts.total(), notes)

@@ -43,18 +43,31 @@ def demote(model: ir.Model, by: str) -> tuple[int, str]:
     numbers beyond float32's range are clipped, so that a mask of ``-1.8e308`` stays
     finite.
     """
-    if not any(True for _ in _doubles(model)):
+    held = any(
+        value.type is not None and _is_double(value.type) for value in _values(model)
+    )
+    if not held and not any(
+        _names_double(node, attribute) or _holds_double(node, attribute)
+        for node in nodes_of(model)
+        for attribute in node.attributes.values()
+    ):
         return 0, ""
     # Stop where the outside needs double
-    keeper = _keeper(model)
-    if keeper:
+    if keeper := _keeper(model):
         return 0, f"float64 stays: {keeper} is double"
     # Weights, attributes, then value types
-    count = _demote_weights(model)
+    count = 0
+    for graph in graphs_of(model.graph):
+        for value in graph.initializers.values():
+            tensor = value.const_value
+            if tensor is not None and tensor.dtype == ir.DataType.DOUBLE:
+                value.const_value = _as_float32(tensor, value.name)
+                value.type = ir.TensorType(ir.DataType.FLOAT)
+                count += 1
     for node in nodes_of(model):
-        if found := _demote_attributes(node):
+        if changed := _demote_attributes(node):
             provenance.inherit(node, [node], by=by)
-            count += found
+            count += changed
     nodes = dict[ir.Node, None]()
     for value in _values(model):
         if value.type is not None and _is_double(value.type):
@@ -65,21 +78,10 @@ def demote(model: ir.Model, by: str) -> tuple[int, str]:
     return count, f"float64 became float32: {counted(len(nodes), 'node')}"
 
 
-def _doubles(model: ir.Model) -> Iterator[object]:
-    for value in _values(model):
-        if value.type is not None and _is_double(value.type):
-            yield value
-    for node in nodes_of(model):
-        for attribute in node.attributes.values():
-            if _names_double(node, attribute) or _holds_double(node, attribute):
-                yield attribute
-
-
 def _keeper(model: ir.Model) -> str:
-    for kind, values in (
-        ("input", model.graph.inputs),
-        ("output", model.graph.outputs),
-    ):
+    """Name what the outside needs in double; empty if nothing."""
+    ports = {"input": model.graph.inputs, "output": model.graph.outputs}
+    for kind, values in ports.items():
         for value in values:
             if value.type is not None and _is_double(value.type):
                 return f"{kind} {value.name}"
@@ -93,18 +95,6 @@ def _keeper(model: ir.Model) -> str:
                 custom = "custom " if node.domain else ""
                 return f"{touched.name} of the {custom}operator {node.op_type}"
     return ""
-
-
-def _demote_weights(model: ir.Model) -> int:
-    count = 0
-    for graph in graphs_of(model.graph):
-        for value in graph.initializers.values():
-            tensor = value.const_value
-            if tensor is not None and tensor.dtype == ir.DataType.DOUBLE:
-                value.const_value = _as_float32(tensor, value.name)
-                value.type = ir.TensorType(ir.DataType.FLOAT)
-                count += 1
-    return count
 
 
 def _demote_attributes(node: ir.Node) -> int:
@@ -142,11 +132,9 @@ def _holds_double(node: ir.Node, attribute: ir.Attr) -> bool:
 
 
 def _as_float32(tensor: ir.TensorProtocol, name: str | None) -> ir.TensorProtocol:
-    exact = tensor.numpy()
-    limits = np.finfo(np.float32)
-    bounded = np.where(
-        np.isfinite(exact), np.clip(exact, limits.min, limits.max), exact
-    )
+    exact, limits = tensor.numpy(), np.finfo(np.float32)
+    clipped = np.clip(exact, limits.min, limits.max)
+    bounded = np.where(np.isfinite(exact), clipped, exact)
     return ir.tensor(bounded.astype(np.float32), name=name)
 
 
@@ -205,10 +193,25 @@ class ImportNormalize(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Rewrite the model in place."""
-        changes = _name_nodes(model, self.name) + _stamp(model, context)
+        changes = _name_nodes(model, self.name)
+        if provenance.missing(model):
+            for node, place in assign(model, context.modules).placements.items():
+                if provenance.read(node) is None:
+                    past = provenance.Provenance(place.module, (node.name or "",))
+                    provenance.stamp(node, past)
+                    changes += 1
         changes += _isolate_plugins(model, self.name)
         demoted, note = demote(model, self.name)
-        changes += demoted + lift_constants(model) + _declare(model)
+        changes += demoted + lift_constants(model)
+        # Versions and domains that are used are declared
+        if model.functions and model.ir_version < _FUNCTIONS_SINCE_IR:
+            model.ir_version = _FUNCTIONS_SINCE_IR
+            changes += 1
+        for body in _bodies(model):
+            for node in nodes_in(body):
+                if node.domain not in body.opset_imports:
+                    body.opset_imports[node.domain] = 1
+                    changes += 1
         return PassResult(model, changes, (note,) if note else ())
 
 
@@ -245,8 +248,7 @@ def _name_nodes(model: ir.Model, by: str) -> int:
         # Reserve all given names first
         nodes = list(nodes_in(body))
         reserved = {node.name for node in nodes if node.name}
-        taken: set[str] = set()
-        counters: dict[str, int] = {}
+        taken, counters = set[str](), dict[str, int]()
         for node in nodes:
             if node.name and node.name not in taken:
                 taken.add(node.name)
@@ -261,18 +263,6 @@ def _name_nodes(model: ir.Model, by: str) -> int:
             reserved.add(node.name)
             taken.add(node.name)
             provenance.inherit(node, [node], by=by)
-            count += 1
-    return count
-
-
-def _stamp(model: ir.Model, context: Context) -> int:
-    if not provenance.missing(model):
-        return 0
-    count = 0
-    for node, place in assign(model, context.modules).placements.items():
-        if provenance.read(node) is None:
-            past = provenance.Provenance(place.module, (node.name or "",))
-            provenance.stamp(node, past)
             count += 1
     return count
 
@@ -305,16 +295,3 @@ def _bare_plugins(body: ir.Graph | ir.Function, model: ir.Model) -> list[ir.Node
         and is_plugin(node)
         and node.op_identifier() not in model.functions
     ]
-
-
-def _declare(model: ir.Model) -> int:
-    count = 0
-    if model.functions and model.ir_version < _FUNCTIONS_SINCE_IR:
-        model.ir_version = _FUNCTIONS_SINCE_IR
-        count += 1
-    for body in _bodies(model):
-        for node in nodes_in(body):
-            if node.domain not in body.opset_imports:
-                body.opset_imports[node.domain] = 1
-                count += 1
-    return count

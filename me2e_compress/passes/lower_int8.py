@@ -48,15 +48,11 @@ class LowerInt8(Pass):
             PreconditionError: the graph is not quantized, or not in symmetric int8.
         """
         # Ranges of tensors that TensorRT leaves in float
-        missing = self.ranged_tensors(model, context)
-        ranges = None
+        missing, ranges = self.ranged_tensors(model, context), None
         if missing:
+            method, saved = self.method, self.ranges
             ranges = context.ranges(
-                self.name,
-                model,
-                missing,
-                method=self.method,
-                saved=self.ranges,
+                self.name, model, missing, method=method, saved=saved
             )
         lowered = onnxruntime.convert(model, ranges)
         provenance.sign(model, lowered, self.name)

@@ -112,16 +112,16 @@ class QuantizeInt8(Pass):
 
     def plan(self, model: ir.Model, context: Context) -> QuantPlan:
         """Choose for every node, as its target can; shapes must be inferred."""
-        overrides = Overrides()
-        if self.overrides is not None:
-            overrides = Overrides.load(self.overrides)
-        rules, scheme = self._rules(), self._scheme(context)
-        costs, objection = self._runtime.costs, self._runtime.fused_objection
-        plan = make_plan(model, scheme, rules, overrides, costs, objection)
-        kept_float = self._runtime.kept_float(plan, model)
-        return dataclasses.replace(
-            plan, kept_float=kept_float, target=self._runtime.name
-        )
+        file, target, modules = self.overrides, self._runtime, context.modules
+        overrides = Overrides() if file is None else Overrides.load(file)
+        if self.modules:
+            scheme = QuantScheme.of(self.modules, modules)
+        else:
+            scheme = QuantScheme.named(self.scheme, modules)
+        costs, objection = target.costs, target.fused_objection
+        plan = make_plan(model, scheme, self._rules(), overrides, costs, objection)
+        kept_float = target.kept_float(plan, model)
+        return dataclasses.replace(plan, kept_float=kept_float, target=target.name)
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
         """Return the names of the tensors that its target reads in int8."""
@@ -137,73 +137,57 @@ class QuantizeInt8(Pass):
         return TARGETS.parse(self.target)
 
     def _rules(self) -> RuleSet:
-        rules = self.rules
-        if isinstance(rules, str):
-            rules = RULE_SETS.parse(rules)
+        named = self.rules
+        rules = RULE_SETS.parse(named) if isinstance(named, str) else named
         # Options of the pass override those of the rule set
         options: dict[str, object] = {"without": (*rules.without, *self.without)}
         if self.attention_limit is not None:
             options["attention_limit"] = self.attention_limit
         return RULE_SETS.with_options(rules, options)
 
-    def _scheme(self, context: Context) -> QuantScheme:
-        if self.modules:
-            return QuantScheme.of(self.modules, context.modules)
-        return QuantScheme.named(self.scheme, context.modules)
-
 
 def _notes(plan: QuantPlan, target: str) -> tuple[str, ...]:
     counts = ", ".join(f"{rule} {count}" for rule, count in plan.counts().items())
-    found = f"{len(plan.placed)} of {len(plan.decisions)} nodes {INT8}"
+    placed = f"{len(plan.placed)} of {len(plan.decisions)} nodes {INT8}"
     if plan.kept_float:
-        found += f"; {len(plan.chosen)} by the plan"
-    scheme = plan.scheme
-    close = [f"{each.node}: {each.borderline}" for each in plan.borderline]
+        placed += f"; {len(plan.chosen)} by the plan"
+    # What the target keeps in float, by reason
+    kept: dict[str, list[str]] = {}
+    for decision in plan.kept_float:
+        kept.setdefault(decision.reason, []).append(decision.node or decision.output)
     return (
-        f"scheme {scheme.name}: {', '.join(scheme.modules)}",
-        f"{found}; by rule: {counts}",
-        *_kept_float(plan, target),
-        *_first(close, "close decisions"),
-    )
-
-
-def _kept_float(plan: QuantPlan, target: str) -> tuple[str, ...]:
-    reasons = dict.fromkeys(each.reason for each in plan.kept_float)
-    nodes = {
-        reason: [
-            each.node or each.output
-            for each in plan.kept_float
-            if each.reason == reason
-        ]
-        for reason in reasons
-    }
-    return tuple(
-        line
-        for reason, names in nodes.items()
-        for line in _first(names, f"{len(names)} stay float on {target}, {reason}")
+        f"scheme {plan.scheme.name}: {', '.join(plan.scheme.modules)}",
+        f"{placed}; by rule: {counts}",
+        *(
+            line
+            for reason, names in kept.items()
+            for line in _first(names, f"{len(names)} stay float on {target}, {reason}")
+        ),
+        *_first(
+            [f"{each.node}: {each.borderline}" for each in plan.borderline],
+            "close decisions",
+        ),
     )
 
 
 def _findings(plan: QuantPlan, ranges: Ranges) -> tuple[str, ...]:
-    on = counted(ranges.frames, "frame")
-    notes = [f"{counted(len(ranges.tensors), 'tensor')} calibrated on {on}"]
-    costs = sorted(sharing_costs(plan, ranges), key=lambda cost: -cost.loss_db)
     # Losses of tensors that share a scale, largest first
     shared = [
         f"{cost.group.name}: {len(cost.group.tensors)} tensors, {cost.tensor} loses"
         f" {cost.loss_db:.1f} dB"
-        for cost in costs
+        for cost in sorted(sharing_costs(plan, ranges), key=lambda cost: -cost.loss_db)
     ]
+    on = counted(ranges.frames, "frame")
     return (
-        *notes,
+        f"{counted(len(ranges.tensors), 'tensor')} calibrated on {on}",
         *map(str, review(ranges)),
         *_first(shared, "scales shared by what a Concat joins"),
     )
 
 
-def _first(found: list[str], what: str) -> tuple[str, ...]:
-    if not found:
+def _first(items: list[str], what: str) -> tuple[str, ...]:
+    if not items:
         return ()
-    more = len(found) - _SHOWN
-    listed = "; ".join(found[:_SHOWN])
+    more = len(items) - _SHOWN
+    listed = "; ".join(items[:_SHOWN])
     return (f"{what}: {listed}" + (f"; and {more} more" if more > 0 else ""),)

@@ -144,8 +144,8 @@ class CompressOptions:
             )
         # each reader gets those options that it knows
         return tuple(
-            each.with_options(
-                {n: v for n, v in given.items() if n in each.option_names()}
+            dataclasses.replace(
+                each, **{n: v for n, v in given.items() if n in each.option_names()}
             )
             if each in readers
             else each

@@ -9,9 +9,8 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.compare import Fidelity, Tally
-from me2e_compress.manager.output_errors import relative
 from me2e_compress.manager.runtime_levels import first_node
-from me2e_compress.manager.verification_inputs import VerificationInputs
+from me2e_compress.manager.verification_inputs import VerificationInputs, relative
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay

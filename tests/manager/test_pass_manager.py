@@ -1,16 +1,23 @@
+"""Transactions: what a pass is given, what is checked, and what a report says."""
+
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import PassError, VerificationError
-from me2e_compress.graph import provenance
+from me2e_compress.calibration.stream import Recording
+from me2e_compress.errors import GraphError, PassError, VerificationError
+from me2e_compress.graph import provenance, shapes
 from me2e_compress.graph.modules import ModuleMap
-from me2e_compress.manager import PassManager, Report, recipe
+from me2e_compress.manager import PassManager, Report, attempt, recipe
 from me2e_compress.passes.base import Context, Pass
+from me2e_compress.passes.eliminate_redundant import EliminateRedundant
+from me2e_compress.passes.fold_constants import FoldConstants
+from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.shipped.drivers import sample_frames, shipped
 from tests.manager import passes
 
@@ -74,23 +81,17 @@ def test_a_pass_finds_the_shapes_of_all_values(
     assert shapes == {"[1,8]"}
 
 
-def test_import_is_put_in_front(chain: ir.Model, context: Context) -> None:
-    report = run(chain, context, passes.IDLE)
-    assert [step.name for step in report.steps] == ["import-normalize", "idle"]
-
-
 def test_every_node_knows_its_module(chain: ir.Model, context: Context) -> None:
     model = run(chain, context, passes.DROPS_RELU).model
     modules = [provenance.module_of(node) for node in model.graph]
     assert modules == ["backbone"] * 2 + ["occ"] * 3 + ["planner"] * 2
 
 
-def test_what_is_imported_is_not_imported_twice(
-    chain: ir.Model, context: Context
-) -> None:
-    once = run(chain, context, passes.IDLE).model
-    report = run(once, context, passes.IDLE)
-    assert [step.name for step in report.steps] == ["idle"]
+def test_import_is_put_in_front_once(chain: ir.Model, context: Context) -> None:
+    once = run(chain, context, passes.IDLE)
+    again = run(once.model, context, passes.IDLE)
+    assert [step.name for step in once.steps] == ["import-normalize", "idle"]
+    assert [step.name for step in again.steps] == ["idle"]
 
 
 def test_exact_passes_are_measured(chain: ir.Model, context: Context) -> None:
@@ -134,19 +135,13 @@ def test_the_reproducer_is_small_and_reproduces(
         run(piece, context, passes.TurnsTanhIntoSigmoid())
 
 
-def test_a_broken_pass_is_named_with_its_cause(
-    chain: ir.Model, context: Context
-) -> None:
-    with pytest.raises(PassError, match="breaks broke: KeyError") as caught:
-        run(chain, context, passes.BREAKS)
-    assert isinstance(caught.value.__cause__, KeyError)
-
-
-def test_a_broken_pass_leaves_a_reproducer(
+def test_a_broken_pass_is_named_with_its_cause_and_leaves_a_reproducer(
     chain: ir.Model, context: Context, tmp_path: Path
 ) -> None:
-    with pytest.raises(PassError, match=r"reproducer \(1 nodes\)"):
+    words = r"breaks broke: KeyError.*reproducer \(1 nodes\)"
+    with pytest.raises(PassError, match=words) as caught:
         run(chain, context, passes.BREAKS, folder=tmp_path)
+    assert isinstance(caught.value.__cause__, KeyError)
     (folder,) = tmp_path.iterdir()
     assert "KeyError" in (folder / "why.txt").read_text()
 
@@ -243,3 +238,84 @@ def test_the_driver_is_judged_on_the_frames_that_ship() -> None:
     assert check.inputs == "recorded"
     assert not check.unsteady
     assert check.errors["plan"] < 1e-5
+
+
+def test_a_pass_s_graph_is_written_once_for_checker_and_inference(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[ir.Model] = []
+    plainly = shapes.without_weights
+
+    def noted(model: ir.Model) -> onnx.ModelProto:
+        written.append(model)
+        return plainly(model)
+
+    for home in (shapes, attempt):
+        monkeypatch.setattr(home, "without_weights", noted)
+    monkeypatch.setattr("me2e_compress.graph.validity.without_weights", noted)
+    chosen = (passes.DROPS_RELU,)
+    PassManager(chosen, verify_frames=0).run(ir.from_onnx_text(CHAIN), context)
+
+    assert len(written) == 3  # as given, imported, rewritten
+
+
+def test_a_graph_that_kills_its_process_is_refused_before_it_is_run(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuses(model: ir.Model, name: str, frames: Recording | None) -> None:
+        raise GraphError(f"{name} kills {frames}")
+
+    def opens(*_: object, **__: object) -> None:
+        raise AssertionError("a session was opened")
+
+    monkeypatch.setattr("me2e_compress.manager.verification_inputs.Session", opens)
+    manager = PassManager((passes.DROPS_RELU,), try_first=refuses)
+    with pytest.raises(GraphError, match="the graph after drops-relu-of-sigmoid kills"):
+        manager.run(ir.from_onnx_text(CHAIN), context)
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["fresh", "with a past"])
+@pytest.mark.parametrize(
+    "body",
+    [
+        "a = Relu(x) y = Neg(a)",
+        '["/backbone/n"] a = Relu(x) ["/backbone/n"] y = Neg(a)',
+        '["/backbone/a"] a = Cast<to = 11>(x) ["/backbone/y"] y = Cast<to = 1>(a)',
+        '["/backbone/a"] a = RotateTRT(x) ["/backbone/y"] y = Neg(a)',
+    ],
+    ids=["no names", "one name twice", "float64", "plugin"],
+)
+def test_a_graph_is_imported_as_exporters_leave_it(
+    body: str, known: bool, context: Context
+) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        f'm (float[1,8] x) => (float[1,8] y) {{ ["/backbone/b"] b = Abs(x) {body} }}'
+    )
+    for node in model.graph if known else ():
+        provenance.stamp(node, provenance.Provenance("backbone", (str(node.name),)))
+    report = PassManager((ImportNormalize(),)).run(model, context)
+    assert report.steps[0].changes > 0
+
+
+def test_a_graph_may_hold_text(context: Context) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 20]>\n'
+        "m (string[2] x) => (string[2] y) {"
+        ' unit = Constant<value_strings = ["m", "s"]>()'
+        ' again = Constant<value_strings = ["m", "s"]>()'
+        ' a = StringConcat(x, unit) ["/backbone/y"] y = StringConcat(a, again) }'
+    )
+    passes = (ImportNormalize(), FoldConstants(), EliminateRedundant())
+    report = PassManager(passes).run(model, context)
+    assert len(report.model.graph.initializers) == 1
+
+
+def test_an_output_that_is_a_sequence_is_not_compared(context: Context) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "m (float[1,8] x) => (seq(float[1,4]) y) <int64[2] parts = {4, 4}> {"
+        ' ["/backbone/a"] y = SplitToSequence<axis = 1>(x, parts) }'
+    )
+    (check,) = PassManager((ImportNormalize(),)).run(model, context).verifications
+    assert check.skipped == "output y is no tensor: not compared"

@@ -1,11 +1,33 @@
 """What a proof by running both graphs covers, and what it says where it covers less."""
 
+import re
+
+import ml_dtypes
+import numpy as np
 import onnx_ir as ir
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from me2e_compress.errors import VerificationError
-from me2e_compress.manager import PassManager, Verification
+from me2e_compress.manager import (
+    PassManager,
+    Verification,
+    runtime_levels,
+    verification_inputs,
+)
+from me2e_compress.manager.runtime_levels import LEVELS
+from me2e_compress.manager.verification_inputs import (
+    VerificationInputs,
+    errors,
+    relative,
+    tolerances,
+)
 from me2e_compress.passes.base import Context, Pass
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.session import Level, Session
 from tests.manager import passes
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
@@ -76,21 +98,32 @@ def test_sizes_are_drawn_until_the_graph_runs(
     assert check.unproven is None
 
 
-def test_a_graph_that_runs_at_no_size_is_not_proven(context: Context) -> None:
-    text = """m (float[n,4] x) => (float[7,997] y) <int64[2] odd = {7, 997}> {
-        ["/backbone/Reshape"] y = Reshape(x, odd)
-    }"""
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (
+            """m (float[n,4] x) => (float[7,997] y) <int64[2] odd = {7, 997}> {
+            ["/backbone/Reshape"] y = Reshape(x, odd) }""",
+            r"runs at none of the sizes that were tried for n \(.*--set-dim",
+        ),
+        (
+            """m (string[2] x) => (string[2] y) {
+            ["/backbone/Identity"] y = Identity(x) }""",
+            "^input x is STRING: seeded inputs are numbers$",
+        ),
+        (
+            """m (float[64] x) => (float[64] noise) {
+            ["/backbone/Noise"] noise = RandomNormalLike(x) }""",
+            "^noise: another at every run$",
+        ),
+    ],
+    ids=["no size", "no numbers", "drawn"],
+)
+def test_what_cannot_be_compared_is_not_proven(
+    text: str, reason: str, context: Context
+) -> None:
     (check,) = checks(text, context, passes.IDLE)
-    assert "runs at none of the sizes that were tried for n (" in (check.unproven or "")
-    assert "--set-dim" in (check.unproven or "")
-
-
-def test_inputs_that_are_no_numbers_are_not_proven(context: Context) -> None:
-    text = """m (string[2] x) => (string[2] y) {
-        ["/backbone/Identity"] y = Identity(x)
-    }"""
-    (check,) = checks(text, context, passes.IDLE)
-    assert check.unproven == "input x is STRING: seeded inputs are numbers"
+    assert re.search(reason, check.unproven or "")
 
 
 def test_what_is_checked_on_no_frame_is_not_proven(context: Context) -> None:
@@ -122,14 +155,6 @@ def test_an_output_that_is_drawn_at_every_run_is_named(context: Context) -> None
     assert check.random == ("noise",)
     assert check.judged == ("y",)
     assert check.left_out == "noise: another at every run"
-
-
-def test_where_every_output_is_drawn_nothing_is_proven(context: Context) -> None:
-    text = """m (float[64] x) => (float[64] noise) {
-        ["/backbone/Noise"] noise = RandomNormalLike(x)
-    }"""
-    (check,) = checks(text, context, passes.IDLE)
-    assert check.unproven == "noise: another at every run"
 
 
 REDUCED = """m (float[1,1,16] x, custom) => (float[1,1,1] y) <int64[1] axes = {2}> {
@@ -226,3 +251,142 @@ def test_what_is_steady_is_judged_beside_it(context: Context) -> None:
     words = r"^turns-tanh-into-sigmoid promises .* changed steady by"
     with pytest.raises(VerificationError, match=words):
         checks(HARD, context, *suspects)
+
+
+CHAIN = """
+<ir_version: 9, opset_import: ["" : 17]>
+chain (float[1,8] x) => (float[1,8] y, float[1,8] z) {
+    ["n0"] a = Sigmoid(x)
+    ["aside"] z = Exp(x)
+    ["n1"] b = Tanh(a)
+    ["n2"] c = Cos(b)
+    ["n3"] d = Sin(c)
+    ["n4"] e = Tanh(d)
+    ["n5"] y = Cos(e)
+}
+"""
+
+
+@pytest.mark.parametrize("guilty", [f"n{index}" for index in range(6)])
+@pytest.mark.parametrize("level", ["basic", "layout"])
+def test_the_first_node_that_a_level_gets_wrong_is_named(
+    guilty: str, level: Level, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Errs(Session):
+        """Takes one node for a Neg, from a level on."""
+
+        def __init__(
+            self,
+            model: ir.Model,
+            *,
+            optimize: Level = "all",
+            provider: Provider = CPU,
+            int8_kernels: bool = False,
+        ) -> None:
+            model = model.clone()
+            for node in model.graph:
+                if node.name == guilty and optimize in LEVELS[LEVELS.index(level) :]:
+                    node.op_type = "Neg"
+            super().__init__(model, optimize="none", provider=provider)
+
+    monkeypatch.setattr(runtime_levels, "Session", Errs)
+    monkeypatch.setattr(verification_inputs, "Session", Errs)
+    model = ir.from_onnx_text(CHAIN)
+    inputs = VerificationInputs.of(model, None, 0, 2)
+    allowed = {"y": 1e-4, "z": 1e-4}
+
+    (said,) = runtime_levels.disagreements("before", model, ("y", "z"), allowed, inputs)
+
+    assert f"another y of the graph before at its level {level} than" in said
+    assert f"from node {guilty} (" in said
+
+
+FLOATS = hnp.arrays(
+    np.float32,
+    hnp.array_shapes(max_side=4),
+    elements=st.floats(-1e6, 1e6, width=32, allow_subnormal=False),
+)
+
+
+@given(FLOATS)
+def test_nothing_differs_from_itself(a: np.ndarray) -> None:
+    assert relative(a, a.copy()) == 0.0
+
+
+@given(FLOATS, st.floats(0.0009765625, 0.5, width=32))
+def test_the_error_is_relative_to_the_largest(a: np.ndarray, share: float) -> None:
+    peak = np.unravel_index(np.abs(a).argmax(), a.shape)
+    if abs(a[peak]) < 1e-3:
+        return
+    b = a.astype(np.float64)
+    b[peak] *= 1 + share
+    assert relative(a.astype(np.float64), b) == pytest.approx(share, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        (np.zeros(2, np.float32), np.zeros(3, np.float32)),
+        (np.zeros(2, np.float32), np.zeros(2, np.float64)),
+        (np.zeros(2, np.float32), np.full(2, 1e-30, np.float32)),
+        (np.array([1.0, np.nan], np.float32), np.array([1.0, 2.0], np.float32)),
+        (np.array([1.0, np.inf], np.float32), np.array([1.0, -np.inf], np.float32)),
+        (np.array([1, 2]), np.array([1, 3])),
+        (np.array(["a"]), np.array(["b"])),
+    ],
+)
+def test_what_no_number_can_measure_is_infinite(a: np.ndarray, b: np.ndarray) -> None:
+    assert relative(a, b) == float("inf")
+
+
+def test_a_new_non_number_is_infinite() -> None:
+    a, b = np.ones(2, np.float32), np.array([1.0, np.nan], np.float32)
+    assert relative(a, b) == float("inf")
+
+
+def test_empty_outputs_are_equal() -> None:
+    assert relative(np.zeros((0, 3)), np.zeros((0, 3))) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("dtype", "rounding", "change"),
+    [
+        ("float64", 5e-10, 2e-9),
+        ("float32", 5e-5, 2e-4),
+        ("float16", 5e-3, 2e-2),
+        ("bfloat16", 2.5e-2, 1e-1),
+    ],
+)
+def test_what_counts_as_rounding_depends_on_the_type(
+    dtype: str, rounding: float, change: float
+) -> None:
+    def is_rounding(share: float) -> bool:
+        kind = np.dtype(getattr(ml_dtypes, dtype, dtype))
+        a = np.linspace(-0.5, 1.0, 61)
+        left, right = {"y": a.astype(kind)}, {"y": (a * (1 + share)).astype(kind)}
+        found = errors([left], [right])
+        return Verification(("p",), "recorded", found, tolerances(left)).passed
+
+    assert is_rounding(rounding)
+    assert not is_rounding(change)
+
+
+@given(FLOATS, st.integers(0, 9))
+def test_a_nudge_moves_the_last_places_of_floats_only(a: np.ndarray, seed: int) -> None:
+    inputs = VerificationInputs(
+        [Frame(0, True, {"x": a, "n": np.arange(3)})], "recorded"
+    )
+    (frame,) = inputs.nudged(seed).frames
+    moved = np.abs(frame.arrays["x"].astype(np.float64) - a)
+    assert frame.arrays["x"].dtype == a.dtype
+    assert np.all(moved <= 8 * np.abs(np.spacing(a)).astype(np.float64))
+    assert np.all(moved > 0)
+    assert np.array_equal(frame.arrays["n"], np.arange(3))
+
+
+def test_outputs_do_not_keep_the_memory_of_their_session(driver: ir.Model) -> None:
+    frame = Frame(0, True, {"camera": np.ones((1, 4), np.float32)})
+
+    (outputs,) = VerificationInputs([frame], "recorded").run(driver)
+
+    assert all(value.flags.owndata for value in outputs.values())

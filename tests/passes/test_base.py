@@ -5,7 +5,6 @@ from typing import ClassVar
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.errors import RecipeError
 from me2e_compress.passes import Context, Pass, PassResult
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
@@ -21,8 +20,6 @@ class Sample(Pass):
 
     name: ClassVar[str] = "sample"
     exact: ClassVar[bool] = True
-    limit: int = 512
-    drop: tuple[str, ...] = ()
     means: Path | None = None
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
@@ -32,16 +29,6 @@ class Sample(Pass):
 def test_files_are_the_paths_that_are_set() -> None:
     assert Sample().files() == ()
     assert Sample(means=Path("m.npz")).files() == (Path("m.npz"),)
-
-
-def test_other_options_leave_the_rest() -> None:
-    changed = Sample(limit=3).with_options({"drop": ("occ",)})
-    assert changed == Sample(limit=3, drop=("occ",))
-
-
-def test_an_option_that_a_pass_lacks_is_named() -> None:
-    with pytest.raises(RecipeError, match="sample has no option 'limits'; it has limi"):
-        Sample().with_options({"limits": 3})
 
 
 @pytest.mark.parametrize(

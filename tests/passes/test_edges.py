@@ -1,21 +1,26 @@
-"""Edges that the ablation pass adds, and broadcasts."""
+"""Edges that the ablation pass adds, those that do not fit, and what grows behind."""
 
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 import onnx_ir as ir
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress import graph
-from me2e_compress.errors import PreconditionError
+from me2e_compress.errors import ModuleMapError, PreconditionError, RecipeError
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import PASSES
 from me2e_compress.passes.ablate_modules import AblateModules
-from me2e_compress.passes.edges import Edge
+from me2e_compress.passes.edges import Edge, carry
 from me2e_compress.passes.parts import stretched
 from me2e_compress.runtime.session import run_once
-from tests.passes.queries import KEYS, Numbers, context, stack, weights
+from tests.nets import net
+from tests.passes.hoisted import integers
+from tests.passes.queries import KEYS, STACK, Numbers, context, stack, weights
+from tests.passes.small import read
 from tests.profiles import scaled
 
 CAMERA = np.random.default_rng(1).normal(size=(1, 5, 8)).astype("f")
@@ -182,3 +187,216 @@ def test_a_broadcast_of_more_than_one_meaning_is_none() -> None:
     assert stretched((2, 8), (2, 2, 3, 8)) is None
     assert stretched((1, 5, 8), (1, 5, 6, 8)) == (1, 5, 1, 8)
     assert stretched((1, 8), (1, 6, 4)) is None
+
+
+@pytest.mark.parametrize(
+    ("edge", "message"),
+    [
+        (
+            Edge("occ", "*.attn"),
+            r"edge occ -> \*.attn: nothing that leaves occ \(taken \[1,2,5\]\) fits"
+            r" what \*.attn reads \(query \[1,1,8\], bev \[1,5,8\]\)",
+        ),
+        (Edge("*.lidar", "*.attn"), r"the graph has no \*.lidar"),
+        (Edge("map", "*.lidar"), r"\*.lidar reads nothing"),
+        (Edge("map", "planner", "add", of="occ"), "planner reads nothing of occ, only"),
+        (Edge("planner", "map"), r"plan \[1,1,8\] does not fit /map/MatMul"),
+        (Edge("motion", "*.attn", axis=7), "nothing that leaves motion"),
+        (Edge("*.attn", "backbone", axis=1), r"plan depends on what backbone makes"),
+    ],
+)
+def test_an_edge_that_does_not_fit_is_refused(edge: Edge, message: str) -> None:
+    with pytest.raises(PreconditionError, match=message):
+        AblateModules((), edges=(edge,)).run(stack(), context())
+
+
+def test_a_longer_value_that_breaks_an_operator_is_named() -> None:
+    """Positions of the cells are added to the keys: there are none of the lanes."""
+    text = STACK.replace("Reshape(bev, cut)", "Reshape(placed, cut)").replace(
+        '["/planner/attn/Reshape_1"]',
+        '["/planner/attn/Add"] placed = Add(bev, places)\n["/planner/attn/Reshape_1"]',
+    )
+    text = text.replace("float[1,2,5] pair)", "float[1,2,5] pair, float[1,5,8] places)")
+    model = net(text, {**weights(), "places": np.ones((1, 5, 8), "f")})
+    graph.infer_shapes(model)
+
+    with pytest.raises(
+        PreconditionError,
+        match=r"lanes \[1,3,8\] does not fit /planner/attn/Add \(Add\), which reads"
+        r" bev_joined \[1,8,8\], places \[1,5,8\]",
+    ):
+        AblateModules((), edges=(KEYS,)).run(model, context())
+
+
+def test_queries_that_a_reshape_merges_are_refused() -> None:
+    text = STACK.replace("int64[4] cut = {1, 5, 2, 4}", "int64[4] cut = {1, 10, 1, 4}")
+    text = text.replace("<perm = [0, 2, 3, 1]> (k0)", "<perm = [0, 2, 3, 1]> (k1)")
+    text = text.replace("<perm = [0, 2, 1, 3]> (k0)", "<perm = [0, 2, 1, 3]> (k1)")
+    text = text.replace(
+        '["/planner/attn/Transpose_1"]',
+        '["/planner/attn/Reshape_3"] k1 = Reshape(k0, again)\n'
+        '["/planner/attn/Transpose_1"]',
+    ).replace("int64[3] back", "int64[4] again = {1, 5, 2, 4}, int64[3] back")
+    model = net(text, weights())
+    graph.infer_shapes(model)
+
+    with pytest.raises(PreconditionError, match=r"Reshape_1, which makes \[1, 10, 1,"):
+        AblateModules((), edges=(KEYS,)).run(model, context())
+
+
+def test_a_source_that_is_dropped_is_refused() -> None:
+    chosen = AblateModules(("map",), drop_outputs=True, edges=(KEYS,))
+
+    with pytest.raises(PreconditionError, match="map is dropped too"):
+        chosen.run(stack(), context())
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        (
+            AblateModules(("backbone",), fill="zeros"),
+            "without backbone the plan is cut: plan depends on nothing of backbone",
+        ),
+        (AblateModules(("planner",), drop_outputs=True), "cannot be dropped: .* plan"),
+        (AblateModules(("planner",)), "planner cannot be dropped: it makes plan"),
+    ],
+)
+def test_an_ablation_that_cuts_the_planner_is_refused(
+    chosen: AblateModules, message: str
+) -> None:
+    with pytest.raises(PreconditionError, match=message):
+        chosen.run(stack(), context())
+
+
+def test_nothing_to_do_is_refused() -> None:
+    with pytest.raises(RecipeError, match="drop is empty, and there are no edges"):
+        AblateModules(()).run(stack(), context())
+
+
+def test_an_edge_that_replaces_says_what() -> None:
+    with pytest.raises(RecipeError, match="edge a -> b: how=replace needs of=PART"):
+        recipe.parse("ablate-modules{drop=[], edges=[{source=a,reader=b,how=replace}]}")
+
+
+def test_a_substitute_for_a_reader_says_by_what() -> None:
+    with pytest.raises(ModuleMapError, match="a substitute with a reader needs by="):
+        context('substitutes = [{ scope = "motion", reader = "planner" }]')
+
+
+HEAD = '<ir_version: 9, opset_import: ["" : 17, "own" : 1]>\n'
+
+
+def grown(
+    shape: tuple[int, ...],
+    axis: int,
+    body: str,
+    made: tuple[int, ...] = (1,),
+    gives: str = "float y",
+    b: ir.Shape | Literal["inferred"] | None = "inferred",
+) -> ir.Model:
+    """Let the readers of ``old`` in a body read two more along an axis instead.
+
+    The body makes ``y`` of ``old``; ``made`` is a constant that it may read, and ``b``
+    the shape that the file gives the value of that name.
+    """
+    more = [*shape]
+    more[axis] = 2
+    model = read(
+        f"{HEAD}g (float{list(shape)} x, float{more} z) => ({gives}) {{\n"
+        f"  old = Neg(x)  new = Concat<axis = {axis}>(old, z)  {body}\n}}",
+        made=integers(*made),
+    )
+    graph.infer_shapes(model)
+    old, new = model.graph[0].outputs[0], model.graph[1].outputs[0]
+    for node in model.graph:
+        if node.outputs[0].name == "b" and b != "inferred":
+            node.outputs[0].shape = b
+    for node, index in tuple(old.uses()):
+        if node is not model.graph[1]:
+            node.replace_input_with(index, new)
+    carry(model, new, old, "more queries")
+    return model
+
+
+def shape_of(model: ir.Model, name: str) -> tuple[int, ...] | None:
+    return next(
+        graph.static_shape(value)
+        for node in model.graph
+        for value in node.outputs
+        if value.name == name
+    )
+
+
+SUM = "y = ReduceSum<keepdims = 0>(b)"
+
+
+def test_shapes_follow_up_to_where_the_axis_is_gone() -> None:
+    model = grown(
+        (1, 6, 8), 1, f"a = Relu(old)  b = Transpose<perm = [1, 0, 2]>(a) {SUM}"
+    )
+
+    assert (shape_of(model, "a"), shape_of(model, "b")) == ((1, 8, 8), (8, 1, 8))
+    assert shape_of(model, "y") == ()
+
+
+@pytest.mark.parametrize(
+    ("shape", "axis", "made", "longer"),
+    [
+        ((1, 6, 8), 1, (1, 6, 2, 4), (1, 8, 2, 4)),
+        ((1, 6, 8), 1, (6, 8), (8, 8)),
+        ((4, 1, 4), 2, (4, 4, 1), (4, 6, 1)),  # the second of two that are as long
+        ((4, 4, 1), 0, (4, 1, 4), (6, 1, 4)),  # the first
+        ((2, 3, 6), 2, (6, 6), (6, 8)),
+        ((6, 2, 3), 0, (6, 6), (8, 6)),
+    ],
+)
+def test_a_reshape_gets_longer_where_the_axis_stands_in_its_result(
+    shape: tuple[int, ...], axis: int, made: tuple[int, ...], longer: tuple[int, ...]
+) -> None:
+    model = grown(shape, axis, f"b = Reshape(old, made) {SUM}", made)
+
+    assert shape_of(model, "b") == longer
+
+
+@pytest.mark.parametrize(
+    ("shape", "axis", "made"),
+    [((1, 6, 8), 1, (1, 48)), ((1, 6, 8), 1, (3, 2, 8)), ((2, 6, 4), 1, (6, 8))],
+)
+def test_a_reshape_that_splits_or_merges_the_axis_is_refused(
+    shape: tuple[int, ...], axis: int, made: tuple[int, ...]
+) -> None:
+    with pytest.raises(PreconditionError, match="the queries are no axis of that"):
+        grown(shape, axis, f"b = Reshape(old, made) {SUM}", made)
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("b = own.Plugin(old)", "does not fit n2 "),
+        ("b = Add(old, x)", r"does not fit n2 \(Add\)"),
+    ],
+    ids=["a plugin", "a sum with what did not grow"],
+)
+def test_what_cannot_read_more_is_named(body: str, message: str) -> None:
+    with pytest.raises(PreconditionError, match=f"more queries {message}"):
+        grown((1, 6, 8), 1, f"{body}  {SUM}")
+
+
+def test_an_output_of_the_graph_stays_as_it_is() -> None:
+    with pytest.raises(
+        PreconditionError, match=r"more queries would change y \[1,6,8\]"
+    ):
+        grown((1, 6, 8), 1, "y = Relu(old)", gives="float[1,6,8] y")
+
+
+@pytest.mark.parametrize(
+    ("body", "before"),
+    [("b = NonZero(old)", ir.Shape([3, 48])), ("b = Relu(old)", None)],
+    ids=["after", "before"],
+)
+def test_a_size_that_is_not_known_before_and_after_is_refused(
+    body: str, before: ir.Shape | None
+) -> None:
+    with pytest.raises(PreconditionError, match="more queries would change b "):
+        grown((1, 6, 8), 1, f"{body}  c = Cast<to = 1>(b)  y = ReduceSum(c)", b=before)

@@ -1,4 +1,4 @@
-"""Constant factors behind and before layers go into the weights."""
+"""Constant factors behind and before layers go into the weights, but for zeros."""
 
 import itertools
 from typing import Any
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from me2e_compress.graph.rewrite import remove_dead
 from me2e_compress.passes.fuse_basic import FuseBasic
-from tests.passes.small import apply, compute, ops, read
+from tests.passes.small import apply, compute, ops, preserved, read
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
 RANDOM = np.random.default_rng(5)
@@ -43,8 +43,7 @@ def integers(*values: int) -> Any:
 def fused(body: str, ports: str, feeds: dict[str, Any], **weights: Any) -> list[str]:
     """Fuse in float64; outputs are equal to 1e-9 of the largest."""
     text = f"{HEAD}g {ports} {{ {body} }}"
-    used = {name: each for name, each in weights.items() if name in body}
-    model = read(text, **used)
+    model = read(text, **weights)
     (want,) = compute(model, feeds)
     apply(FuseBasic(), model)
     (got,) = compute(model, feeds)
@@ -192,3 +191,31 @@ def test_values_between_a_layer_and_its_factor_take_other_names() -> None:
     assert "Mul" not in ops(model)
     values = [str(value.name) for node in model.graph for value in node.outputs]
     assert not {"a", "s", "v"} & set(values)
+
+
+FACTORED = {
+    "Gemm": ("Gemm(x, w, b)", "float[5,4]"),
+    "MatMul": ("MatMul(x, w)", "float[5,4]"),
+    "Conv": ("Conv(x, k, b)", "float[5,4,2,2]"),
+}
+
+
+@pytest.mark.parametrize(
+    ("factor", "constant"), [("Mul", 0.0), ("Mul", -0.0), ("Div", -np.inf)]
+)
+@pytest.mark.parametrize("layer", FACTORED)
+def test_a_factor_of_zero_stays_behind_its_layer(
+    layer: str, factor: str, constant: float
+) -> None:
+    call, kind = FACTORED[layer]
+    text = (
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        f"g ({kind} x) => ({kind} y)"
+        f" {{ a = {call} c = {factor}(a, z) y = Reciprocal(c) }}"
+    )
+    given = {
+        "w": normal(4, 4), "b": normal(4), "k": normal(4, 4, 1, 1), "z": constant
+    }  # fmt: skip
+    weights: dict[str, Any] = {n: np.float32(each) for n, each in given.items()}
+
+    preserved(FuseBasic(), text, **weights)

@@ -34,6 +34,12 @@ def feeds(*shapes: tuple[int, ...]) -> dict[str, Any]:
     return {name: RANDOM.normal(size=shape) for name, shape in pairs}
 
 
+def holds_product(model: ir.Model, *shapes: tuple[int, ...]) -> None:
+    given_ = feeds(*shapes)
+    (got,) = compute(model, given_)
+    np.testing.assert_allclose(got, given_["a"] @ given_["b"], rtol=0, atol=1e-9)
+
+
 def matmul_shapes(model: ir.Model) -> list[Any]:
     (node,) = (node for node in model.graph if node.op_type == "MatMul")
     return [static_shape(value) for value in node.inputs]
@@ -54,14 +60,13 @@ def test_any_product_keeps_its_result(
         while shape and shape[0] == 1 and data.draw(st.booleans()):
             del shape[0]
     a, b = (*left, rows, inner), (*right, inner, columns)
-    model, given_ = read(product(a, b)), feeds(a, b)
+    model = read(product(a, b))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(flatten_matmul, "SMALL_PRODUCTS_PER_NODE", 1e-3)
         apply(FlattenMatmul(), model)
 
-    (got,) = compute(model, given_)
-    np.testing.assert_allclose(got, given_["a"] @ given_["b"], rtol=0, atol=1e-9)
+    holds_product(model, a, b)
     shapes = matmul_shapes(model)
     assert small_products(*shapes) <= small_products(a, b)
 
@@ -76,19 +81,16 @@ def test_a_matrix_for_each_camera_times_all_points() -> None:
     result = apply(FlattenMatmul(), model)
     assert result.notes == ("flattened 1 product",)
     assert matmul_shapes(model) == [(1, HEIGHTS * CELLS, 4), (CAMERAS, 4, 4)]
-    given_ = feeds(MATRICES, POINTS)
-    (got,) = compute(model, given_)
-    np.testing.assert_allclose(got, given_["a"] @ given_["b"], rtol=0, atol=1e-9)
+    holds_product(model, MATRICES, POINTS)
 
 
 def test_queries_of_one_row_move_behind_their_heads() -> None:
     """Agents that attend to the same lanes: all of them at once, for each head."""
     a, b = (400, 8, 1, 32), (1, 8, 32, 20)
-    model, given_ = read(product(a, b)), feeds(a, b)
+    model = read(product(a, b))
     assert apply(FlattenMatmul(), model).notes == ("flattened 1 product",)
     assert matmul_shapes(model) == [(8, 400, 32), (8, 32, 20)]
-    (got,) = compute(model, given_)
-    np.testing.assert_allclose(got, given_["a"] @ given_["b"], rtol=0, atol=1e-9)
+    holds_product(model, a, b)
 
 
 def test_repetitions_are_not_read_in_front_of_a_product() -> None:

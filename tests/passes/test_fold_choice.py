@@ -1,15 +1,27 @@
-"""What folding stores: bytes of the file against nodes of every frame."""
+"""What folding stores and what it leaves: bytes of the file against nodes."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import onnx_ir as ir
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from me2e_compress.graph import static_shape
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.rewrite import Array
 from me2e_compress.graph.summary import weight_bytes
-from me2e_compress.passes.fold_constants import ENTRY_BYTES, FoldConstants
-from tests.passes.small import NO_MODULES, apply, ops, read
+from me2e_compress.passes import Context
+from me2e_compress.passes.fold_constants import (
+    ENTRY_BYTES,
+    FoldConstants,
+    knowledge,
+)
+from me2e_compress.passes.fold_constants.knowledge import Knowledge
+from me2e_compress.runtime.opening import REFUSALS
+from tests.passes.small import NO_MODULES, apply, compute, ops, read
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
 
@@ -73,18 +85,6 @@ def _file_bytes(model: ir.Model) -> int:
     return weight_bytes(model) + ENTRY_BYTES * len(model.graph.initializers)
 
 
-def test_a_table_that_is_only_repeated_stays_computed() -> None:
-    text = HEAD + (
-        "g (float[2000,32] x) => (float[2000,32] y) {"
-        " table = Expand(learned, shape) turned = Neg(table) y = Add(x, turned) }"
-    )
-    learned = np.ones((1, 32), np.float32)
-    model = read(text, learned=learned, shape=np.array([2000, 32]))
-    apply(FoldConstants(), model)
-
-    assert "Expand" in ops(model)
-
-
 def test_slices_of_a_packed_weight_are_folded_beside_what_stays_computed() -> None:
     """Together they are no larger than it, whatever the expansion behind them costs."""
     text = HEAD + (
@@ -123,36 +123,25 @@ TABLE_WEIGHTS: dict[str, Any] = {
 }
 
 
-def test_a_repeated_table_is_not_stored() -> None:
+@pytest.mark.parametrize(
+    ("limit", "left"), [(4096, ["Expand", "Add", "Mul"]), (200_000, ["Mul"])]
+)
+def test_a_repeated_table_is_stored_under_a_high_limit(
+    limit: int, left: list[str]
+) -> None:
     model = read(TABLE, **TABLE_WEIGHTS)
-    result = apply(FoldConstants(), model)
-    assert ops(model) == ["Expand", "Add", "Mul"]
-    assert "smaller than their values" in result.notes[0]
-
-
-def test_a_repeated_table_is_stored_under_a_high_limit() -> None:
-    model = read(TABLE, **TABLE_WEIGHTS)
-    apply(FoldConstants(bytes_per_node=200_000), model)
-    assert ops(model) == ["Mul"]
+    result = apply(FoldConstants(limit), model)
+    assert ops(model) == left
+    assert ("smaller than their values" in result.notes[0]) == (limit == 4096)
 
 
 def test_what_is_in_front_of_the_table_is_stored() -> None:
-    text = """
-    <ir_version: 9, opset_import: ["" : 17]>
-    g (float[1000,64] x) => (float[1000,64] y) {
-        doubled = Mul(row, two)
-        table = Expand(doubled, shape)
-        y = Mul(x, table)
-    }
-    """
-    model = read(
-        text,
-        row=np.arange(64, dtype=np.float32),
-        two=np.float32(2),
-        shape=np.array([1000, 64]),
+    text = TABLE.replace("Expand(row,", "Expand(doubled,").replace(
+        "table = ", "doubled = Mul(row, one) table = "
     )
+    model = read(text, **TABLE_WEIGHTS)
     apply(FoldConstants(), model)
-    assert ops(model) == ["Expand", "Mul"]
+    assert ops(model) == ["Expand", "Add", "Mul"]
     assert "doubled" in model.graph.initializers
 
 
@@ -177,3 +166,72 @@ def test_a_weight_that_only_dead_nodes_share_is_free_to_fold() -> None:
     model = read(text, weight=np.ones((2, 3), np.float32))
     apply(FoldConstants(bytes_per_node=0), model)
     assert ops(model) == ["Add"]
+
+
+def graph_with(start: Any, limit: Any, delta: Any, kind: str = "int64") -> Any:
+    text = f"""
+    <ir_version: 9, opset_import: ["" : 17]>
+    g ({kind}[1] x) => ({kind}[N] y) {{ r = Range(a, b, c) y = Add(x, r) }}
+    """
+    return read(text, a=start, b=limit, c=delta)
+
+
+@pytest.mark.parametrize(
+    ("start", "limit", "delta", "expected"),
+    [(0, 5, 2, [0, 2, 4]), (5, 0, -2, [5, 3, 1]), (3, 3, 1, []), (0, 3, -1, [])],
+)
+def test_a_range_of_integers(
+    start: int, limit: int, delta: int, expected: list[int]
+) -> None:
+    model = graph_with(np.int64(start), np.int64(limit), np.int64(delta))
+
+    apply(FoldConstants(bytes_per_node=10**6), model)
+
+    assert ops(model) == ["Add"]
+    assert compute(model, {"x": np.zeros(1, np.int64)})[0].tolist() == expected
+
+
+def test_a_range_of_floats_is_that_of_the_runtime_to_the_bit() -> None:
+    ends = np.float32(0), np.float32(100), np.float32(0.1)
+    before, after = graph_with(*ends, "float"), graph_with(*ends, "float")
+
+    apply(FoldConstants(bytes_per_node=10**6), after)
+
+    feeds = {"x": np.zeros(1, np.float32)}
+    assert ops(after) == ["Add"]
+    np.testing.assert_array_equal(compute(after, feeds)[0], compute(before, feeds)[0])
+
+
+def test_a_range_that_never_ends_stays_for_the_runtime_to_refuse() -> None:
+    model = graph_with(np.int64(0), np.int64(5), np.int64(0))
+
+    assert apply(FoldConstants(), model).changes == 0
+
+
+def test_a_value_beyond_the_limit_stays_computed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    lines = [f"c{at + 1} = Concat<axis = 0>(c{at}, c{at})" for at in range(40)]
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "g (float[1,4] x) => (float[1,4] y) <float[1,4] c0 = {1, 1, 1, 1}> {"
+        f" {' '.join(lines)} r = ReduceMax<axes = [0], keepdims = 1>(c40)"
+        " y = Add(x, r) }"
+    )
+    rows = list[int]()
+
+    def evaluate(
+        values: Sequence[ir.Value], known: Knowledge, opset: int
+    ) -> tuple[dict[ir.Value, Array], list[ir.Node]]:
+        made = [one.nodes[0].outputs[0] for one in known.expressions]
+        rows.extend((static_shape(each) or (0,))[0] for each in made)
+        return {}, []
+
+    monkeypatch.setattr(knowledge, "evaluate", evaluate)
+    found = FoldConstants(bytes_per_node=0).run(model, Context(ModuleMap.whole())).model
+    assert max(rows) * 16 == knowledge.LARGEST
+    assert [node.op_type for node in found.graph][-2:] == ["ReduceMax", "Add"]
+
+
+def test_memory_that_runs_out_is_a_refusal() -> None:
+    assert issubclass(MemoryError, REFUSALS)

@@ -58,12 +58,9 @@ def test_names_and_pasts_come_back(folded: ir.Model) -> None:
     ]
 
 
-def test_the_metadata_is_the_model_s_and_not_onnxsim_s(folded: ir.Model) -> None:
+def test_metadata_is_the_model_s_and_no_weight_needs_a_file(folded: ir.Model) -> None:
     assert folded.metadata_props == {"me2e.stack": "vad-tiny"}
     assert folded.producer_name != "onnx-simplifier"
-
-
-def test_the_result_needs_no_file_any_more(folded: ir.Model) -> None:
     tensors = [value.const_value for value in folded.graph.initializers.values()]
     assert tensors
     assert not any(isinstance(tensor, ir.ExternalTensor) for tensor in tensors)

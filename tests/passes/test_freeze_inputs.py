@@ -57,16 +57,12 @@ def test_geometry_is_computed_once(tmp_path: Path) -> None:
     )
 
 
-def test_a_second_run_changes_nothing(tmp_path: Path) -> None:
+def test_a_second_run_changes_nothing_and_frames_still_fit(tmp_path: Path) -> None:
     recorded = frames(tmp_path, RIG)
     result = run(net(), recorded).model
     context = Context(ModuleMap.whole(), recorded)
     assert FreezeInputs().run(result, context).changes == 0
-
-
-def test_frames_of_this_vehicle_still_fit(tmp_path: Path) -> None:
-    recorded = frames(tmp_path, RIG)
-    recorded.check(run(net(), recorded).model)
+    recorded.check(result)
 
 
 def test_frames_of_another_vehicle_are_refused(tmp_path: Path) -> None:
@@ -97,12 +93,9 @@ def test_a_value_that_is_missing_is_named(tmp_path: Path) -> None:
         run(net(), recorded)
 
 
-def test_no_frames() -> None:
+def test_neither_frames_nor_inputs() -> None:
     with pytest.raises(FramesError, match="--frames"):
         run(net(), None)
     assert FreezeInputs().needs_frames
-
-
-def test_no_input_at_all() -> None:
     with pytest.raises(RecipeError, match="needs inputs"):
         FreezeInputs(inputs=())

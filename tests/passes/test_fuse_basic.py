@@ -1,11 +1,28 @@
+"""Normalizations, products and constants that one standard operator can express."""
+
 from typing import Any
 
 import numpy as np
+import onnx_ir as ir
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from me2e_compress.graph import digest, provenance
+from me2e_compress import graph
+from me2e_compress.graph import digest, provenance, rank_of
+from me2e_compress.passes import PassResult
 from me2e_compress.passes.fuse_basic import FuseBasic
-from tests.passes.small import apply, fuse_basic, normal, ops, opset, read
+from tests.passes.small import (
+    apply,
+    compute,
+    fuse_basic,
+    normal,
+    ops,
+    opset,
+    preserved,
+    read,
+)
+from tests.profiles import scaled
 
 IMAGE = "float[1,4,6,6]"
 
@@ -67,21 +84,28 @@ def test_a_constant_per_channel_goes_into_the_convolution(
     fuse_basic(text, ["Conv"], weight=normal(8, 4, 1, 1), c=constant)
 
 
-def test_a_constant_per_column_stays() -> None:
-    text = opset(17) + (
-        f"g ({IMAGE} x) => (float[1,8,6,6] y) {{ a = Conv(x, weight) y = Add(a, c) }}"
-    )
-    fuse_basic(text, ["Conv", "Add"], weight=normal(8, 4, 1, 1), c=normal(6))
-
-
-def test_a_training_normalization_stays() -> None:
-    text = opset(17) + (
-        f"g ({IMAGE} x) => (float[1,8,6,6] y, float[8] m, float[8] v) {{"
+STAYS = {
+    "a constant of every column": (
+        f"({IMAGE} x) => (float[1,8,6,6] y) {{ a = Conv(x, weight) y = Add(a, c) }}",
+        {"weight": normal(8, 4, 1, 1), "c": normal(6)},
+    ),
+    "a normalization that trains": (
+        f"({IMAGE} x) => (float[1,8,6,6] y, float[8] m, float[8] v) {{"
         " a = Conv(x, weight)"
-        " y, m, v = BatchNormalization<training_mode = 1>(a, gamma, beta, mean, var) }"
-    )
-    model = read(text, weight=normal(8, 4, 1, 1), **statistics(8))
-    assert apply(FuseBasic(), model).changes == 0
+        " y, m, v = BatchNormalization<training_mode = 1>(a, gamma, beta, mean, var) }",
+        {"weight": normal(8, 4, 1, 1), **statistics(8)},
+    ),
+    "constants that cancel": (
+        "(float[4] x) => (float[4] y) { a = Add(x, p) y = Add(a, q) }",
+        {"p": np.float32(1e6), "q": np.float32(-1e6)},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", STAYS)
+def test_what_stays(case: str) -> None:
+    text, weights = STAYS[case]
+    assert apply(FuseBasic(), read(f"{opset(17)}g {text}", **weights)).changes == 0
 
 
 def test_a_residual_add_stays_and_is_reported() -> None:
@@ -107,21 +131,19 @@ def test_only_matrices_become_gemm(shape: str, left: list[str]) -> None:
     fuse_basic(text, left, w=normal(4, 8), b=normal(8))
 
 
+BIASED = (
+    "g (float[2,5,4] x) => (float[2,5,8] y) {"
+    " a = MatMul(x, w) b = Add(a, bias) y = Mul(b, c) }"
+)
+
+
 def test_a_factor_goes_into_weight_and_bias() -> None:
-    text = opset(17) + (
-        "g (float[2,5,4] x) => (float[2,5,8] y) {"
-        " a = MatMul(x, w) b = Add(a, bias) y = Mul(b, c) }"
-    )
-    fuse_basic(
-        text, ["MatMul", "Add"], w=normal(4, 8), bias=normal(8), c=np.float32(0.35)
-    )
+    given = {"w": normal(4, 8), "bias": normal(8), "c": np.float32(0.35)}
+    fuse_basic(opset(17) + BIASED, ["MatMul", "Add"], **given)
 
 
 def test_a_factor_is_folded_into_both_or_neither() -> None:
-    text = opset(17) + (
-        "g (float[2,5,4] x) => (float[2,5,8] y) {"
-        " a = MatMul(x, w) b = Add(a, bias) y = Mul(b, c) }"
-    )
+    text = opset(17) + BIASED
     large = np.full((4, 8), 1e38, np.float32)
     model = read(text, w=large, bias=normal(8), c=np.float32(10))
     before = digest(model)
@@ -133,10 +155,7 @@ def test_a_factor_is_folded_into_both_or_neither() -> None:
 
 
 def test_what_was_fused_owns_its_weights_at_once() -> None:
-    text = opset(17) + (
-        "g (float[5,4] x) => (float[5,8] y) {"
-        " a = MatMul(x, w) b = Add(a, bias) y = Mul(b, c) }"
-    )
+    text = opset(17) + BIASED.replace("2,5,", "5,")
     fuse_basic(text, ["Gemm"], w=normal(4, 8), bias=normal(8), c=normal(8))
 
 
@@ -156,12 +175,6 @@ def test_constants_in_a_row_are_combined(op: str) -> None:
         + f"g (float[2,4] x) => (float[2,4] y) {{ a = {op}(x, p) y = {op}(q, a) }}"
     )
     fuse_basic(text, [op], p=np.abs(normal(4)), q=np.abs(normal(1)))
-
-
-def test_constants_that_cancel_stay() -> None:
-    text = opset(17) + "g (float[4] x) => (float[4] y) { a = Add(x, p) y = Add(a, q) }"
-    model = read(text, p=np.float32(1e6), q=np.float32(-1e6))
-    assert apply(FuseBasic(), model).changes == 0
 
 
 NORM = """
@@ -195,16 +208,17 @@ def test_layer_normalization() -> None:
     assert set(past.origins) == {f"n{index}" for index in range(9)}
 
 
-def test_a_layer_normalization_is_counted_once() -> None:
-    model = read(opset(17) + NORM, **NORM_WEIGHTS, gamma=normal(8), beta=normal(8))
-    assert apply(FuseBasic(), model).notes == ("fused: layer normalizations (1)",)
-
-
-def test_layer_normalization_needs_opset_17() -> None:
-    model = read(opset(13) + NORM, **NORM_WEIGHTS, gamma=normal(8), beta=normal(8))
-    result = apply(FuseBasic(), model)
-    assert result.changes == 0
-    assert "left 1: LayerNormalization needs opset 17" in result.notes
+@pytest.mark.parametrize(
+    ("version", "note"),
+    [
+        (17, "fused: layer normalizations (1)"),
+        (13, "left 1: LayerNormalization needs opset 17"),
+    ],
+)
+def test_a_layer_normalization_is_counted_once(version: int, note: str) -> None:
+    text, scale = opset(version) + NORM, {"gamma": normal(8), "beta": normal(8)}
+    model = read(text, **NORM_WEIGHTS, **scale)
+    assert apply(FuseBasic(), model).notes == (note,)
 
 
 def test_nothing_is_fused_into_a_body() -> None:
@@ -223,3 +237,224 @@ def test_nothing_is_fused_into_a_body() -> None:
 
     assert result.changes == 0
     assert ops(model) == ["MatMul", "Mul", "If"]
+
+
+RANDOM = np.random.default_rng(8)
+
+
+def text_of(body: str, *, x: str = "float[2,600,1]", y: str = "float[M,N,O]") -> str:
+    return (
+        f'<ir_version: 9, opset_import: ["" : 17]>\ng ({x} x) => ({y} y) {{ {body} }}'
+    )
+
+
+def constant_rank(text: str, **weights: Any) -> int | None:
+    """Apply the pass; return the rank that the constant ``c`` of a node has then."""
+    model, _ = preserved(FuseBasic(), text, **weights)
+    node = next(node for node in model.graph if len(node.inputs) == 2)
+    (rank,) = (rank_of(v) for v in node.inputs if v is not None and v.name != "x")
+    return rank
+
+
+@pytest.mark.parametrize(
+    ("shape", "call", "constant", "rank"),
+    [
+        ("2,600,1", "Sub(x, c)", np.float32(0.5), 3),
+        ("2,600,1", "Sub(c, x)", np.ones(1, np.float32), 3),
+        ("1200,1,1", "Max(x, c)", np.ones((1, 1), np.float32), 3),
+        ("2,600,1", "Sub(x, c)", np.ones((1, 1), np.float32), 2),
+        ("2,600", "Sub(x, c)", np.float32(0.5), 0),
+        ("2,300,1", "Sub(x, c)", np.float32(0.5), 0),
+    ],
+)  # fmt: skip
+def test_a_constant_gets_axes_where_the_last_are_one(
+    shape: str, call: str, constant: Any, rank: int
+) -> None:
+    """Joined axes, of more than one element or as many as 1,000, are fast already."""
+    text = text_of(f"y = {call}", x=f"float[{shape}]", y="float[" + shape + "]")
+    assert constant_rank(text, c=constant) == rank
+
+
+def test_another_reader_keeps_its_constant() -> None:
+    body = "a = Sub(x, c) b = Reshape(a, flat) y = Mod<fmod = 1>(b, c)"
+    weights = {"c": np.float32(0.5), "flat": np.array([-1])}
+    model = read(text_of(body, y="float[1200]"), **weights)
+    apply(FuseBasic(), model)
+    assert rank_of(model.graph.node(2).inputs[1]) == 0
+
+
+COUNT = (
+    "e = Equal(x, zero) n = Not(e) i = Cast<to = 7>(n) s = ReduceSum{}(i{})"
+    " y = Greater(s, nothing)"
+)
+
+
+@pytest.mark.parametrize(
+    ("options", "axes", "y"),
+    [
+        ("<keepdims = 0>", "", "bool"),
+        ("", ", last", "bool[2,3,1]"),
+        ("<noop_with_empty_axes = 1>", "", "bool[2,3,4]"),
+    ],
+)
+def test_conditions_are_not_counted_as_integers(
+    options: str, axes: str, y: str
+) -> None:
+    text = text_of(COUNT.format(options, axes), x="float[2,3,4]", y=y)
+    weights = {"zero": np.float32(0), "nothing": np.int64(0), "last": np.array([-1])}
+    model, before = read(text, **weights), read(text, **weights)
+    result = apply(FuseBasic(), model)
+    assert "fused: sums of conditions (1)" in result.notes
+    assert "INT64" not in {str(v.dtype) for node in model.graph for v in node.outputs}
+    x = np.zeros((2, 3, 4), np.float32)
+    for filled in (x, x + (np.arange(3) == 1)[:, None], x + np.float32("nan")):
+        feeds = {"x": filled.astype(np.float32)}
+        (want,), (got,) = compute(before, feeds), compute(model, feeds)
+        np.testing.assert_array_equal(got, want)
+
+
+@pytest.mark.parametrize(
+    ("body", "kind"),
+    [
+        (COUNT.format("<keepdims = 0>", "").replace("nothing", "one"), "a number"),
+        (COUNT.format("<keepdims = 0>", "").replace("(n)", "(x)"), "no conditions"),
+    ],
+)
+def test_other_sums_stay(body: str, kind: str) -> None:
+    weights = {"zero": np.float32(0), "nothing": np.int64(0), "one": np.int64(1)}
+    model = read(text_of(body, x="float[2,3,4]", y="bool"), **weights)
+    apply(FuseBasic(), model)
+    assert ops(model)[-3:] == ["Cast", "ReduceSum", "Greater"]
+    assert model.graph.node(-3).attributes["to"].as_int() == 7, kind
+
+
+HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
+
+
+def levels(followers: str, channels: int, size: int) -> str:
+    """One convolution over several images, each with its own follower.
+
+    ``b``, ``c``: a normalization by the statistics of that letter; ``-``: none.
+    """
+    inputs = ", ".join(f"float[1,4,{size},{size}] x{i}" for i in range(len(followers)))
+    outputs = ", ".join(
+        f"float[1,{channels},{size},{size}] y{i}" for i in range(len(followers))
+    )
+    lines = []
+    for i, letter in enumerate(followers):
+        if letter == "-":
+            lines.append(f"y{i} = Conv(x{i}, weight)")
+            continue
+        read = ", ".join(f"{part}_{letter}" for part in ("g", "d", "m", "v"))
+        lines.append(f"a{i} = Conv(x{i}, weight)")
+        lines.append(f"y{i} = BatchNormalization(a{i}, {read})")
+    body = "\n".join(lines)
+    return HEAD + f"g ({inputs}) => ({outputs}) {{ {body} }}"
+
+
+def weights(followers: str, channels: int) -> dict[str, Any]:
+    random = np.random.default_rng(0)
+    found = {"weight": random.normal(size=(channels, 4, 1, 1)).astype(np.float32)}
+    for letter in set(followers) - {"-"}:
+        for part in ("g", "d", "m", "v"):
+            drawn = random.uniform(0.5, 1.5, channels).astype(np.float32)
+            found[f"{part}_{letter}"] = drawn
+    return found
+
+
+def fused(
+    followers: str, channels: int = 4, size: int = 6
+) -> tuple[ir.Model, PassResult]:
+    text, arrays = levels(followers, channels, size), weights(followers, channels)
+    return preserved(FuseBasic(), text, 1e-4, **arrays)
+
+
+def test_layers_with_equal_statistics_go_on_sharing() -> None:
+    after, _ = fused("bbb")
+
+    assert ops(after) == ["Conv"] * 3
+    assert len({node.inputs[1] for node in after.graph}) == 1
+    assert graph.size(after).weight_bytes == 4 * (4 * 4 + 3 * 4)  # a weight, biases
+
+
+def test_layers_with_statistics_of_their_own_get_copies() -> None:
+    after, _ = fused("bcb")
+
+    assert ops(after) == ["Conv"] * 3
+    assert len({node.inputs[1] for node in after.graph}) == 2
+
+
+def test_a_layer_that_nothing_follows_keeps_the_weight() -> None:
+    after, _ = fused("b-")
+
+    assert ops(after) == ["Conv"] * 2
+    assert "weight" in after.graph.initializers
+
+
+def test_copies_that_cost_more_than_their_nodes_are_worth_are_not_made() -> None:
+    after, result = fused("bcde", channels=1024, size=1)
+
+    assert ops(after).count("BatchNormalization") == 4
+    assert "left 4: Conv that shares its weights" in result.notes
+
+
+@settings(max_examples=scaled(25))
+@given(st.text("bc-", min_size=1, max_size=4), st.integers(1, 5))
+def test_whatever_follows_the_outputs_stay(followers: str, channels: int) -> None:
+    after, _ = fused(followers, channels)
+
+    assert "BatchNormalization" not in ops(after)
+
+
+BEHIND = ("g", "d", "m", "v")
+
+
+def drawn(*shape: int) -> Any:
+    return np.random.default_rng(1).uniform(0.5, 1.5, shape).astype(np.float32)
+
+
+def test_a_copy_is_another_where_the_weight_was_scaled_in_place_since() -> None:
+    text = """
+    g (float[1,4,5,5] x1, float[1,4,5,5] x2)
+        => (float[1,4,5,5] v11, float[1,4,5,5] v24) {
+        v7 = Conv(x1, W, b)
+        v9 = Conv(x2, W)
+        v11 = Div(v7, two)
+        v17 = BatchNormalization(v9, g, d, m, v)
+        v24 = Div(v17, two)
+    }"""
+    preserved(
+        FuseBasic(), text, 1e-4, W=drawn(4, 4, 1, 1), b=drawn(4), two=np.float32(2),
+        **{name: drawn(4) * (1 + i) for i, name in enumerate(BEHIND)},
+    )  # fmt: skip
+
+
+def test_a_copy_is_another_where_it_was_scaled_in_place_itself() -> None:
+    text = """
+    g (float[1,4,5,5] x1, float[1,4,5,5] x2, float[1,4,5,5] x3)
+        => (float[1,4,5,5] c, float[1,4,5,5] y2, float[1,4,5,5] x) {
+        a = Conv(x1, W)
+        b = Mul(a, two)
+        c = BatchNormalization(b, g, d, m, v)
+        a2 = Conv(x2, W)
+        y2 = Mul(a2, two)
+        x = Conv(x3, W)
+    }"""
+    preserved(
+        FuseBasic(), text, 1e-4, W=drawn(4, 4, 1, 1), two=np.float32(2),
+        **{name: drawn(4) * (1 + i) for i, name in enumerate(BEHIND)},
+    )  # fmt: skip
+
+
+def test_a_transposed_weight_has_copies_of_its_own() -> None:
+    text = """
+    g (float[3,4] x1, float[3,4] x2, float[3,4] x3)
+        => (float[3,4] y1, float[3,4] y2, float[3,4] y3) {
+        a1 = Gemm(x1, W, b)
+        y1 = Mul(a1, k)
+        a2 = Gemm<transB = 1>(x2, W, b)
+        y2 = Mul(a2, k)
+        a3 = MatMul(x3, W)
+        y3 = Mul(a3, k)
+    }"""
+    preserved(FuseBasic(), text, 1e-4, W=drawn(4, 4), b=drawn(4), k=drawn(4))

@@ -1,6 +1,10 @@
+"""Int8 where a plan says so, of float32 and of float16, and lowered for a CPU."""
+
+import re
 from pathlib import Path
 
 import numpy as np
+import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
@@ -13,11 +17,21 @@ from me2e_compress.errors import (
     RecipeError,
 )
 from me2e_compress.fidelity.compare import compare
-from me2e_compress.passes.base import Context
+from me2e_compress.graph import provenance
+from me2e_compress.manager import PassManager
+from me2e_compress.passes import Context
+from me2e_compress.passes.convert_float16 import ConvertFloat16
+from me2e_compress.passes.convert_float32 import ConvertFloat32
+from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.session import Session
-from me2e_compress.targets.onnxruntime import int8_layers
+from me2e_compress.targets.onnxruntime import (
+    int8_layers,
+    unranged,
+)
+from me2e_compress.targets.tensorrt import TensorRT
+from me2e_compress.testing import check_pass
 from tests.frames import record
 from tests.nets import MODULES, conv_attention, image, net
 
@@ -271,3 +285,148 @@ def test_where_the_target_takes_nothing_nothing_is_int8(context: Context) -> Non
     assert result.changes == 0
     assert result.notes[0] == "nothing to quantize"
     assert "0 of 1 nodes int8; 1 by the plan; by rule: layer 1" in result.notes
+
+
+PAPER = QuantizeInt8(rules="paper", target="tensorrt")
+
+
+def half(opset: int, context: Context) -> ir.Model:
+    source = conv_attention()
+    source.opset_imports[""] = opset
+    return check_pass(ConvertFloat16(), source, context).model
+
+
+def scales(model: ir.Model) -> set[str]:
+    return {
+        node.inputs[1].dtype.name
+        for node in model.graph
+        if node.op_type == "DequantizeLinear"
+        and node.inputs[1] is not None
+        and node.inputs[1].dtype is not None
+    }
+
+
+def test_scales_are_of_the_type_of_the_graph(context: Context) -> None:
+    source = half(19, context)
+    placed = check_pass(PAPER, source, context).model
+
+    assert scales(placed) == {"FLOAT16"}
+    assert TensorRT(version="10.7").lint(placed) == ()
+    found = compare(Session(source), Session(placed), list(context.frames or ()))
+    assert min(each.sqnr_db for each in found.outputs) > 20
+
+
+def test_int8_first_and_float16_then_gives_the_same_types(
+    context: Context,
+) -> None:
+    source = conv_attention()
+    source.opset_imports[""] = 19
+    int8 = check_pass(PAPER, source, context).model
+    both = check_pass(ConvertFloat16(), int8, context).model
+
+    assert scales(both) == {"FLOAT16"}
+    assert TensorRT(version="10.7").lint(both) == ()
+    weights = {v.dtype.name for v in both.graph.initializers.values() if v.dtype}
+    assert weights == {"FLOAT16", "INT8", "INT64"}
+
+
+@pytest.mark.parametrize(
+    ("target", "reason"),
+    [
+        ("tensorrt", "float16 scales need opset 19, the graph is of 17"),
+        ("onnxruntime", "onnxruntime has int8 kernels for float32 alone"),
+    ],
+)
+def test_the_refusal_names_the_way_out(
+    target: str, reason: str, context: Context
+) -> None:
+    step = QuantizeInt8(rules="paper", target=target)
+
+    with pytest.raises(PreconditionError, match=re.escape(reason)) as raised:
+        check_pass(step, half(17, context), context)
+    assert "put convert-float32 before quantize-int8" in str(raised.value)
+
+
+def test_the_way_out_leads_out(context: Context) -> None:
+    wide = check_pass(ConvertFloat32(), half(17, context), context).model
+    step = QuantizeInt8(rules="paper", target="onnxruntime")
+
+    assert check_pass(step, wide, context).changes == 2  # Conv and Linear
+
+
+FOR_TENSORRT = QuantizeInt8(rules="paper", target="tensorrt")
+
+
+def test_what_was_placed_for_tensorrt_is_lowered(
+    context: Context, frames: CalibrationSet
+) -> None:
+    model = conv_attention()
+    placed = FOR_TENSORRT.run(model.clone(), context).model
+
+    result = LowerInt8().run(placed, context)
+
+    assert result.changes == len(int8_layers(result.model)) == 2
+    assert "2 layers in int8 for onnxruntime" in result.notes
+    found = compare(Session(model), Session(result.model), frames)
+    assert all(20 < each.sqnr_db < 60 for each in found.outputs)
+
+
+def test_the_manager_takes_both_passes_in_a_row(context: Context) -> None:
+    manager = PassManager((FOR_TENSORRT, LowerInt8()), verify_frames=0)
+
+    report = manager.run(conv_attention(), context)
+
+    assert [step.changes for step in report.steps] == [4, 2]
+    assert not provenance.missing(report.model)
+
+
+def test_the_target_onnxruntime_needs_no_second_pass(context: Context) -> None:
+    result = QuantizeInt8(rules="paper", target="onnxruntime").run(
+        conv_attention(), context
+    )
+
+    assert len(int8_layers(result.model)) == 2
+    with pytest.raises(PreconditionError, match="only symmetric int8"):
+        LowerInt8().run(result.model, context)
+
+
+def test_saved_ranges_lower_to_the_same_graph_without_frames(
+    context: Context, frames: CalibrationSet, tmp_path: Path
+) -> None:
+    placed = FOR_TENSORRT.run(conv_attention(), context).model
+    path = tmp_path / "r.json"
+    Calibrator().run(placed, unranged(placed), frames).save(path)
+
+    measured = LowerInt8().run(placed, context).model
+    read = LowerInt8(ranges=path).run(placed, Context(MODULES)).model
+
+    assert graph.digest(read) == graph.digest(measured)
+
+
+def test_without_frames_nothing_is_lowered(context: Context) -> None:
+    placed = FOR_TENSORRT.run(conv_attention(), context).model
+
+    with pytest.raises(FramesError, match=r"lower-int8 needs recorded .* never made"):
+        LowerInt8().run(placed, Context(MODULES))
+
+
+def test_a_float_graph_is_refused(context: Context) -> None:
+    with pytest.raises(PreconditionError, match="no quantized activation"):
+        LowerInt8().run(conv_attention(), context)
+
+
+def test_pairs_without_a_kernel_are_taken_out(context: Context) -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    batched (float[1,3,8,8] image, float[1,3,8,4] w) => (float[1,3,8,4] y) {
+        y = MatMul(image, w)
+    }
+    """
+    weight = np.random.default_rng(0).standard_normal((1, 3, 8, 4))
+    model = net(text, {"w": weight})
+
+    manager = PassManager((FOR_TENSORRT, LowerInt8()), verify_frames=0)
+    report = manager.run(model, context)
+
+    assert [step.changes for step in report.steps] == [1, 1]
+    assert "0 layers in int8 for onnxruntime" in report.steps[1].notes

@@ -1,8 +1,5 @@
 """What repeats is computed once, whatever regroups its axes before it is read."""
 
-import re
-from typing import Any
-
 import numpy as np
 import onnx_ir as ir
 import pytest
@@ -67,10 +64,6 @@ GIVEN = {
 }  # fmt: skip
 
 
-def used(body: str) -> dict[str, Any]:
-    return {name: GIVEN[name] for name in re.findall(r"\w+", body) if name in GIVEN}
-
-
 def rows_of(model: ir.Model, *op_types: str) -> set[int | None]:
     """Return the sizes of the first axis of what some operators make."""
     found = [node.outputs[0] for node in model.graph if node.op_type in op_types]
@@ -81,7 +74,7 @@ def rows_of(model: ir.Model, *op_types: str) -> set[int | None]:
 def test_offsets_and_weights_of_one_query_for_six_cameras(form: str) -> None:
     body = f"{FORMS[form]} {OFFSETS} {WEIGHTS}"
 
-    model = hoist(graph_of(PORTS, body), **used(body))
+    model = hoist(graph_of(PORTS, body), **GIVEN)
 
     assert products(model) == CELLS * WIDE * (128 + 64)
     assert rows_of(model, "MatMul", "Div", "Softmax") == {1}
@@ -154,9 +147,7 @@ def test_flat_rows_are_regrouped_behind_what_is_computed_once() -> None:
         f" => (float[{CAMERAS * CELLS},{WIDE}] y)",
         body,
     )
-    given = {name: each for name, each in used(body).items() if name != "position"}
-
-    model = hoist(text, **given)
+    model = hoist(text, **{n: each for n, each in GIVEN.items() if n != "position"})
 
     assert rows_of(model, "Tanh") == {1}
     assert ops(model)[-3:] == ["Expand", "Reshape", "Add"]
@@ -169,16 +160,15 @@ def test_an_exponent_of_another_type_stays_repeated() -> None:
         "t = Tile(n, times) r = Reshape(t, rows) e = Reshape(x, row) y = Pow(e, r)",
     )
     row = integers(1, CELLS, WIDE)
-    given = {name: GIVEN[name] for name in ("times", "rows")}
 
-    assert apply(HoistLinear(), read(text, row=row, **given)).changes == 0
+    assert apply(HoistLinear(), read(text, row=row, **GIVEN)).changes == 0
 
 
 def test_what_does_not_pay_is_noted() -> None:
     body = DIFFERS["few rows that others read, too"][0]
     text = graph_of(f"(float[1,1,{CELLS},{WIDE}] x) => (float[A,B,C] y)", body)
 
-    result = apply(HoistLinear(), read(text, **used(body)))
+    result = apply(HoistLinear(), read(text, **GIVEN))
 
     assert result.notes == (
         "left 1 node behind what repeats: others read it too, or it is small",
@@ -190,7 +180,7 @@ def test_what_differs_by_camera_is_computed_for_each(case: str) -> None:
     body, rows = DIFFERS[case]
     text = graph_of(f"(float[1,1,{CELLS},{WIDE}] x) => (float[A,B,C] y)", body)
 
-    model = hoist(text, **used(body))
+    model = hoist(text, **GIVEN)
 
     assert {kind: rows_of(model, kind) for kind in rows} == {
         kind: {size} for kind, size in rows.items()

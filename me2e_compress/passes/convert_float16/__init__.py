@@ -1,16 +1,35 @@
 """Convert a graph to float16 where that is as good as float32."""
 
 import dataclasses
+import fnmatch
+import itertools
 from collections import Counter
+from collections.abc import Collection, Mapping
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 import onnx_ir as ir
 
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.stream import Recording
 from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph import array_of, input_at, opset_of, rewrite
+from me2e_compress.graph import (
+    array_of,
+    has_subgraph,
+    input_at,
+    is_standard,
+    opset_of,
+    provenance,
+    rewrite,
+    static_shape,
+)
+from me2e_compress.graph.nodes import (
+    LAYOUT_OPERATORS,
+    Numbers,
+    constant_values,
+    producer_of,
+)
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.convert_float16.element_types import (
     FLOAT,
@@ -18,7 +37,8 @@ from me2e_compress.passes.convert_float16.element_types import (
     ElementTypes,
     Retyping,
 )
-from me2e_compress.passes.convert_float16.wide_nodes import matching, wide_nodes
+from me2e_compress.quantization.geometry import position_arithmetic
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets.quantized import (
     DEQUANTIZE,
     QUANTIZE,
@@ -27,10 +47,7 @@ from me2e_compress.targets.quantized import (
 )
 from me2e_compress.targets.weights import requantized, scales_in
 
-__all__ = [
-    "ConvertFloat16",
-    "hold_scales",
-]
+__all__ = ["ConvertFloat16", "hold_scales"]
 
 
 # Scales of int8 that float16 holds: none becomes 0, or loses its digits.
@@ -52,9 +69,15 @@ def hold_scales(model: ir.Model, narrow: set[ir.Node]) -> None:
         scale, stored = node.inputs[1], array_of(node.inputs[1])
         if scale is None or stored is None or stored.dtype != np.float32:
             continue
-        exact = stored.astype(np.float32)
-        if narrow.isdisjoint((node, *_partners(node))):
+        # The other nodes of its pair
+        if node.op_type == QUANTIZE:
+            readers = node.outputs[0].consumers()
+            partners = [each for each in readers if each.op_type == DEQUANTIZE]
+        else:
+            partners = list(filter(None, [producer_of(node.inputs[0])]))
+        if narrow.isdisjoint((node, *partners)):
             continue
+        exact = stored.astype(np.float32)
         raised = scales_in(exact, np.float16).astype(np.float32)
         # Rounding to 11 bits moves no integer
         few = exact < np.finfo(np.float16).smallest_normal
@@ -65,36 +88,18 @@ def hold_scales(model: ir.Model, narrow: set[ir.Node]) -> None:
             fresh[scale] = rewrite.add_constant(
                 model.graph, raised, f"{scale.name}_held", names
             )
-        _round_again(model.graph, node, exact, raised, names)
+        # Integers that are stored are rounded again
+        value = node.inputs[0]
+        integers = array_of(value)
+        if node.op_type == DEQUANTIZE and integers is not None and value is not None:
+            axis = node.attributes.get_int("axis", 1) if exact.size > 1 else None
+            zero = array_of(input_at(node, 2))
+            again = requantized(integers, exact, raised, axis, zero)
+            name = f"{value.name}_held"
+            held = rewrite.add_constant(model.graph, again, name, names)
+            node.replace_input_with(0, held)
         node.replace_input_with(1, fresh[scale])
     rewrite.sweep(model)
-
-
-def _partners(node: ir.Node) -> list[ir.Node]:
-    """Return the other nodes of a pair."""
-    if node.op_type == QUANTIZE:
-        readers = node.outputs[0].consumers()
-        return [each for each in readers if each.op_type == DEQUANTIZE]
-    maker = None if node.inputs[0] is None else node.inputs[0].producer()
-    return [] if maker is None else [maker]
-
-
-def _round_again(
-    where: ir.Graph,
-    node: ir.Node,
-    exact: npt.NDArray[np.float32],
-    raised: npt.NDArray[np.float32],
-    names: set[str],
-) -> None:
-    """Round the integers that a DequantizeLinear reads, if they are stored."""
-    stored = array_of(node.inputs[0])
-    if node.op_type != DEQUANTIZE or stored is None or node.inputs[0] is None:
-        return
-    axis = node.attributes.get_int("axis", 1) if exact.size > 1 else None
-    zero = array_of(input_at(node, 2))
-    integers = requantized(stored, exact, raised, axis, zero)
-    name = f"{node.inputs[0].name}_held"
-    node.replace_input_with(0, rewrite.add_constant(where, integers, name, names))
 
 
 SCALES_SINCE = 19
@@ -151,35 +156,213 @@ class ConvertFloat16(Pass):
                 f" {SCALES_SINCE}, export the model so"
             )
         # Collect the nodes that must stay in float32
-        types = ElementTypes(model, FLOAT, HALF)
-        wide = matching(model, self.keep_ops, self.keep_modules, self.keep_nodes)
-        frames, io = context.frames, self.keep_io
-        found = wide_nodes(model, types, frames, keep_io=io, provider=context.provider)
-        wide = found | wide
+        types, frames = ElementTypes(model, FLOAT, HALF), context.frames
+        wide = wide_nodes(
+            model, types, frames, keep_io=self.keep_io, provider=context.provider
+        )
+        wide |= {
+            node: "the options keep it"
+            for node in model.graph
+            if node.op_type in self.keep_ops
+            or provenance.module_of(node) in self.keep_modules
+            or any(fnmatch.fnmatchcase(node.name or "", g) for g in self.keep_nodes)
+        }
         # Everything else that can be float16 becomes float16
         narrow = [n for n in model.graph if n not in wide and types.inputs(n)]
         hold_scales(model, set(narrow))
         retyping = Retyping(model, types, self.name)
         retyping.run(narrow, keep_io=self.keep_io)
-        return PassResult(model, retyping.changed, _notes(narrow, wide, context))
-
-
-def _notes(
-    narrow: list[ir.Node], wide: dict[ir.Node, str], context: Context
-) -> tuple[str, ...]:
-    floats = Counter(
-        reason
-        for node, reason in wide.items()
-        if any(each is not None and each.dtype == FLOAT for each in node.inputs)
-    )
-    notes = [
-        f"{counted(len(narrow), 'node')} in float16, {floats.total()} stay in float32"
-    ]
-    if floats:
-        listed = ", ".join(f"{reason} {n}" for reason, n in floats.most_common())
-        notes.append(f"float32: {listed}")
-    if context.frames is None:
-        notes.append(
-            "no frames (--frames): whether all numbers fit float16 was not measured"
+        reasons = Counter(
+            reason
+            for node, reason in wide.items()
+            if any(each is not None and each.dtype == FLOAT for each in node.inputs)
         )
-    return tuple(notes)
+        nodes, stay = counted(len(narrow), "node"), reasons.total()
+        notes = [f"{nodes} in float16, {stay} stay in float32"]
+        if reasons:
+            listed = ", ".join(f"{why} {n}" for why, n in reasons.most_common())
+            notes.append(f"float32: {listed}")
+        if frames is None:
+            notes.append(
+                "no frames (--frames): whether all numbers fit float16 was not measured"
+            )
+        return PassResult(model, retyping.changed, tuple(notes))
+
+
+# The nodes that stay in float32, and why.
+
+LARGEST = float(np.finfo(np.float16).max)
+"""65504."""
+
+HEADROOM = 2.0
+"""Factor by which other frames may exceed the measured range."""
+
+LONGEST_SUM = 1024
+"""A half has 11 bits: a sum of more than 2,048 equal numbers stops growing. A kernel
+that adds up a softmax in half is right to 1e-3 up to half of that."""
+
+_RESOLUTION = 2.0**-10
+"""Relative error of a constant that still is the same constant."""
+
+_SUMS = frozenset(
+    {
+        "CumSum", "Exp", "Log", "Mean", "MeanVarianceNormalization", "Pow", "ReduceL1",
+        "ReduceL2", "ReduceLogSum", "ReduceLogSumExp", "ReduceMean", "ReduceProd",
+        "ReduceSum", "ReduceSumSquare", "Softplus", "Sum",
+    }
+)  # fmt: skip
+"""Sums of many elements, squares and exponentials: they leave float16 on their way."""
+
+_CHOICES = frozenset(
+    {
+        "ArgMax", "ArgMin", "Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual",
+        "NonMaxSuppression", "NonZero", "TopK", "Ceil", "Floor", "Round",
+    }
+)  # fmt: skip
+"""Operators that choose between numbers: nearly equal ones would become equal."""
+
+_PLACES = frozenset({"DeformConv", "Det", "GridSample", "Range", "RoiAlign"})
+"""Operators that take coordinates beside their data."""
+
+_MOVES = LAYOUT_OPERATORS | {
+    "Concat", "Expand", "Gather", "GatherElements", "GatherND", "Pad",
+    "ScatterElements", "ScatterND", "Slice", "Split", "Tile",
+}  # fmt: skip
+"""What only moves elements: it is as exact in either type."""
+
+
+def wide_nodes(
+    model: ir.Model,
+    types: ElementTypes,
+    frames: Recording | None,
+    *,
+    keep_io: bool,
+    provider: Provider = CPU,
+) -> dict[ir.Node, str]:
+    """Map the nodes of the main graph that must stay in float32 to the reason.
+
+    Shapes and types must be inferred; without ``frames`` no ranges are measured.
+    """
+    # Operators, constants and positions decide without running the graph
+    places = position_arithmetic(model, constant_values(model))
+    found: dict[ir.Node, str] = {}
+    for node in model.graph:
+        reason = _by_operator(node) or _by_constants(node, types)
+        if reason is None and node in places:
+            reason = "positions: a half is right to 1/2048"
+        if reason is not None:
+            found[node] = reason
+    # Measured ranges and the nodes in between come last
+    if frames is not None:
+        found |= _by_ranges(model, types, found, frames, provider)
+    return found | _between(model, found, keep_io=keep_io)
+
+
+def _by_operator(node: ir.Node) -> str | None:
+    if not is_standard(node):
+        return "not an operator of ONNX"
+    if has_subgraph(node):
+        return "has a body"
+    if node.op_type in _SUMS:
+        return "sums, squares and exponentials"
+    if node.op_type in _CHOICES:
+        return "choices between nearly equal numbers"
+    if node.op_type in _PLACES:
+        return "positions: a half is right to 1/2048"
+    if node.op_type in ("LogSoftmax", "Softmax"):
+        shape = static_shape(node.inputs[0])
+        axis = node.attributes.get_int("axis", -1)
+        if shape is None or shape[axis] > LONGEST_SUM:
+            return f"a softmax over more than {LONGEST_SUM} elements"
+    return None
+
+
+def _by_constants(node: ir.Node, types: ElementTypes) -> str | None:
+    for index in types.inputs(node):
+        value = node.inputs[index]  # the default of an input counts as well
+        tensor = None if value is None else ir.convenience.get_const_tensor(value)
+        if tensor is not None and not _fits(tensor.numpy().astype(np.float64)):
+            return "a constant that float16 does not hold"
+    return None
+
+
+def _fits(numbers: Numbers) -> bool:
+    """Return whether constants are the same in float16.
+
+    Of more than 16 numbers only the large ones count: the rest may become 0.
+    """
+    size = np.abs(numbers)
+    if numbers.size == 0 or not np.isfinite(size).all():
+        return True
+    if size.max() > LARGEST:
+        return False
+    error = np.abs(numbers.astype(np.float16).astype(np.float64) - numbers)
+    scale = size if numbers.size <= 16 else size.max()
+    return bool((error <= _RESOLUTION * scale).all())
+
+
+def _by_ranges(
+    model: ir.Model,
+    types: ElementTypes,
+    known: Collection[ir.Node],
+    frames: Recording,
+    provider: Provider,
+) -> dict[ir.Node, str]:
+    # Map the measured values to the nodes that touch them
+    touched, constants = dict[str, list[ir.Node]](), constant_values(model)
+    for node in model.graph:
+        if node in known:
+            continue
+        read = [node.inputs[index] for index in types.inputs(node)]
+        made = [node.outputs[index] for index in types.outputs(node)]
+        for value in (*read, *made):
+            if value is not None and value not in constants:
+                touched.setdefault(str(value.name), []).append(node)
+    if not touched:
+        return {}
+    ranges = Calibrator(provider=provider).run(model, tuple(touched), frames).tensors
+    # Keep a factor of headroom for frames that were not measured
+    large = {
+        name: max(-low, high)
+        for name, (low, high) in ranges.items()
+        if max(-low, high) * HEADROOM > LARGEST
+    }
+    return {
+        node: f"numbers up to {reach:.3g}"
+        for name, reach in large.items()
+        for node in touched[name]
+    }
+
+
+def _between(
+    model: ir.Model, wide: Mapping[ir.Node, str], *, keep_io: bool
+) -> dict[ir.Node, str]:
+    """Find nodes that only move elements between float32 nodes, inputs and outputs."""
+    moves = {node: None for node in model.graph if node.op_type in _MOVES}
+
+    def from_wide(node: ir.Node) -> bool:
+        data = node.inputs if node.op_type == "Concat" else node.inputs[:1]
+        makers = [None if value is None else value.producer() for value in data]
+        return all(
+            keep_io if each is None else each in wide or each in moves
+            for each in makers
+        )
+
+    def to_wide(node: ir.Node) -> bool:
+        outside = any(value.is_graph_output() for value in node.outputs)
+        readers = itertools.chain(*(value.consumers() for value in node.outputs))
+        return (keep_io or not outside) and all(
+            each in wide or each in moves for each in readers
+        )
+
+    # Strike out moves next to float16 nodes until nothing changes
+    before = -1
+    while len(moves) != before:
+        before = len(moves)
+        for node in list(moves):
+            if not from_wide(node):
+                del moves[node]
+        for node in reversed(list(moves)):
+            if not to_wide(node):
+                del moves[node]
+    return dict.fromkeys(moves, "moves numbers between nodes in float32")

@@ -123,13 +123,21 @@ class Retyping:
         wanted = {(n, index) for n, indices in chosen.items() for index in indices}
         self._leave_casts(nodes, results, wanted)
         if not keep_io:
-            given = [v for v in self._graph.inputs if _is_read_as(v, wanted)]
+            given = [
+                value
+                for value in self._graph.inputs
+                if (read := [(node, index) for node, index in value.uses()])
+                and wanted.issuperset(read)
+            ]
             results.update(given)
             self.changed += len(given)
         # Record the readers before types and inputs change
+        made = (value for node in self._graph for value in node.outputs)
+        every = (*self._graph.inputs, *self._graph.initializers.values(), *made)
         uses = {
             value: [(node, index) for node, index in value.uses()]
-            for value in self._float_values(results)
+            for value in dict.fromkeys(every)
+            if value.dtype == types.source
         }
         for value in results:
             value.type = ir.TensorType(types.wanted)  # clones share the old one
@@ -146,7 +154,8 @@ class Retyping:
         # Insert Casts for the readers, then for the graph outputs
         for value, users in uses.items():
             self._serve(value, users, wanted)
-        self._outputs(results, keep_io=keep_io)
+        if keep_io:
+            self._restore_outputs(results)
 
     def _leave_casts(
         self,
@@ -165,42 +174,33 @@ class Retyping:
             if value is None or not (value in results or self._is_constant(value)):
                 wanted.discard((node, 0))
 
-    def _float_values(self, results: Iterable[ir.Value]) -> list[ir.Value]:
-        made = (value for node in self._graph for value in node.outputs)
-        every = (*self._graph.inputs, *self._graph.initializers.values(), *made)
-        return [v for v in dict.fromkeys(every) if v.dtype == self._types.source]
-
     def _serve(
         self,
         value: ir.Value,
         users: list[tuple[ir.Node, int]],
-        wanted: Collection[tuple[ir.Node, int]],
+        wanted: set[tuple[ir.Node, int]],
     ) -> None:
-        types = self._types
-        inside = [use for use in users if use in wanted]
-        alone = bool(inside) and len(inside) == len(users)
+        """Give the readers of a value their type; a constant of these alone changes."""
+        alone = bool(users) and wanted.issuperset(users)
         if self._is_constant(value) and alone and not value.is_graph_output():
             self._convert(value)
             return
         for node, index in users:
-            kind = types.wanted if (node, index) in wanted else types.source
+            kind = self._types.wanted if (node, index) in wanted else self._types.source
             if kind != value.dtype:
                 node.replace_input_with(index, self._as(value, kind, node))
 
     def _as(self, value: ir.Value, kind: ir.DataType, reader: ir.Node) -> ir.Value:
-        if (value, kind) not in self._casts:
-            if self._is_constant(value):
-                array = _converted(value, kind)
-                name = f"{value.name}_{kind.name.lower()}"
-                self._casts[value, kind] = rewrite.add_constant(
-                    self._graph, array, name, self._names
-                )
-            else:
-                self._casts[value, kind] = self._cast(value, kind, reader)
-        return self._casts[value, kind]
-
-    def _cast(self, value: ir.Value, kind: ir.DataType, reader: ir.Node) -> ir.Value:
+        """Return a value in a type: a constant, or a Cast that its readers share."""
+        if (value, kind) in self._casts:
+            return self._casts[value, kind]
         name = f"{value.name}_{kind.name.lower()}"
+        if self._is_constant(value):
+            result = rewrite.add_constant(
+                self._graph, _converted(value, kind), name, self._names
+            )
+            self._casts[value, kind] = result
+            return result
         name = rewrite.fresh_name(name, self._names)
         cast = ir.node("Cast", [value], {"to": kind.value}, name=name)
         result, producer = cast.outputs[0], value.producer()
@@ -212,13 +212,14 @@ class Retyping:
         else:
             self._graph.insert_after(producer, cast)
         self.changed += 1
+        self._casts[value, kind] = result
         return result
 
-    def _outputs(self, results: Collection[ir.Value], *, keep_io: bool) -> None:
+    def _restore_outputs(self, results: Collection[ir.Value]) -> None:
         """Cast retyped graph outputs back to their old type, under their old names."""
         for index, value in enumerate(self._graph.outputs):
             producer = value.producer()
-            if not keep_io or value not in results or producer is None:
+            if value not in results or producer is None:
                 continue
             result = self._as(value, self._types.source, producer)
             name, shape = value.name, value.shape
@@ -234,11 +235,6 @@ class Retyping:
         value.const_value = ir.tensor(array, name=value.name)
         value.type = ir.TensorType(self._types.wanted)
         self.changed += 1
-
-
-def _is_read_as(value: ir.Value, wanted: Collection[tuple[ir.Node, int]]) -> bool:
-    uses = [(node, index) for node, index in value.uses()]
-    return bool(uses) and all(use in wanted for use in uses)
 
 
 def _converted(

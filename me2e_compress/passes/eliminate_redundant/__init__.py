@@ -24,8 +24,11 @@ from me2e_compress.graph.rewrite import (
     value_names,
 )
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.eliminate_redundant.identities import identity_of
-from me2e_compress.passes.eliminate_redundant.merges import MergeSite, merge
+from me2e_compress.passes.eliminate_redundant.rules import (
+    MergeSite,
+    identity_of,
+    merge,
+)
 from me2e_compress.passes.fold_constants.knowledge import branch_fits
 
 COMMUTATIVE = frozenset({"Add", "And", "Equal", "Mul", "Or", "Xor"})
@@ -48,7 +51,13 @@ def share_nodes(graph: ir.Graph, by: str, *, across_modules: bool) -> int:
         if not is_standard(node) or node.op_type in RANDOM or has_subgraph(node):
             continue
         module = "" if across_modules else provenance.module_of(node)
-        known = first.setdefault(_key(node, module), node)
+        inputs = [id(value) for value in node.inputs]
+        if node.op_type in COMMUTATIVE:
+            inputs.sort()
+        named = tuple(bool(value.name) for value in node.outputs)
+        values = attribute_values(node)
+        key = (node.op_type, tuple(inputs), named, values, module)
+        known = first.setdefault(key, node)
         if known is node:
             continue
         pairs = list(zip(node.outputs, known.outputs, strict=True))
@@ -63,14 +72,6 @@ def share_nodes(graph: ir.Graph, by: str, *, across_modules: bool) -> int:
     return sum(len(nodes) - 1 for nodes in merged.values())
 
 
-def _key(node: ir.Node, module: str) -> object:
-    inputs = [id(value) for value in node.inputs]
-    if node.op_type in COMMUTATIVE:
-        inputs.sort()
-    named = tuple(bool(value.name) for value in node.outputs)
-    return (node.op_type, tuple(inputs), named, attribute_values(node), module)
-
-
 def share_initializers(graph: ir.Graph) -> int:
     """Merge equal initializers into the first and count the removed ones."""
     # Group by type, shape and edges; hash only within a group
@@ -82,7 +83,10 @@ def share_initializers(graph: ir.Graph) -> int:
     for group in groups.values():
         first: dict[bytes, ir.Value] = {}
         for value in group if len(group) > 1 else ():
-            known = first.setdefault(_content(value), value)
+            tensor, content = value.const_value, b""
+            if tensor is not None and tensor.dtype != ir.DataType.STRING:
+                content = hashlib.blake2b(tensor.tobytes(), digest_size=16).digest()
+            known = first.setdefault(content, value)
             if known is not value and not value.is_graph_output():
                 value.replace_all_uses_with(known)
                 del graph.initializers[value.name or ""]
@@ -99,13 +103,6 @@ def _edges(tensor: ir.TensorProtocol) -> object:
     flat = tensor.numpy().reshape(-1)
     size = EDGE_BYTES // flat.itemsize
     return (*head, flat[:size].tobytes(), flat[-size:].tobytes())
-
-
-def _content(value: ir.Value) -> bytes:
-    tensor = value.const_value
-    if tensor is None or tensor.dtype == ir.DataType.STRING:
-        return b""
-    return hashlib.blake2b(tensor.tobytes(), digest_size=16).digest()
 
 
 __all__ = ["EliminateRedundant"]
@@ -149,8 +146,14 @@ class EliminateRedundant(Pass):
             if tally.total() == before:
                 break
         # Remove functions and opsets that are no longer used
-        tally["functions and opsets"] += _remove_unused(model)
-        return PassResult(model, tally.total(), _notes(tally))
+        declared = _count_declared(model)
+        functions = common.RemoveUnusedFunctionsPass()  # type: ignore[no-untyped-call]
+        functions(model)
+        common.RemoveUnusedOpsetsPass()(model)
+        tally["functions and opsets"] += declared - _count_declared(model)
+        removed = ", ".join(f"{count} {what}" for what, count in tally.items() if count)
+        notes = (f"removed: {removed}",) if removed else ()
+        return PassResult(model, tally.total(), notes)
 
     def _round(self, body: ir.Graph, opset: int, tally: Counter[str]) -> None:
         site = MergeSite(body, opset, self.name)
@@ -190,22 +193,9 @@ class EliminateRedundant(Pass):
         return [merged, *merged.successors(), *merged.predecessors()]
 
 
-def _remove_unused(model: ir.Model) -> int:
-    before = _count_declared(model)
-    functions = common.RemoveUnusedFunctionsPass()  # type: ignore[no-untyped-call]
-    functions(model)
-    common.RemoveUnusedOpsetsPass()(model)
-    return before - _count_declared(model)
-
-
 def _count_declared(model: ir.Model) -> int:
     inner = sum(len(body.opset_imports) for body in model.functions.values())
     return len(model.functions) + len(model.opset_imports) + inner
-
-
-def _notes(tally: Counter[str]) -> tuple[str, ...]:
-    found = [f"{count} {what}" for what, count in tally.items() if count]
-    return ("removed: " + ", ".join(found),) if found else ()
 
 
 def _inline_branch(node: ir.Node, opset: int, by: str) -> list[ir.Node] | None:

@@ -37,38 +37,22 @@ from me2e_compress.graph.rewrite import (
 )
 from me2e_compress.graph.summary import value_bytes
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.fold_constants import evaluation
-from me2e_compress.passes.fold_constants.evaluation import Expression, Knowledge
-from me2e_compress.passes.fold_constants.knowledge import Sweep, branch_fits
+from me2e_compress.passes.fold_constants import knowledge
+from me2e_compress.passes.fold_constants.knowledge import (
+    Expression,
+    Knowledge,
+    Sweep,
+    branch_fits,
+)
 
-__all__ = [
-    "ENTRY_BYTES",
-    "FoldChoice",
-    "FoldConstants",
-    "choose",
-]
-
+__all__ = ["ENTRY_BYTES", "FoldConstants"]
 
 ENTRY_BYTES = 64
 """Bytes of an initializer in the file besides its data: name, shape, type."""
 
 
-@dataclasses.dataclass
-class FoldChoice:
-    """Which values become initializers, and which expressions are no longer needed.
-
-    ``kept`` counts the nodes that go on computing constants because that is smaller.
-    """
-
-    values: list[ir.Value]
-    gone: list[Expression]
-    kept: int
-    growth_bytes: int
-
-
-def choose(known: Knowledge, bytes_per_node: int) -> FoldChoice:
-    """Choose for every constant value whether it is stored or computed."""
-    sizes = _Sizes(known)
+def choose(known: Knowledge, sizes: "_Sizes", bytes_per_node: int) -> list[Expression]:
+    """Choose the constant expressions that are no longer needed; others go on."""
     gone: set[Expression] = set()
     waiting = sizes.groups(known.expressions)
     while waiting:
@@ -78,11 +62,7 @@ def choose(known: Knowledge, bytes_per_node: int) -> FoldChoice:
             gone.update(group)
         else:
             waiting.extend(sizes.groups(sizes.without_largest(group)))
-    # Store what remaining nodes still read
-    chosen = [one for one in known.expressions if one in gone]
-    values = sizes.stored(chosen, gone)
-    kept = sum(len(one.nodes) for one in known.expressions if one not in gone)
-    return FoldChoice(values, chosen, kept, int(sizes.growth(chosen)))
+    return [one for one in known.expressions if one in gone]
 
 
 class _Sizes:
@@ -100,7 +80,7 @@ class _Sizes:
             value
             for one in known.expressions
             for place, value in enumerate(one.nodes[0].outputs)
-            if self._is_read_outside(one, place)
+            if any(self._is_read_outside(node.outputs[place]) for node in one.nodes)
         }
         # Weights that only constant expressions read
         self.weights = {
@@ -180,14 +160,9 @@ class _Sizes:
             found.setdefault(root(one), []).append(one)
         return list(found.values())
 
-    def _is_read_outside(self, one: Expression, place: int) -> bool:
-        for node in one.nodes:
-            equal = node.outputs[place]
-            if equal.is_graph_output():
-                return True
-            if any(self._expression(use.node) is None for use in equal.uses()):
-                return True
-        return False
+    def _is_read_outside(self, value: ir.Value) -> bool:
+        readers = (self._expression(use.node) for use in value.uses())
+        return value.is_graph_output() or None in readers
 
     def _expression(self, node: ir.Node) -> Expression | None:
         return self.known.maker.get(node.outputs[0]) if node.outputs else None
@@ -276,32 +251,35 @@ class FoldConstants(Pass):
                 through_compute=self.through_compute,
                 trust_shapes=trust,
             ).run(body)
-            choice = choose(known, self.bytes_per_node)
+            sizes = _Sizes(known)
+            gone = choose(known, sizes, self.bytes_per_node)
+            values = sizes.stored(gone, set(gone))
             # Evaluate the choice; start over if it taught new shapes or failed
-            asked = [value for value in choice.values if value not in known.arrays]
-            found, failed = evaluation.evaluate(asked, known, opset)
+            asked = [value for value in values if value not in known.arrays]
+            arrays, failed = knowledge.evaluate(asked, known, opset)
             tally.refused.update(node.op_type for node in failed)
             refused.update(failed)
-            if failed or _learn(asked, found):
+            unshaped = [
+                value
+                for value in asked
+                if value in arrays
+                and graphs.static_shape(value) is None
+                and not value.is_graph_output()
+            ]
+            if failed or unshaped:
+                for value in () if failed else unshaped:
+                    value.shape = ir.Shape(arrays[value].shape)
                 continue
             # Write the chosen values into the graph
-            known.arrays.update(found)
-            if not choice.gone:
-                tally.kept += choice.kept
+            growth = int(sizes.growth(gone))
+            known.arrays.update(arrays)
+            if not gone:
+                tally.kept += sum(len(one.nodes) for one in known.expressions)
                 return
-            fresh.update(_commit(body, choice, known.arrays, self.name))
-            tally.folded += sum(len(one.nodes) for one in choice.gone)
-            tally.stored += len(choice.values)
-            tally.growth_bytes += choice.growth_bytes
-
-
-def _learn(asked: list[ir.Value], found: dict[ir.Value, Array]) -> bool:
-    learnt = False
-    for value in asked:
-        if graphs.static_shape(value) is None and not value.is_graph_output():
-            value.shape = ir.Shape(found[value].shape)
-            learnt = True
-    return learnt
+            fresh.update(_commit(body, gone, values, known.arrays, self.name))
+            tally.folded += sum(len(one.nodes) for one in gone)
+            tally.stored += len(values)
+            tally.growth_bytes += growth
 
 
 def _notes(tally: _Tally) -> tuple[str, ...]:
@@ -322,28 +300,36 @@ def _notes(tally: _Tally) -> tuple[str, ...]:
 
 
 def _commit(
-    graph: ir.Graph, choice: FoldChoice, arrays: dict[ir.Value, Array], name: str
+    graph: ir.Graph,
+    gone: list[Expression],
+    values: list[ir.Value],
+    arrays: dict[ir.Value, Array],
+    name: str,
 ) -> list[ir.Value]:
     """Replace the chosen values by initializers of the same names, and return these.
 
     Not every runtime allows an initializer as a graph output: an Identity passes it on.
     """
     # Names of the removed nodes are free again
-    leave = {
-        value.name for one in choice.gone for n in one.nodes for value in n.outputs
-    }
-    stored = _Store(graph, value_names(graph) - leave)
+    leave = {value.name for one in gone for n in one.nodes for value in n.outputs}
+    names = value_names(graph) - leave
+    stored: dict[tuple[str, tuple[int, ...], bytes], ir.Value] = {}
     place = {
         value: (one, index)
-        for one in choice.gone
+        for one in gone
         for index, value in enumerate(one.nodes[0].outputs)
     }
-    # Store each value once for all nodes that compute it
-    for value in choice.values:
+    # Store equal values once, for all nodes that compute them
+    for value in values:
         one, index = place[value]
         is_output = any(node.outputs[index].is_graph_output() for node in one.nodes)
         label = f"{value.name}_value" if is_output else value.name or ""
-        weight = stored.add(arrays[value], label)
+        array = arrays[value]
+        content = hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16)
+        key = (str(array.dtype), array.shape, content.digest())
+        if key not in stored:
+            stored[key] = add_constant(graph, array, label, names)
+        weight = stored[key]
         for node in one.nodes:
             equal = node.outputs[index]
             if equal.is_graph_output():
@@ -351,24 +337,9 @@ def _commit(
             else:
                 equal.replace_all_uses_with(weight)
     # Remove the nodes, readers first
-    for one in reversed(choice.gone):
+    for one in reversed(gone):
         graph.remove([node for node in one.nodes if node.graph is graph], safe=True)
-    return list(stored.known.values())
-
-
-class _Store:
-    def __init__(self, graph: ir.Graph, names: set[str]) -> None:
-        self.graph = graph
-        self.names = names
-        self.known: dict[tuple[str, tuple[int, ...], bytes], ir.Value] = {}
-
-    def add(self, array: Array, name: str) -> ir.Value:
-        data = np.ascontiguousarray(array).tobytes()
-        content = hashlib.blake2b(data, digest_size=16)
-        key = (str(array.dtype), array.shape, content.digest())
-        if key not in self.known:
-            self.known[key] = add_constant(self.graph, array, name, self.names)
-        return self.known[key]
+    return list(stored.values())
 
 
 def _keep_output(
@@ -397,30 +368,27 @@ def _reshape_bounds(graph: ir.Graph, opset: int, by: str) -> int:
 
     Result:  If -> n -> Reshape to a scalar -> Range(0, n, 1)
     """
-    choices = [node for node in graph if node.op_type == "If"]
-    return sum(_reshape_bounds_of(node, graph, opset, by) for node in choices)
-
-
-def _reshape_bounds_of(choice: ir.Node, graph: ir.Graph, opset: int, by: str) -> int:
-    branches = [attribute.as_graph() for attribute in choice.attributes.values()]
-    if all(branch_fits(choice, branch, opset) for branch in branches):
-        return 0
-    # Find the ranges that read a result of the If
-    bounds = [
-        (use.node, use.idx, value)
-        for value in choice.outputs
-        for use in value.uses()
-        if use.node.op_type == "Range" and use.node.graph is graph
-    ]
-    for node, index, value in bounds:
-        # Reshape each bound to a scalar
-        shape = add_constant(graph, np.zeros(0, np.int64), f"{value.name}_shape")
-        scalar = ir.node("Reshape", [value, shape], name=f"{node.name}_bound_{index}")
-        scalar.outputs[0].name = f"{value.name}_scalar_{node.name}_{index}"
-        scalar.outputs[0].type = value.type
-        scalar.outputs[0].shape = ir.Shape([])
-        provenance.inherit(scalar, [node], by=by)
-        graph.insert_before(node, scalar)
-        node.replace_input_with(index, scalar.outputs[0])
-        provenance.inherit(node, [node], by=by)
-    return len(bounds)
+    count = 0
+    for choice in [node for node in graph if node.op_type == "If"]:
+        branches = [attribute.as_graph() for attribute in choice.attributes.values()]
+        if all(branch_fits(choice, branch, opset) for branch in branches):
+            continue
+        bounds = [
+            (use.node, use.idx, value)
+            for value in choice.outputs
+            for use in value.uses()
+            if use.node.op_type == "Range" and use.node.graph is graph
+        ]
+        for node, index, value in bounds:
+            shape = add_constant(graph, np.zeros(0, np.int64), f"{value.name}_shape")
+            name = f"{node.name}_bound_{index}"
+            scalar = ir.node("Reshape", [value, shape], name=name)
+            scalar.outputs[0].name = f"{value.name}_scalar_{node.name}_{index}"
+            scalar.outputs[0].type = value.type
+            scalar.outputs[0].shape = ir.Shape([])
+            provenance.inherit(scalar, [node], by=by)
+            graph.insert_before(node, scalar)
+            node.replace_input_with(index, scalar.outputs[0])
+            provenance.inherit(node, [node], by=by)
+        count += len(bounds)
+    return count

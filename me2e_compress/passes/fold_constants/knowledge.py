@@ -1,40 +1,192 @@
-"""A forward sweep that finds the values of a graph that are known before it runs."""
+"""Find the values of a graph that are known before it runs, and compute them.
 
+A forward sweep collects the constant expressions; onnxruntime evaluates those that are
+chosen, all at once, or one by one.
+"""
+
+import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import onnx
 import onnx_ir as ir
+import onnxruntime
 
 from me2e_compress.graph import array_of, shapes, static_shape
 from me2e_compress.graph.nodes import DRAWS, NATIVE, attribute_values, unrenamed
 from me2e_compress.graph.rewrite import Array, has_subgraph, is_standard
 from me2e_compress.graph.shapes import refined
 from me2e_compress.graph.summary import value_bytes
-from me2e_compress.passes.fold_constants import evaluation
-from me2e_compress.passes.fold_constants.evaluation import Expression, Knowledge
 from me2e_compress.runtime.opening import REFUSALS
+
+SILENT = 4
+"""onnxruntime's log level "fatal": the notes report what cannot be evaluated."""
+
+
+@dataclasses.dataclass(eq=False)
+class Expression:
+    """Equal nodes of constants; each input is replaced by its first equal."""
+
+    nodes: list[ir.Node]
+    inputs: tuple[ir.Value | None, ...]
+
+
+@dataclasses.dataclass
+class Knowledge:
+    """What is known about the values of one graph.
+
+    ``first`` maps a value that is computed twice to the first value that equals it.
+    """
+
+    arrays: dict[ir.Value, Array]
+    expressions: list[Expression]
+    maker: dict[ir.Value, Expression]
+    first: dict[ir.Value, ir.Value]
+
+    def canonical(self, value: ir.Value) -> ir.Value:
+        """Return the first value equal to this one."""
+        return self.first.get(value, value)
+
+
+def evaluate(
+    values: Sequence[ir.Value], known: Knowledge, opset: int
+) -> tuple[dict[ir.Value, Array], list[ir.Node]]:
+    """Return the computed values, and the nodes that the runtime refused.
+
+    Nodes run in one session, or each in its own if that fails.
+    """
+    # What they need, in order
+    wanted = {known.maker[value] for value in values}
+    for one in reversed(known.expressions):
+        if one in wanted:
+            wanted.update(
+                known.maker[value]
+                for value in one.inputs
+                if value in known.maker and value not in known.arrays
+            )
+    needed = [one for one in known.expressions if one in wanted]
+    if not needed:
+        return {}, []
+    try:
+        return run(needed, list(values), known.arrays, opset), []
+    except REFUSALS:
+        pass  # which of them, says each on its own
+    done: dict[ir.Value, Any] = dict(known.arrays)
+    refused: list[ir.Node] = []
+    for one in needed:
+        outputs = [value for value in one.nodes[0].outputs if value.name]
+        inputs = [value for value in one.inputs if value is not None]
+        # Skip nodes whose inputs could not be computed
+        if any(value in known.maker and value not in done for value in inputs):
+            continue
+        try:
+            done.update(run([one], outputs, done, opset))
+        except REFUSALS:
+            refused.extend(one.nodes)
+    return {value: done[value] for value in values if value in done}, refused
+
+
+def run(
+    expressions: Sequence[Expression],
+    values: Sequence[ir.Value],
+    arrays: Mapping[ir.Value, Any],
+    opset: int,
+) -> dict[ir.Value, Any]:
+    """Compute values of expressions, as written, in one session of onnxruntime."""
+    names: dict[ir.Value, str] = {}
+    feeds: dict[str, Any] = {}
+    nodes = [_node(one, names, feeds, arrays) for one in expressions]
+    # Write the expressions as a model of their own
+    ports = [
+        onnx.helper.make_tensor_value_info(
+            name,
+            onnx.helper.np_dtype_to_tensor_dtype(np.dtype(array.dtype)),
+            array.shape,
+        )
+        for name, array in feeds.items()
+    ]
+    made = [onnx.ValueInfoProto(name=names[value]) for value in values]
+    model = onnx.helper.make_model(
+        onnx.helper.make_graph(nodes, "constants", ports, made),
+        opset_imports=[onnx.helper.make_opsetid("", opset)],
+        ir_version=8,
+    )
+    # No optimization: run exactly the nodes as written
+    options = onnxruntime.SessionOptions()
+    options.graph_optimization_level = (
+        onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    )
+    options.intra_op_num_threads = 1
+    options.enable_cpu_mem_arena = False  # it would live as long as a constant does
+    options.log_severity_level = SILENT
+    session = onnxruntime.InferenceSession(
+        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
+    run = onnxruntime.RunOptions()
+    run.log_severity_level = SILENT
+    outputs = session.run([names[value] for value in values], feeds, run)
+    return dict(zip(values, outputs, strict=True))
+
+
+def _node(
+    one: Expression,
+    names: dict[ir.Value, str],
+    feeds: dict[str, Any],
+    arrays: Mapping[ir.Value, Any],
+) -> onnx.NodeProto:
+    proto = ir.serde.serialize_node(one.nodes[0])
+    del proto.input[:], proto.output[:], proto.metadata_props[:]
+    for value in one.inputs:
+        if value is None:
+            proto.input.append("")
+            continue
+        if value not in names:
+            names[value] = f"v{len(names)}"
+            array = arrays.get(value)
+            feeds[names[value]] = array_of(value) if array is None else array
+        proto.input.append(names[value])
+    for value in one.nodes[0].outputs:
+        if value.name:
+            names[value] = f"v{len(names)}"
+        proto.output.append(names[value] if value.name else "")
+    return proto
+
 
 # Shape inference of single nodes, given the data that folding has found.
 
 
 def learn_shapes(
-    node: ir.Node,
-    known: Mapping[ir.Value, Array],
-    opset: int,
-    *,
-    trust_shapes: bool = True,
+    node: ir.Node, known: Mapping[ir.Value, Array], opset: int, *, answers: bool
 ) -> bool:
     """Infer missing shapes of a node's outputs; return whether any is new.
 
-    Use ``trust_shapes=False`` in loops, whose outputs may change shape between rounds.
+    ``answers``: whether shapes of graph outputs are refined, which in loops may change
+    between rounds.
     """
     try:
-        found = shapes.infer_node(node, opset, known=known.get)
+        inferred = shapes.infer_node(node, opset, known=known.get)
     except shapes.REFUSALS:
         return False
-    return _record(node, found, answers=trust_shapes)
+    learnt = False
+    for value in node.outputs:
+        proto = inferred.get(value.name or "")
+        if proto is None:
+            continue
+        shape = ir.serde.deserialize_type_proto_for_shape(proto)
+        # Shapes of graph outputs are only refined
+        if value.is_graph_output():
+            if answers and (more := refined(value.shape, shape)) is not value.shape:
+                value.shape, learnt = more, True
+            continue
+        if value.type is None:
+            value.type = ir.serde.deserialize_type_proto_for_type(proto)
+        if shape is None or (value.shape is not None and value.shape.is_static()):
+            continue
+        if value.shape is None or shape.is_static():
+            value.shape, learnt = shape, True
+    return learnt
 
 
 def branch_fits(node: ir.Node, branch: ir.Graph, opset: int) -> bool:
@@ -45,46 +197,18 @@ def branch_fits(node: ir.Node, branch: ir.Graph, opset: int) -> bool:
     """
     instead = dict(zip(node.outputs, branch.outputs, strict=True))
     readers = dict.fromkeys(use.node for value in instead for use in value.uses())
-    return all(_accepts(reader, instead, opset) for reader in readers)
-
-
-def _accepts(node: ir.Node, instead: Mapping[ir.Value, ir.Value], opset: int) -> bool:
-    arrays = {
-        value: array
-        for value in node.inputs
-        if value is not None
-        and (array := array_of(unrenamed(instead.get(value, value)))) is not None
-    }
-    try:
-        shapes.infer_node(node, opset, known=arrays.get, instead=instead)
-    except shapes.REFUSALS:
-        return False
+    for reader in readers:
+        arrays = {
+            value: array
+            for value in reader.inputs
+            if value is not None
+            and (array := array_of(unrenamed(instead.get(value, value)))) is not None
+        }
+        try:
+            shapes.infer_node(reader, opset, known=arrays.get, instead=instead)
+        except shapes.REFUSALS:
+            return False
     return True
-
-
-def _record(
-    node: ir.Node, found: Mapping[str, onnx.TypeProto], *, answers: bool
-) -> bool:
-    learnt = False
-    for value in node.outputs:
-        proto = found.get(value.name or "")
-        if proto is None:
-            continue
-        # Shapes of graph outputs are only refined
-        if value.is_graph_output():
-            shape = ir.serde.deserialize_type_proto_for_shape(proto)
-            if answers and (more := refined(value.shape, shape)) is not value.shape:
-                value.shape, learnt = more, True
-            continue
-        if value.type is None:
-            value.type = ir.serde.deserialize_type_proto_for_type(proto)
-        shape = ir.serde.deserialize_type_proto_for_shape(proto)
-        if shape is None or (value.shape is not None and value.shape.is_static()):
-            continue
-        if value.shape is None or shape.is_static():
-            value.shape = shape
-            learnt = True
-    return learnt
 
 
 SMALL = 1024
@@ -134,31 +258,30 @@ class Sweep:
     def run(self, graph: ir.Graph) -> Knowledge:
         """Visit every node once, producers before readers."""
         for node in graph:
-            if self._is_shape(node) or self._is_constant(node):
+            if self._is_constant(node):
                 self._infer(node)
                 self._add(node)
             elif self._touched(node):
                 self._infer(node)
         return self.known
 
-    def _is_shape(self, node: ir.Node) -> bool:
-        return (
-            self.trust_shapes
-            and is_standard(node)
-            and node.op_type in ("Shape", "Size")
-            and node not in self.refused
-            and static_shape(node.inputs[0]) is not None
-        )
-
     def _is_constant(self, node: ir.Node) -> bool:
         if node in self.refused or node.op_type in NEVER or not is_standard(node):
             return False
+        shown = self.trust_shapes and node.op_type in ("Shape", "Size")
+        if shown and static_shape(node.inputs[0]) is not None:
+            return True
         if node.op_type in COMPUTE and not self.through_compute:
             return False
-        if node.op_type == "Dropout" and not _is_inference(node, self.opset):
+        training = len(node.inputs) > 2 and node.inputs[2] is not None
+        if node.op_type == "Dropout" and (training or self.opset < 7):
             return False
-        # Bodies may read outer values
-        if has_subgraph(node) or not node.inputs or _is_constant_output(node):
+        # Bodies may read outer values; a weight that is an output needs its Identity
+        if has_subgraph(node) or not node.inputs:
+            return False
+        passes_on = node.op_type == "Identity" and node.outputs[0].is_graph_output()
+        source = node.inputs[0]
+        if passes_on and source is not None and source.is_initializer():
             return False
         return all(value is None or self._known(value) for value in node.inputs)
 
@@ -192,7 +315,7 @@ class Sweep:
             if value is not None:
                 self._known(value)
         arrays, trust = self.known.arrays, self.trust_shapes
-        if learn_shapes(node, arrays, self.opset, trust_shapes=trust):
+        if learn_shapes(node, arrays, self.opset, answers=trust):
             self.learnt.update(outputs)
 
     def _add(self, node: ir.Node) -> None:
@@ -240,7 +363,7 @@ class Sweep:
         if any(value is not None and value not in arrays for value in one.inputs):
             return None
         try:
-            found = evaluation.run([one], [output], arrays, self.opset)[output]
+            found = run([one], [output], arrays, self.opset)[output]
         except REFUSALS:
             return None
         # It may be a sequence, or have another shape than the file claims
@@ -259,17 +382,7 @@ def _shape(node: ir.Node, shape: tuple[int, ...]) -> Array:
     return np.array(shape[start:end], dtype=np.int64)
 
 
-def _is_constant_output(node: ir.Node) -> bool:
-    if node.op_type != "Identity" or not node.outputs[0].is_graph_output():
-        return False
-    return node.inputs[0] is not None and node.inputs[0].is_initializer()
-
-
 def _is_native(value: ir.Value) -> bool:
     if isinstance(value.type, ir.SequenceType | ir.OptionalType):
         return value.type.elem_type.dtype in NATIVE
     return value.dtype in NATIVE
-
-
-def _is_inference(node: ir.Node, opset: int) -> bool:
-    return opset >= 7 and (len(node.inputs) < 3 or node.inputs[2] is None)

@@ -85,18 +85,15 @@ def _simplify(given: Path, folded: Path, timeout_s: float) -> None:
         message = f"fold-with-onnxsim: onnxsim took longer than {timeout_s:g} s"
         raise PassError(message) from error
     except subprocess.CalledProcessError as error:
-        raise PassError(f"fold-with-onnxsim: onnxsim {_end_of(error)}") from error
-
-
-def _end_of(error: subprocess.CalledProcessError) -> str:
-    if error.returncode < 0:
-        return f"was killed by signal {-error.returncode}"
-    lines = [line.strip() for line in str(error.stderr).splitlines() if line.strip()]
-    said = lines[-1] if lines else "nothing"
-    return f"ended with code {error.returncode} and said: {said}"
+        code, lines = error.returncode, str(error.stderr).split("\n")
+        last = next((line.strip() for line in lines[::-1] if line.strip()), "nothing")
+        end = f"ended with code {code} and said: {last}"
+        end = f"was killed by signal {-code}" if code < 0 else end
+        raise PassError(f"fold-with-onnxsim: onnxsim {end}") from error
 
 
 def _own_weights(result: ir.Model, model: ir.Model) -> None:
+    """Read the weights: those of the model where they are equal, others from disk."""
     ours = model.graph.initializers
     for graph in (result.graph, *result.graph.subgraphs()):
         for name, value in graph.initializers.items():
@@ -104,17 +101,14 @@ def _own_weights(result: ir.Model, model: ir.Model) -> None:
             known = ours[name].const_value if name in ours else None
             if tensor is None:
                 continue
-            if known is not None and _same(tensor, known):
+            if (
+                known is not None
+                and tensor.dtype == known.dtype
+                and tensor.shape == known.shape
+                and tensor.tobytes() == known.tobytes()
+            ):
                 value.const_value = known
             elif isinstance(tensor, ir.ExternalTensor):
                 value.const_value = ir.Tensor(
                     tensor.numpy().copy(), dtype=tensor.dtype, name=name
                 )
-
-
-def _same(one: ir.TensorProtocol, other: ir.TensorProtocol) -> bool:
-    return (
-        one.dtype == other.dtype
-        and one.shape == other.shape
-        and one.tobytes() == other.tobytes()
-    )

@@ -8,15 +8,7 @@ import onnx_ir as ir
 from me2e_compress.graph import array_of
 from me2e_compress.graph.rewrite import Fusion, fuse, maker
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.fuse_basic import (
-    activations,
-    affine,
-    any_of,
-    factors,
-    layer_norm,
-    linear,
-    scalars,
-)
+from me2e_compress.passes.fuse_basic import activations, constants, weights
 
 __all__ = ["FuseBasic"]
 
@@ -44,36 +36,26 @@ class FuseBasic(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Try every fusion on every node until none applies."""
-        found = fuse(model, self.fusions(), by=self.name)
-        residual = sum(_is_residual(node) for node in model.graph)
-        return PassResult(model, found.changes, (*found.notes(), *_left(residual)))
+        fused = fuse(model, self.fusions(), by=self.name)
+        residual = sum(
+            node.op_type == "Add"
+            and any(maker(value, "Conv") for value in node.inputs)
+            and all(array_of(value) is None for value in node.inputs)
+            for node in model.graph
+        )
+        left = (
+            f"left {residual} residual Conv + Add as they are: TensorRT and onnxruntime"
+            " fuse them with the activation behind",
+        )
+        notes = (*fused.notes(), *(left if residual else ()))
+        return PassResult(model, fused.changes, notes)
 
     def fusions(self) -> tuple[Fusion, ...]:
         """Return the fusions in the order in which they are tried."""
         return (
-            affine.FUSION,
-            *factors.FUSIONS,
-            linear.GEMM,
-            layer_norm.FUSION,
+            *weights.FUSIONS,
+            constants.GEMM,
+            activations.LAYER_NORM,
             *activations.fusions(swish=self.swish),
-            *linear.CHAIN,
-            any_of.FUSION,
-            scalars.FUSION,
+            *constants.FUSIONS,
         )
-
-
-def _is_residual(node: ir.Node) -> bool:
-    return (
-        node.op_type == "Add"
-        and any(maker(value, "Conv") for value in node.inputs)
-        and all(array_of(value) is None for value in node.inputs)
-    )
-
-
-def _left(residual: int) -> tuple[str, ...]:
-    if not residual:
-        return ()
-    return (
-        f"left {residual} residual Conv + Add as they are: TensorRT and onnxruntime"
-        " fuse them with the activation behind",
-    )

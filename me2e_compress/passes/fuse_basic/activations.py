@@ -1,21 +1,23 @@
-"""Fuse decomposed activations into ONNX's operators.
+"""Fuse what exporters decompose into ONNX's operators: activations, normalization.
 
-Given:   x * 0.5 * (1 + Erf(x / sqrt 2))
-Result:  Gelu(x)
+Given:   x * 0.5 * (1 + Erf(x / sqrt 2));
+         d = x - ReduceMean(x);  d / Sqrt(ReduceMean(d * d) + eps) * scale + bias
+Result:  Gelu(x);  LayerNormalization(x, scale, bias)
 
 Gelu: Hendrycks, Gimpel 2016 (erf and tanh forms). HardSwish: Howard et al. 2019.
-Mish: Misra 2019. Swish: Ramachandran et al. 2017.
+LayerNormalization: Ba, Kiros, Hinton 2016. Mish: Misra 2019. Swish: Ramachandran et al.
+2017.
 """
 
-import dataclasses
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, rank_of
+from me2e_compress.graph import array_of, rank_of, static_shape
+from me2e_compress.graph.nodes import integers_at
 from me2e_compress.graph.rewrite import (
     Array,
     Facts,
@@ -29,11 +31,14 @@ from me2e_compress.graph.rewrite import (
     needs_opset,
     op,
     product,
+    scalar_of,
     sole_reader,
     var,
 )
 
-SINCE = {"Gelu": 20, "HardSwish": 14, "Mish": 18, "Swish": 24}
+SINCE = {
+    "Gelu": 20, "HardSwish": 14, "LayerNormalization": 17, "Mish": 18, "Swish": 24
+}  # fmt: skip
 """The opset that brought each operator."""
 
 TANH_CUBE = 0.044715
@@ -69,54 +74,64 @@ TANH = op(
 LOW, HIGH = (constant(scalar=True, floating=False) for _ in range(2))
 """The bounds of a Clip, of whatever type."""
 
-RELU = op("Relu", X)
-
 
 def fusions(*, swish: bool) -> tuple[Fusion, ...]:
     """Build the fusions; Swish is refused unless allowed."""
-    gelu = product(X, op("Add", ERF, ONE), scale=0.5)
-    tanh_gelu = product(X, op("Add", TANH, ONE), scale=0.5)
-    gated = product(X, op("HardSigmoid", X, where=_is_sixth))
-    return (
-        _named("Gelu", gelu),
-        _named("Gelu", tanh_gelu, {"approximate": "tanh"}),
-        _swish(allowed=swish),
-        _named("Mish", product(X, op("Tanh", op("Softplus", X)))),
-        _named("HardSwish", gated),
-        _named("HardSwish", product(X, RELU6_PLUS_3, scale=1 / 6)),
-        _hard_sigmoid(),
-        _sigmoid(),
-        # without the overflow of the Exp
-        _simple("Softplus", op("Log", op("Add", op("Exp", X), ONE))),
-        _clip(),
-    )
-
-
-def _named(
-    op_type: str, pattern: Pattern, attributes: Mapping[str, str] | None = None
-) -> Fusion:
-    return Fusion(
-        "activations",
-        pattern,
-        lambda match, kit: kit.put(op_type, [match[X]], attributes),
-        needs_opset(op_type, SINCE[op_type]),
-        _is_float,
-    )
-
-
-def _simple(op_type: str, pattern: Pattern) -> Fusion:
-    return Fusion(
-        op_type,
-        pattern,
-        lambda match, kit: kit.put(op_type, [match[X]]),
-        where=_is_float,
-    )
-
-
-def _sigmoid() -> Fusion:
     exponential = op("Add", op("Exp", op("Neg", X)), ONE)
-    spelled = either(op("Div", ONE, exponential), op("Reciprocal", exponential))
-    return dataclasses.replace(_simple("Sigmoid", spelled), check=_stays_a_part)
+    sigmoid = either(op("Div", ONE, exponential), op("Reciprocal", exponential))
+    swish_opset = needs_opset("Swish", SINCE["Swish"])
+
+    def swish_check(match: Match, facts: Facts) -> str | None:
+        reason = swish_opset(match, facts)
+        if reason is None and not swish:
+            return "Swish, for which onnxruntime has no kernel"
+        return reason
+
+    gated, sixth = op("HardSigmoid", X, where=_is_sixth), 1 / 6
+    tanh, gate = {"approximate": "tanh"}, {"alpha": sixth, "beta": 0.5}
+    return (
+        _fusion("Gelu", product(X, op("Add", ERF, ONE), scale=0.5)),
+        _fusion("Gelu", product(X, op("Add", TANH, ONE), scale=0.5), tanh),
+        _fusion("Swish", product(X, op("Sigmoid", X)), check=swish_check),
+        _fusion("Mish", product(X, op("Tanh", op("Softplus", X)))),
+        _fusion("HardSwish", product(X, gated)),
+        _fusion("HardSwish", product(X, RELU6_PLUS_3, scale=sixth)),
+        _fusion(
+            "HardSigmoid", product(RELU6_PLUS_3, scale=sixth), gate, where=_stands_alone
+        ),
+        _fusion("Sigmoid", sigmoid, name="Sigmoid", check=_stays_a_part),
+        # without the overflow of the Exp
+        _fusion("Softplus", op("Log", op("Add", op("Exp", X), ONE)), name="Softplus"),
+        Fusion(
+            "Clip",
+            either(
+                op("Min", either(op("Max", X, LOW), op("Relu", X)), HIGH),
+                op("Max", op("Min", X, HIGH), LOW),
+            ),
+            _put_clip,
+            needs_opset("Clip of all types", CLIP_SINCE),
+            _is_interval,
+        ),
+    )
+
+
+def _fusion(
+    op_type: str,
+    pattern: Pattern,
+    attributes: Mapping[str, float | str] | None = None,
+    *,
+    name: str = "activations",
+    check: Callable[[Match, Facts], str | None] | None = None,
+    where: Callable[[Match, Facts], bool] | None = None,
+) -> Fusion:
+    """Build the fusion of an expression of x into an operator that the opset has."""
+    if check is None and op_type in SINCE:
+        check = needs_opset(op_type, SINCE[op_type])
+
+    def put(match: Match, kit: Kit) -> None:
+        kit.put(op_type, [match[X]], attributes)
+
+    return Fusion(name, pattern, put, check, where or _is_float)
 
 
 def _stays_a_part(match: Match, facts: Facts) -> str | None:
@@ -131,17 +146,13 @@ def _stays_a_part(match: Match, facts: Facts) -> str | None:
         for reader in ahead.popleft().consumers():
             if reader.op_type == "Log":
                 return "Sigmoid that a Log turns back: only written out it is exact"
-            if not _is_layer(reader):
+            by_weights = reader.op_type == "MatMul" and any(
+                array_of(value) is not None for value in reader.inputs
+            )
+            if not by_weights and reader.op_type not in LAYERS:
                 ahead.extend(value for value in reader.outputs if value not in seen)
                 seen.update(reader.outputs)
     return None
-
-
-def _is_layer(node: ir.Node) -> bool:
-    by_weights = node.op_type == "MatMul" and any(
-        array_of(value) is not None for value in node.inputs
-    )
-    return by_weights or node.op_type in LAYERS
 
 
 def _is_float(match: Match, facts: Facts) -> bool:
@@ -154,51 +165,17 @@ def _keeps_rank(match: Match) -> bool:
     return rank is not None and rank == rank_of(match.root.outputs[0])
 
 
-def _swish(*, allowed: bool) -> Fusion:
-    known = needs_opset("Swish", SINCE["Swish"])
-
-    def check(match: Match, facts: Facts) -> str | None:
-        reason = known(match, facts)
-        if reason is None and not allowed:
-            return "Swish, for which onnxruntime has no kernel"
-        return reason
-
-    named = _named("Swish", product(X, op("Sigmoid", X)))
-    return dataclasses.replace(named, check=check)
+def _stands_alone(match: Match, facts: Facts) -> bool:
+    """Leave a HardSigmoid to HardSwish where the product with x follows."""
+    reader = sole_reader(match.root.outputs[0])
+    gates = reader is not None and match[X] in reader.inputs
+    return _is_float(match, facts) and not gates
 
 
 def _is_sixth(node: ir.Node) -> bool:
     alpha = node.attributes.get_float("alpha", 0.2)
     beta = node.attributes.get_float("beta", 0.5)
     return is_close(alpha, 1 / 6) and is_close(beta, 0.5)
-
-
-def _hard_sigmoid() -> Fusion:
-    def stands_alone(match: Match, facts: Facts) -> bool:
-        """Leave it to HardSwish where the product with x follows."""
-        reader = sole_reader(match.root.outputs[0])
-        gates = reader is not None and match[X] in reader.inputs
-        return _is_float(match, facts) and not gates
-
-    return Fusion(
-        "activations",
-        product(RELU6_PLUS_3, scale=1 / 6),
-        lambda match, kit: kit.put(
-            "HardSigmoid", [match[X]], {"alpha": 1 / 6, "beta": 0.5}
-        ),
-        where=stands_alone,
-    )
-
-
-def _clip() -> Fusion:
-    raised = either(op("Max", X, LOW), RELU)
-    return Fusion(
-        "Clip",
-        either(op("Min", raised, HIGH), op("Max", op("Min", X, HIGH), LOW)),
-        _put_clip,
-        needs_opset("Clip of all types", CLIP_SINCE),
-        _is_interval,
-    )
 
 
 def _bounds(match: Match) -> list[Array]:
@@ -220,3 +197,84 @@ def _put_clip(match: Match, kit: Kit) -> None:
         for which, bound in zip(("min", "max"), _bounds(match), strict=True)
     ]
     kit.put("Clip", [match[X], *limits])
+
+
+# Layer normalization.
+
+EPSILON = constant(scalar=True)
+# exporters write x - mean once or twice, and others may read either
+MEANS = tuple(op("ReduceMean", X, more=True, shared=True) for _ in range(2))
+CENTRED, AGAIN = (op("Sub", X, mean, shared=True) for mean in MEANS)
+SQUARE = either(
+    op("Mul", AGAIN, AGAIN),
+    op("Pow", AGAIN, constant(), where=lambda node: scalar_of(node.inputs[1]) == 2.0),
+)
+VARIANCE = op("ReduceMean", SQUARE, more=True)
+NORMALIZED = op("Div", CENTRED, op("Sqrt", op("Add", VARIANCE, EPSILON)))
+
+
+def _is_over_last_axes(match: Match, facts: Facts) -> bool:
+    """Return whether all three means are over the same last axes."""
+    rank = rank_of(match[X]) or 0
+    first, *others = [_axes(match.node(mean)) for mean in (VARIANCE, *MEANS)]
+    if not rank or not first or others != [first, first]:
+        return False
+    if rank_of(match.root.outputs[0]) != rank:
+        return False  # the epsilon has more axes
+    # The axes must be the last ones
+    last = list(range(rank - len(first), rank))
+    return sorted(axis % rank for axis in first) == last
+
+
+def _axes(node: ir.Node) -> list[int] | None:
+    if not node.attributes.get_int("keepdims", 1):
+        return None
+    return integers_at(node, "axes", 1)
+
+
+def _check_normal(match: Match, facts: Facts) -> str | None:
+    since = SINCE["LayerNormalization"]
+    if facts.opset < since:
+        return f"LayerNormalization needs opset {since}"
+    if static_shape(match[X]) is None or match[X].dtype not in KINDS:
+        return "LayerNormalization of an unknown shape or of float64"
+    return None
+
+
+def _put_normal(match: Match, kit: Kit) -> None:
+    source, root = match[X], match.root
+    shape, axes = static_shape(source) or (), _axes(match.node(VARIANCE)) or []
+    normal = shape[len(shape) - len(axes) :]
+    # Take in the scale and bias that follow
+    multiplied, scale = _following(root, "Mul", normal)
+    end = root if multiplied is None else multiplied
+    added, bias = _following(end, "Add", normal)
+    epsilon = match.array(EPSILON)
+    if scale is None:
+        ones = np.ones(normal, epsilon.dtype)
+        scale = kit.constant(ones, f"{root.outputs[0].name}_scale")
+    kit.put(
+        "LayerNormalization",
+        [source, scale, *([] if bias is None else [bias])],
+        {"axis": -len(axes), "epsilon": float(epsilon.item())},
+        behind=[node for node in (multiplied, added) if node is not None],
+    )
+
+
+def _following(
+    node: ir.Node, op_type: str, shape: tuple[int, ...]
+) -> tuple[ir.Node | None, ir.Value | None]:
+    """Return the Mul (or Add) that scales (or shifts) a result, and its constant."""
+    reader = sole_reader(node.outputs[0])
+    if reader is None or reader.op_type != op_type or reader.graph is not node.graph:
+        return None, None
+    for value in reader.inputs:
+        array = array_of(value)
+        if array is not None and array.shape == shape:
+            return reader, value
+    return None, None
+
+
+LAYER_NORM = Fusion(
+    "layer normalizations", NORMALIZED, _put_normal, _check_normal, _is_over_last_axes
+)

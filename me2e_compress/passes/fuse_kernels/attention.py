@@ -1,7 +1,7 @@
 """Fuse attention over long sequences: product, softmax, product."""
 
-import dataclasses
 import math
+from typing import NamedTuple
 
 import onnx_ir as ir
 
@@ -36,8 +36,7 @@ WIDEST = 128
 _Shape = tuple[int, ...]
 
 
-@dataclasses.dataclass(frozen=True)
-class _Attention:
+class _Attention(NamedTuple):
     """Softmax(scale * query turned_key) value, with the heads in the batch.
 
     query [.., Q, C], turned_key [.., C, K], value [.., K, C].
@@ -47,10 +46,6 @@ class _Attention:
     turned_key: ir.Value
     value: ir.Value
     scale: float
-
-    @property
-    def operands(self) -> tuple[ir.Value, ir.Value, ir.Value]:
-        return self.query, self.turned_key, self.value
 
 
 def fuse_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
@@ -69,9 +64,7 @@ def fuse_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
         return None
     if call.opset < _OPSET:
         raise PreconditionError(f"fused nodes need opset {_OPSET} or later")
-    shape = _checked(found, softmax)
-    result = _side_by_side(call, found, shape)
-    return _in_batch(call, found, shape) if result is None else result
+    return _fused(call, found, _checked(found, softmax))
 
 
 def _found(node: ir.Node, softmax: ir.Node) -> _Attention | None:
@@ -104,15 +97,15 @@ def _unscaled(value: ir.Value | None) -> tuple[ir.Value | None, float]:
 
 def _checked(found: _Attention, softmax: ir.Node) -> _Shape:
     """Return the shape [.., Q, C] of the query; refuse what the kernel cannot do."""
-    shapes = [static_shape(each) for each in found.operands]
+    shapes = [static_shape(each) for each in found[:3]]
     query, key, value = shapes
     if query is None or key is None or value is None:
         raise PreconditionError("its shapes are not known")
     if min(map(len, (query, key, value))) < 2:
         raise PreconditionError("one of its operands is a vector")
-    if any(maker(each, "DequantizeLinear") for each in found.operands):
+    if any(maker(each, "DequantizeLinear") for each in found[:3]):
         raise PreconditionError("its products are int8")
-    if any(each.dtype != ir.DataType.FLOAT for each in found.operands):
+    if any(each.dtype != ir.DataType.FLOAT for each in found[:3]):
         raise PreconditionError("it is not of float32 numbers")
     count, width = query[-2:]
     keys = key[-1]
@@ -129,37 +122,34 @@ def _checked(found: _Attention, softmax: ir.Node) -> _Shape:
     return query
 
 
-def _side_by_side(call: FusedCall, found: _Attention, shape: _Shape) -> ir.Value | None:
-    """Write attention of the rows that Transposes read; None if one is not so read."""
-    rank, parts = len(shape), []
-    for value, orders in zip(found.operands, (_ROWS, _KEYS, _ROWS), strict=True):
-        node = maker(value, "Transpose")
-        if node is None or permutation_of(node) != orders.get(rank):
-            return None
-        parts.append(node.inputs[0])
-    rows = [_viewed(call, each, -2) for each in parts]
-    heads, width = shape[-3], shape[-1]
-    result = _attention(call, rows, found.scale * math.sqrt(width), heads)
-    split = call.reshape(result, static_shape(parts[0]) or ())
-    # What takes the heads out of the batch again is done already
-    for reader in call.node.outputs[0].consumers():
-        back = reader.outputs[0]
-        if maker(back, "Transpose") and permutation_of(reader) == _ROWS[rank]:
-            bypass(back, split)
-    return call.transpose(split, _ROWS[rank])
-
-
-def _in_batch(call: FusedCall, found: _Attention, shape: _Shape) -> ir.Value:
-    """Write attention whose heads are in the batch."""
-    last = [*range(len(shape) - 2), len(shape) - 1, len(shape) - 2]
-    node = maker(found.turned_key, "Transpose")
-    if node is not None and permutation_of(node) == last:
-        key = node.inputs[0]
+def _fused(call: FusedCall, found: _Attention, shape: _Shape) -> ir.Value:
+    """Write attention of the rows that Transposes read, or of heads in the batch."""
+    rank, width = len(shape), shape[-1]
+    factor = found.scale * math.sqrt(width)
+    turns = [maker(value, "Transpose") for value in found[:3]]
+    orders = [_ROWS.get(rank), _KEYS.get(rank), _ROWS.get(rank)]
+    reads = [
+        turn.inputs[0]
+        for turn, order in zip(turns, orders, strict=True)
+        if turn is not None and order and permutation_of(turn) == order
+    ]
+    if len(reads) == len(turns):
+        rows = [_viewed(call, each, -2) for each in reads]
+        result = _attention(call, rows, factor, shape[-3])
+        split = call.reshape(result, static_shape(reads[0]) or ())
+        # What takes the heads out of the batch again is done already
+        for reader in call.node.outputs[0].consumers():
+            back = reader.outputs[0]
+            if maker(back, "Transpose") and permutation_of(reader) == _ROWS[rank]:
+                bypass(back, split)
+        return call.transpose(split, _ROWS[rank])
+    last = [*range(rank - 2), rank - 1, rank - 2]
+    if turns[1] is not None and permutation_of(turns[1]) == last:
+        key = turns[1].inputs[0]
     else:
         key = call.transpose(found.turned_key, last)
     rows = [_viewed(call, each, -1) for each in (found.query, key, found.value)]
-    result = _attention(call, rows, found.scale * math.sqrt(shape[-1]), 1)
-    return call.reshape(result, shape)
+    return call.reshape(_attention(call, rows, factor, 1), shape)
 
 
 def _viewed(call: FusedCall, value: ir.Value | None, rows: int) -> ir.Value:

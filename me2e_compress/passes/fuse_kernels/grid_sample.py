@@ -47,7 +47,7 @@ def fuse_grid_sample(node: ir.Node, call: FusedCall) -> ir.Value | None:
     if image is None or grid is None:
         return None
     # Check attributes, sizes and what it gains
-    mode, sizes = _mode(node), _sizes(image, grid)
+    mode, sizes = _checked(node, image, grid)
     rows = _source_rows(image, sizes)
     turned = _turned_readers(node.outputs[0], sizes)
     if mode != _NEAREST and rows is None and not turned:
@@ -58,7 +58,12 @@ def fuse_grid_sample(node: ir.Node, call: FusedCall) -> ir.Value | None:
         whole = call.reshape(image, (n, channels, -1))
         rows = call.transpose(whole, (0, 2, 1))
     value = call.reshape(rows, (n, sizes.height * sizes.width, 1, channels))
-    sampled = _attention(call, value, _locations(call, grid, mode, sizes), sizes)
+    at = _locations(call, grid, mode, sizes)
+    ones = np.ones((n, sizes.points, 1, 1, 1))
+    maps = call.sizes((sizes.height, sizes.width), (1, 2)), call.integers([0])
+    inputs = [value, *maps, at, call.numbers(ones, value)]
+    sampled = call.add("MultiScaleDeformableAttention", inputs, domain=OWN_DOMAIN)
+    sampled.type, sampled.shape = value.type, ir.Shape((n, sizes.points, 1, channels))
     # Readers that turn channels to the last axis read the rows as they are
     for reader in turned:
         shape = static_shape(reader.outputs[0]) or ()
@@ -68,7 +73,8 @@ def fuse_grid_sample(node: ir.Node, call: FusedCall) -> ir.Value | None:
     return call.reshape(result, (n, channels, *sizes.grid[1:3]))
 
 
-def _mode(node: ir.Node) -> str:
+def _checked(node: ir.Node, image: ir.Value, grid: ir.Value) -> tuple[str, _Sizes]:
+    """Return how it samples, and its sizes; refuse what the kernel cannot do."""
     mode = node.attributes.get_string("mode", "bilinear")
     padding = node.attributes.get_string("padding_mode", "zeros")
     if mode not in (*_BILINEAR, _NEAREST):
@@ -77,10 +83,6 @@ def _mode(node: ir.Node) -> str:
         raise PreconditionError(f"it pads with {padding}, not zeros")
     if node.attributes.get_int("align_corners", 0):
         raise PreconditionError("it aligns corners")
-    return mode
-
-
-def _sizes(image: ir.Value, grid: ir.Value) -> _Sizes:
     map_, places = static_shape(image), static_shape(grid)
     if map_ is None or places is None or len(map_) != 4 or 0 in (*map_, *places):
         raise PreconditionError("sizes are unknown, or it samples a volume")
@@ -88,7 +90,7 @@ def _sizes(image: ir.Value, grid: ir.Value) -> _Sizes:
         raise PreconditionError("it is not of float32")
     if map_[1] < LEAST_CHANNELS:
         raise PreconditionError(f"{map_[1]} channels, below {LEAST_CHANNELS}")
-    return _Sizes(*map_, places)
+    return mode, _Sizes(*map_, places)
 
 
 def _source_rows(image: ir.Value, sizes: _Sizes) -> ir.Value | None:
@@ -147,24 +149,3 @@ def _locations(call: FusedCall, grid: ir.Value, mode: str, s: _Sizes) -> ir.Valu
         pixel = call.add("Round", [call.add("Mul", [pixel, half])])
         at = call.add("Div", [call.add("Add", [pixel, half]), size])
     return call.reshape(at, (s.batch, s.points, 1, 1, 1, 2))
-
-
-def _attention(
-    call: FusedCall, value: ir.Value, locations: ir.Value, s: _Sizes
-) -> ir.Value:
-    """Write the sum of one sample of one map for each query, [N, Q, 1, C]."""
-    ones = np.ones((s.batch, s.points, 1, 1, 1))
-    result = call.add(
-        "MultiScaleDeformableAttention",
-        [
-            value,
-            call.sizes((s.height, s.width), (1, 2)),
-            call.integers([0]),
-            locations,
-            call.numbers(ones, value),
-        ],
-        domain=OWN_DOMAIN,
-    )
-    result.type = value.type
-    result.shape = ir.Shape((s.batch, s.points, 1, s.channels))
-    return result

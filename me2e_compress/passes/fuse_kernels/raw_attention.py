@@ -149,12 +149,9 @@ def _find(node: ir.Node) -> _Found | None:
     places = _sum(at)
     if places is not None:
         found = dataclasses.replace(found, near=places[0], away=places[1])
-    return None if found == plain else _with_cheapest(found)
-
-
-def _with_cheapest(found: _Found) -> _Found:
-    """Read every operand where that moves the least data."""
-    sizes = found.sizes
+    if found == plain:
+        return None
+    # Every operand is read where that moves the least data
     near, scores = found.near, found.scores
     return dataclasses.replace(
         found,

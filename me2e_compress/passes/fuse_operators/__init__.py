@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence
 from typing import ClassVar
 
 import onnx_ir as ir
@@ -79,15 +78,27 @@ class FuseOperators(Pass):
             return PassResult(model, 0)
         opset, unread = opset_of(model), remove_dead(model.graph)
         run = _Run(self, opset, value_names(model.graph), Proofs(opset, context.seed))
+        done = samplers = 0
+        left: list[str] = []
         for body in graphs_of(model.graph):
             for node in list(body):
-                if node.graph is body and _is_sampler(node):
-                    run.attempt(body, node)
-        if run.done:
+                if node.graph is not body or not _is_sampler(node):
+                    continue
+                try:
+                    samplers += run.fuse(body, node)
+                    done += 1
+                except (PreconditionError, GraphError) as error:
+                    left.append(f"left {node.name}: {error}")
+        if done:
             model.opset_imports.setdefault(OWN_DOMAIN, 1)
             remove_dead(model.graph)
+        fused = (
+            f"fused: {done} deformable attentions of {samplers} GridSample,"
+            f" {run.worst:.1g} apart at most",
+        )
         swept = (f"removed: {unread} unread",) * bool(unread)
-        return PassResult(model, run.done + unread, (*run.notes(), *swept))
+        notes = (*(fused if done else ()), *left, *swept)
+        return PassResult(model, done + unread, notes)
 
 
 def _is_sampler(node: ir.Node) -> bool:
@@ -95,39 +106,23 @@ def _is_sampler(node: ir.Node) -> bool:
 
 
 class _Run:
+    """Fuses one match after another; ``worst`` is the largest error that was let by."""
+
     def __init__(
         self, current: FuseOperators, opset: int, names: set[str], proofs: Proofs
     ) -> None:
         self.current, self.opset, self.names = current, opset, names
         self.proofs = proofs
-        self.done, self.samplers, self.worst = 0, 0, 0.0
-        self.left: list[str] = []
+        self.worst = 0.0
 
-    def notes(self) -> tuple[str, ...]:
-        fused = (
-            f"fused: {self.done} deformable attentions of {self.samplers} GridSample,"
-            f" {self.worst:.1g} apart at most"
-        )
-        return (*([fused] if self.done else ()), *self.left)
-
-    def attempt(self, body: ir.Graph, node: ir.Node) -> None:
-        try:
-            found = decomposed.find(node)
-            self._replace(body, self._plan(found))
-        except (PreconditionError, GraphError) as error:
-            self.left.append(f"left {node.name}: {error}")
-            return
-        self.done += 1
-        self.samplers += len(found.levels)
-
-    def _plan(self, found: decomposed.Decomposed) -> fused_form.Plan:
-        """Plan with the following sum over images, if that can be included."""
+    def fuse(self, body: ir.Graph, node: ir.Node) -> int:
+        """Fuse the attention of a GridSample; return how many GridSample it has."""
+        match, plan = decomposed.find(node), None
+        # With the following sum over images, if that can be included
         if self.current.merge_images:
             with contextlib.suppress(PreconditionError):
-                return fused_form.plan(decomposed.with_images(found))
-        return fused_form.plan(found)
-
-    def _replace(self, body: ir.Graph, plan: fused_form.Plan) -> None:
+                plan = fused_form.plan(decomposed.with_images(match))
+        plan = fused_form.plan(match) if plan is None else plan
         old = plan.result.value
         root, known = old.producer(), set(body.initializers)
         if root is None:
@@ -140,31 +135,30 @@ class _Run:
         made = nodes_between(new, inputs)
         # Keep it only if both compute the same
         try:
-            self._prove(old, new, plan)
+            error = self.proofs.error(old, new, plan.inputs)
+            if not error <= self.current.tolerance:
+                raise PreconditionError(
+                    f"as one node it differs by {error:.1e} (allowed"
+                    f" {self.current.tolerance:.0e})"
+                )
         except (PreconditionError, GraphError):
             take_back(body, made, known)
             raise
-        # Replace the old result and clean up
+        self.worst = max(self.worst, error)
+        # Replace the old result and clean up, readers first
         for each in made:
             inherit(each, [root, *matched], by=self.current.name)
         replace_value(old, new)
         self._fold(body, new, plan)
-        _drop_dead([*matched, *made])
-
-    def _prove(self, old: ir.Value, new: ir.Value, plan: fused_form.Plan) -> None:
-        error = self.proofs.error(old, new, plan.inputs)
-        if not error <= self.current.tolerance:
-            raise PreconditionError(
-                f"as one node it differs by {error:.1e} (allowed"
-                f" {self.current.tolerance:.0e})"
-            )
-        self.worst = max(self.worst, error)
+        for each in reversed([*matched, *made]):
+            if each.graph is not None and not any(map(is_read, each.outputs)):
+                each.graph.remove(each, safe=True)
+        return len(match.levels)
 
     def _fold(self, body: ir.Graph, new: ir.Value, plan: fused_form.Plan) -> None:
-        views = [view.value for view in plan.inputs]
-        node = next(
-            each for each in nodes_between(new, views) if each.domain == OWN_DOMAIN
-        )
+        """Store operands that are computed of constants alone."""
+        between = nodes_between(new, [view.value for view in plan.inputs])
+        node = next(each for each in between if each.domain == OWN_DOMAIN)
         mask = () if plan.mask is None else (plan.mask,)
         for index, read in (
             (0, plan.value.views),
@@ -172,17 +166,9 @@ class _Run:
             (4, (*plan.weights.views, *mask)),
         ):
             value = node.inputs[index]
-            # Only operands without computed parts
             constant = all(array_of(view.value) is not None for view in read)
             if value is None or value.producer() is None or not constant:
                 continue
             array = run_piece(piece_of(value, (), self.opset), ())
             name = f"{value.name}_constant"
             node.replace_input_with(index, add_constant(body, array, name, self.names))
-
-
-def _drop_dead(nodes: Sequence[ir.Node]) -> None:
-    """Remove the nodes that nothing reads any more; they must be in graph order."""
-    for node in reversed(nodes):
-        if node.graph is not None and not any(is_read(each) for each in node.outputs):
-            node.graph.remove(node, safe=True)

@@ -86,7 +86,7 @@ def find(node: ir.Node) -> Decomposed:
     total, _ = _total(list(results(product))[-1], ("ReduceSum",))
     left, before = flat(total.layout), flat(product.layout)
     # Only rows, columns and levels may be summed over
-    gone = _difference(before, left)
+    gone = tuple(digit for digit in before if digit not in left)
     if any(digit.axis in (BATCH, CHANNEL) for digit in gone):
         raise PreconditionError("the sum is over channels or heads too")
     if any(digit.axis == LEVEL for digit in left):
@@ -119,7 +119,8 @@ def with_images(found: Decomposed) -> Decomposed:
     except PreconditionError:
         return found
     # Only axes of the batch may be summed over
-    gone = _difference(flat(end.layout), flat(total.layout))
+    left = flat(total.layout)
+    gone = tuple(digit for digit in flat(end.layout) if digit not in left)
     if not gone or any(digit.axis != BATCH for digit in gone):
         return found
     count = math.prod(digit.size for digit in gone)
@@ -132,15 +133,11 @@ def with_images(found: Decomposed) -> Decomposed:
     )
 
 
-def _difference(digits: Digits, others: Digits) -> Digits:
-    return tuple(digit for digit in digits if digit not in others)
-
-
 def _level(node: ir.Node) -> tuple[Level, View]:
     for name, allowed in SAMPLING.items():
-        found = node.attributes.get_string(name, allowed[0])
-        if found not in allowed:
-            raise PreconditionError(f"it samples with {name}={found}")
+        given = node.attributes.get_string(name, allowed[0])
+        if given not in allowed:
+            raise PreconditionError(f"it samples with {name}={given}")
     if node.attributes.get_int("align_corners", 0):
         raise PreconditionError("it samples with align_corners=1")
     # Shapes and types must be known and supported
@@ -156,22 +153,12 @@ def _level(node: ir.Node) -> tuple[Level, View]:
         raise PreconditionError("it samples in another type than float32")
     # Describe both operands by their digits
     batch, channels, height, width = shape
-    pixels = (
-        (Digit(PIXEL, width, height),) if height > 1 else (),
-        (Digit(PIXEL, 1, width),) if width > 1 else (),
-    )
-    first, rows, columns = (
-        whole(BATCH, batch),
-        whole(ROW, places[1]),
-        whole(COLUMN, places[2]),
-    )
-    second = whole(CHANNEL, channels)
-    level = Level(
-        node,
-        View(image, (first, second, *pixels)),
-        View(grid, (first, rows, columns, whole(XY, 2))),
-        (height, width),
-    )
+    row = (Digit(PIXEL, width, height),) if height > 1 else ()
+    first, second = whole(BATCH, batch), whole(CHANNEL, channels)
+    rows, columns = whole(ROW, places[1]), whole(COLUMN, places[2])
+    maps = View(image, (first, second, row, whole(PIXEL, width)))
+    at = View(grid, (first, rows, columns, whole(XY, 2)))
+    level = Level(node, maps, at, (height, width))
     return level, View(node.outputs[0], (first, second, rows, columns))
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 
 import numpy as np
 import onnx_ir as ir
@@ -48,10 +48,11 @@ class Source:
 
 def join_pixels(selections: Sequence[Selection]) -> View | None:
     """Join feature maps that were cut from one row of pixels, level after level."""
-    for each in selections:
-        digits = merged(each.view.layout[each.axis])
-        if digits != whole(PIXEL, each.size):
-            return None
+    if any(
+        merged(each.view.layout[each.axis]) != whole(PIXEL, each.size)
+        for each in selections
+    ):
+        return None
     return joined(selections, whole(PIXEL, sum(each.size for each in selections)))
 
 
@@ -93,8 +94,12 @@ def options_of(
 
 def whole_views(view: View) -> list[View]:
     """Return where a value can be read as a whole and unscaled."""
-    found = (each for each in sources(view) if isinstance(each, View))
-    return [each for each in found if _same(each, view)]
+    return [
+        each
+        for each in sources(view)
+        if isinstance(each, View)
+        and (each.scale, each.shift) == (view.scale, view.shift)
+    ]
 
 
 def sums_of(option: Source) -> list[Source]:
@@ -112,10 +117,6 @@ def sums_of(option: Source) -> list[Source]:
         for part in parts
     )
     return [Source((a, b), total=True) for a in first for b in second]
-
-
-def _same(view: View, other: View) -> bool:
-    return (view.scale, view.shift) == (other.scale, other.shift)
 
 
 def cheapest(
@@ -199,10 +200,7 @@ def laid_out(call: FusedCall, view: View, form: Layout) -> ir.Value:
         value = call.transpose(_shaped(call, value, shape, sizes(tuple(pieces))), order)
         shape = tuple(sizes(tuple(pieces))[place] for place in order)
     if len(present) < len(wanted):
-        # Repeat along the missing digits
-        ones = [digit.size if digit in have else 1 for digit in wanted]
-        value = _shaped(call, value, shape, ones)
-        return _expanded(call, value, ones, wanted, form)
+        return _repeated(call, value, shape, wanted, have, form)
     return _shaped(call, value, shape, sizes(form))
 
 
@@ -212,35 +210,10 @@ def combined(
     """Write an Add or Mul of views in a layout, each repeated by broadcasting."""
     if len(views) == 1:
         return laid_out(call, views[0], form)
-    # Group the digits so that a view has or lacks each group as a whole
+    # Split each dimension into runs that every view has or lacks as a whole
     digits = [digit for view in views for digit in flat(view.layout)]
     every = split_like(flat(form), digits)
     have = [set(split_like(flat(view.layout), every)) for view in views]
-    groups = _groups(form, digits, have)
-    # Combine the views by broadcasting
-    value: ir.Value | None = None
-    for view, mine in zip(views, have, strict=True):
-        own = tuple(run if run[0] in mine else () for run in groups)
-        part = laid_out(call, view, own)
-        value = part if value is None else call.add(op_type, [value, part])
-    assert value is not None
-    # Expand along digits that no view has
-    found = [run if any(run[0] in each for each in have) else () for run in groups]
-    shape = sizes(tuple(found))
-    if shape != sizes(tuple(groups)):
-        wanted = tuple(digit for run in groups for digit in run)
-        ones = [
-            digit.size if any(digit in each for each in have) else 1 for digit in wanted
-        ]
-        value = _shaped(call, value, shape, ones)
-        return _expanded(call, value, ones, wanted, form)
-    return _shaped(call, value, shape, sizes(form))
-
-
-def _groups(
-    form: Layout, digits: Sequence[Digit], have: Sequence[set[Digit]]
-) -> list[tuple[Digit, ...]]:
-    """Split each dimension into runs that every view has or lacks as a whole."""
     groups: list[tuple[Digit, ...]] = []
     for dimension in form:
         last: tuple[bool, ...] | None = None
@@ -251,17 +224,34 @@ def _groups(
             else:
                 groups.append((digit,))
             last = who
-    return groups
+    # Combine the views by broadcasting
+    value: ir.Value | None = None
+    for view, mine in zip(views, have, strict=True):
+        own = tuple(run if run[0] in mine else () for run in groups)
+        part = laid_out(call, view, own)
+        value = part if value is None else call.add(op_type, [value, part])
+    assert value is not None
+    # Expand along digits that no view has
+    present = set().union(*have)
+    shape = sizes(tuple(run if run[0] in present else () for run in groups))
+    if shape == sizes(tuple(groups)):
+        return _shaped(call, value, shape, sizes(form))
+    wanted = [digit for run in groups for digit in run]
+    return _repeated(call, value, shape, wanted, present, form)
 
 
-def _expanded(
+def _repeated(
     call: FusedCall,
     value: ir.Value,
-    ones: Sequence[int],
+    shape: Sequence[int],
     wanted: Sequence[Digit],
+    present: Container[Digit],
     form: Layout,
 ) -> ir.Value:
+    """Repeat a value of some digits over the wanted ones, in a layout."""
     full = [digit.size for digit in wanted]
+    ones = [digit.size if digit in present else 1 for digit in wanted]
+    value = _shaped(call, value, shape, ones)
     value = call.add("Expand", [value, call.integers(full)])
     return _shaped(call, value, full, sizes(form))
 
@@ -344,33 +334,24 @@ def write(chosen: Plan, call: FusedCall) -> ir.Value:
     found = chosen.found
     form = _Form(found, chosen.heads)
     images = math.prod(digit.size for digit in found.images)
-    # Each image is one more set of levels
+    # Weights with their mask and scale; each image is one more set of levels
     shapes = np.array([level.size for level in found.levels] * images, np.int64)
     areas = shapes.prod(axis=1)
-    made = call.add(
-        OP_TYPE,
-        [
-            _operand(call, chosen.value, form.value, 1),
-            call.constant(shapes, "spatial_shapes"),
-            call.constant(np.cumsum(areas) - areas, "level_start_index"),
-            _operand(call, chosen.locations, form.locations, 3),
-            _weights(call, chosen, form),
-        ],
-        domain=OWN_DOMAIN,
-    )
+    operands = [
+        _operand(call, chosen.value, form.value, 1),
+        call.constant(shapes, "spatial_shapes"),
+        call.constant(np.cumsum(areas) - areas, "level_start_index"),
+        _operand(call, chosen.locations, form.locations, 3),
+    ]
+    factors = [*chosen.weights.views, *([chosen.mask] if chosen.mask else [])]
+    weights = combined(call, "Mul", factors, form.weights(None))
+    if found.scale != 1.0:
+        weights = call.add("Mul", [weights, call.numbers(found.scale, weights)])
+    made = call.add(OP_TYPE, [*operands, weights], domain=OWN_DOMAIN)
     # Bring the result to the layout of the replaced value
     made.dtype = ir.DataType.FLOAT
     made.shape = ir.Shape(sizes(form.result))
     return laid_out(call, View(made, form.result), chosen.result.layout)
-
-
-def _weights(call: FusedCall, chosen: Plan, form: "_Form") -> ir.Value:
-    factors = [*chosen.weights.views, *([chosen.mask] if chosen.mask else [])]
-    value = combined(call, "Mul", factors, form.weights(None))
-    scale = chosen.found.scale
-    return (
-        value if scale == 1.0 else call.add("Mul", [value, call.numbers(scale, value)])
-    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -44,12 +44,6 @@ class Selection:
     start: int
     size: int
 
-    @property
-    def length(self) -> int:
-        """The size of the whole dimension."""
-        shape = static_shape(self.view.value) or ()
-        return shape[self.axis]
-
 
 def sources(view: View) -> Iterator[View | Selection]:
     """Walk from a value, itself first, back to where its elements come from.
@@ -79,24 +73,21 @@ def results(view: View) -> Iterator[View]:
 
 def joined(selections: Sequence[Selection], digits: Digits) -> View | None:
     """Return the view that consecutive parts make up together; None if they do not."""
-    first = selections[0]
-    start = 0
+    first, start = selections[0], 0
+    axis, layout = first.axis, first.view.layout
     # The parts must be adjacent and equal in all other respects
     for each in selections:
-        alike = dataclasses.replace(each.view, layout=()) == dataclasses.replace(
-            first.view, layout=()
-        )
-        rest, ours = _without(each.view.layout, each.axis), first.view.layout
-        if not alike or each.axis != first.axis or each.start != start:
-            return None
-        if rest != _without(ours, first.axis):
+        own = each.view.layout
+        beside = own[: each.axis] + layout[axis : axis + 1] + own[each.axis + 1 :]
+        alike = dataclasses.replace(each.view, layout=beside) == first.view
+        if not alike or each.axis != axis or each.start != start:
             return None
         start += each.size
-    if start != first.length or math.prod(d.size for d in digits) != start:
+    whole = (static_shape(first.view.value) or ())[axis]
+    if start != whole or math.prod(d.size for d in digits) != start:
         return None
-    layout = list(first.view.layout)
-    layout[first.axis] = digits
-    return dataclasses.replace(first.view, layout=tuple(layout))
+    layout = (*layout[:axis], digits, *layout[axis + 1 :])
+    return dataclasses.replace(first.view, layout=layout)
 
 
 def terms(view: View) -> tuple[View, View] | None:
@@ -123,10 +114,6 @@ def aligned(layout: Layout, shape: Sequence[int]) -> Layout:
     )
 
 
-def _without(layout: Layout, axis: int) -> Layout:
-    return layout[:axis] + layout[axis + 1 :]
-
-
 def _earlier(view: View) -> View | Selection | None:
     node = producer_of(view.value)
     if node is None or not is_standard(node) or not node.inputs:
@@ -149,17 +136,15 @@ def _earlier(view: View) -> View | Selection | None:
 
 
 def _after(node: ir.Node, view: View) -> View | None:
-    if not is_standard(node) or node.inputs[0] is not view.value:
-        return None
     result = node.outputs[0]
-    shape = static_shape(result)
-    if shape is None:
+    shape, order = static_shape(result), permutation_of(node)
+    if not is_standard(node) or node.inputs[0] is not view.value or shape is None:
         return None
     layout: Layout | None = None
     if node.op_type in VIEWS:
         layout = regrouped(view.layout, shape)
     elif node.op_type == "Transpose":
-        layout = tuple(view.layout[axis] for axis in permutation_of(node) or ())
+        layout = tuple(view.layout[axis] for axis in order or ())
     if layout is None:
         return None
     return dataclasses.replace(view, value=result, layout=layout)
@@ -193,55 +178,35 @@ def _number(value: ir.Value | None) -> float | None:
 
 
 def _selected(node: ir.Node, view: View) -> Selection | None:
-    source = node.inputs[0]
+    """Return the part of a dimension that a Gather, Slice or Split takes."""
+    source, made = node.inputs[0], static_shape(view.value)
     shape = static_shape(source)
     if source is None or shape is None:
         return None
-    part = {"Gather": _gathered, "Slice": _sliced, "Split": _split}[node.op_type](
-        node, view.value, shape
-    )
-    if part is None:
-        return None
-    axis, start, size, kept = part
+    axis, size = node.attributes.get_int("axis", 0) % len(shape), 1
+    if node.op_type == "Gather":
+        index = integers_of(input_at(node, 1))
+        if index is None or len(index) != 1:
+            return None
+        start = index[0] % shape[axis]
+    elif node.op_type == "Slice":
+        starts, axes = integers_of(input_at(node, 1)), integers_of(input_at(node, 3))
+        steps = integers_of(input_at(node, 4)) if len(node.inputs) > 4 else [1]
+        if starts is None or len(starts) != 1 or steps != [1] or made is None:
+            return None
+        axis = (0 if axes is None else axes[0]) % len(shape)
+        first = starts[0] + shape[axis] if starts[0] < 0 else starts[0]
+        start, size = min(first, shape[axis]), made[axis]
+    else:
+        parts = [static_shape(part) for part in node.outputs]
+        at = view.value.index() or 0
+        known = [part[axis] for part in parts[: at + 1] if part is not None]
+        if len(known) <= at:
+            return None
+        start, size = sum(known[:at]), known[at]
+    # A Gather of one index may drop the axis
     layout = list(view.layout)
-    if not kept:
+    if node.op_type == "Gather" and len(made or ()) != len(shape):
         layout.insert(axis, ())
     whole = dataclasses.replace(view, value=source, layout=tuple(layout))
     return Selection(whole, axis, start, size)
-
-
-_Part = tuple[int, int, int, bool]
-"""Axis, first index, how many, and whether the dimension stays."""
-
-
-def _gathered(node: ir.Node, made: ir.Value, shape: tuple[int, ...]) -> _Part | None:
-    index = integers_of(input_at(node, 1))
-    if index is None or len(index) != 1:
-        return None
-    axis = node.attributes.get_int("axis", 0) % len(shape)
-    kept = len(static_shape(made) or ()) == len(shape)
-    return axis, index[0] % shape[axis], 1, kept
-
-
-def _sliced(node: ir.Node, made: ir.Value, shape: tuple[int, ...]) -> _Part | None:
-    starts, axes = integers_of(input_at(node, 1)), integers_of(input_at(node, 3))
-    steps = integers_of(input_at(node, 4)) if len(node.inputs) > 4 else [1]
-    found = static_shape(made)
-    if starts is None or len(starts) != 1 or steps != [1] or found is None:
-        return None
-    axis = (0 if axes is None else axes[0]) % len(shape)
-    start = min(starts[0] + shape[axis] if starts[0] < 0 else starts[0], shape[axis])
-    return axis, start, found[axis], True
-
-
-def _split(node: ir.Node, made: ir.Value, shape: tuple[int, ...]) -> _Part | None:
-    axis = node.attributes.get_int("axis", 0) % len(shape)
-    start = 0
-    for each in node.outputs:
-        parts = static_shape(each)
-        if parts is None:
-            return None
-        if each is made:
-            return axis, start, parts[axis], True
-        start += parts[axis]
-    return None

@@ -9,10 +9,9 @@ from me2e_compress.display import counted
 from me2e_compress.graph import macs, nodes_of, opset_of
 from me2e_compress.graph.rewrite import graphs_of, remove_dead, value_names
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.hoist_linear.layers import layer_at
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.repeats import before_repeat
-from me2e_compress.passes.hoist_linear.sums import multiply_earlier
+from me2e_compress.passes.hoist_linear.sums import layer_at, multiply_earlier
 from me2e_compress.passes.work import BYTES_PER_NODE
 
 __all__ = ["HoistLinear"]
@@ -22,36 +21,6 @@ OLDEST_OPSET = 8
 
 ROUNDS = 8
 """A round may move further what the last one moved: real graphs need two."""
-
-
-@dataclasses.dataclass
-class _Tally:
-    products: int = 0
-    others: int = 0
-    unread: int = 0
-    left: int = 0
-
-    @property
-    def changes(self) -> int:
-        return self.products + self.others + self.unread
-
-    def notes(self, macs: int) -> tuple[str, ...]:
-        found = []
-        if self.products:
-            less = f"{macs / 1e6:,.1f} MMACs fewer"
-            found.append(f"moved {counted(self.products, 'product')}: {less}")
-        if self.others:
-            found.append(
-                f"moved {counted(self.others, 'other node')} before repeated rows"
-            )
-        if self.left:
-            what = counted(self.left, "node")
-            found.append(
-                f"left {what} behind what repeats: others read it too, or it is small"
-            )
-        if self.unread:
-            found.append(f"removed what nothing reads: {self.unread}")
-        return tuple(found)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,36 +50,47 @@ class HoistLinear(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Rewrite every node that has a cheaper form, until none has."""
-        tally, opset = _Tally(), opset_of(model)
+        opset = opset_of(model)
         if opset < OLDEST_OPSET:
             return PassResult(model, 0)
-        tally.unread = remove_dead(model.graph)  # it would hold on to what it reads
-        names, before = value_names(model.graph), _macs(model)
+        unread = remove_dead(model.graph)  # it would hold on to what it reads
+        names, macs_before = value_names(model.graph), _macs(model)
         rewriters = [
-            Rewriter(each, names, self.name) for each in graphs_of(model.graph)
+            Rewriter(body, names, self.name) for body in graphs_of(model.graph)
         ]
+        products = others = left = 0
         for _ in range(ROUNDS):
-            changes, tally.left = tally.changes, 0  # those of the last round are left
+            moved, left = products + others, 0  # those of the last round are left
             for rewriter in rewriters:
-                self._round(rewriter, opset, tally)
-            if tally.changes == changes:
+                for node in list(rewriter.graph):
+                    if node.graph is not rewriter.graph:
+                        continue
+                    layer = layer_at(node)
+                    before = before_repeat(node, rewriter, opset)
+                    if before:
+                        products += layer is not None
+                        others += layer is None
+                        continue
+                    left += before is False
+                    if layer is not None:
+                        price = self.bytes_per_node
+                        products += multiply_earlier(layer, rewriter, price)
+            if products + others == moved:
                 break
             remove_dead(model.graph)
-        return PassResult(model, tally.changes, tally.notes(before - _macs(model)))
-
-    def _round(self, rewriter: Rewriter, opset: int, tally: _Tally) -> None:
-        for node in list(rewriter.graph):
-            if node.graph is not rewriter.graph:
-                continue
-            layer = layer_at(node)
-            moved = before_repeat(node, rewriter, opset)
-            if moved:
-                tally.products += layer is not None
-                tally.others += layer is None
-                continue
-            tally.left += moved is False
-            if layer is not None:
-                tally.products += multiply_earlier(layer, rewriter, self.bytes_per_node)
+        less = f"{(macs_before - _macs(model)) / 1e6:,.1f} MMACs fewer"
+        notes = (
+            (products, f"moved {counted(products, 'product')}: {less}"),
+            (others, f"moved {counted(others, 'other node')} before repeated rows"),
+            (
+                left,
+                f"left {counted(left, 'node')} behind what repeats: others read it too,"
+                " or it is small",
+            ),
+            (unread, f"removed what nothing reads: {unread}"),
+        )
+        changes = products + others + unread
+        return PassResult(model, changes, tuple(note for n, note in notes if n))
 
 
 def _macs(model: ir.Model) -> int:

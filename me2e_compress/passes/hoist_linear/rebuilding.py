@@ -65,42 +65,26 @@ class Rewriter:
             if not is_read(value) and value.is_initializer():
                 del self.graph.initializers[value.name or ""]
 
-    def write(
-        self,
-        op_type: str,
-        inputs: Sequence[ir.Value | None],
-        attributes: Sequence[ir.Attr],
-        shape: tuple[int, ...],
-        *,
-        sources: Sequence[ir.Node],
-        like: ir.Value,
-    ) -> ir.Value:
-        """Write a node that replaces ``sources``, before the maker of ``like``."""
-        place = like.producer()
-        assert place is not None
-        name = fresh_name(f"{sources[0].name}_{op_type}", self.names)
-        node = ir.Node("", op_type, inputs, attributes, num_outputs=1, name=name)
-        value = node.outputs[0]
-        value.name, value.type, value.shape = name, like.type, ir.Shape(shape)
-        inherit(node, sources, by=self.by)
-        self.graph.insert_before(place, node)
-        return value
-
 
 class NodeWriter:
     """Writes nodes of known shapes in front of the node that they replace.
 
     Args:
         rewriter: of the graph.
-        sources: the replaced node first, then those that go with it.
+        node: that one; new values have its result's type.
         label: what shapes are named after.
+        sources: the nodes that the new ones stand for, by default that one.
     """
 
     def __init__(
-        self, rewriter: Rewriter, sources: Sequence[ir.Node], label: str | None
+        self,
+        rewriter: Rewriter,
+        node: ir.Node,
+        label: str | None,
+        sources: Sequence[ir.Node] = (),
     ) -> None:
-        self.rewriter, self.sources = rewriter, tuple(sources)
-        self.label = label
+        self.rewriter, self.node, self.label = rewriter, node, label
+        self.sources = tuple(sources) or (node,)
         self.values: list[ir.Value] = []
 
     def transpose(self, value: ir.Value, order: Sequence[int]) -> ir.Value:
@@ -110,16 +94,18 @@ class NodeWriter:
         old = static_shape(value) or ()
         shape = tuple(old[axis] for axis in order)
         perm = ir.AttrInt64s("perm", list(order))
-        return self._moved(value, self.write("Transpose", [value], shape, [perm]))
+        result = self.write("Transpose", [value], shape, [perm])
+        result.type = value.type or result.type
+        return result
 
-    def shape(self, value: ir.Value, shape: tuple[int, ...]) -> ir.Value:
-        """Reshape; nothing is written where the shape stays."""
+    def shape(
+        self, value: ir.Value, shape: tuple[int, ...], op_type: str = "Reshape"
+    ) -> ir.Value:
+        """Reshape, or Expand; nothing is written where the shape stays."""
         if static_shape(value) == shape:
             return value
         target = self.rewriter.target(shape, f"{self.label}_shape")
-        return self._moved(value, self.write("Reshape", [value, target], shape))
-
-    def _moved(self, value: ir.Value, result: ir.Value) -> ir.Value:
+        result = self.write(op_type, [value, target], shape)
         result.type = value.type or result.type
         return result
 
@@ -131,13 +117,12 @@ class NodeWriter:
         attributes: Sequence[ir.Attr] = (),
     ) -> ir.Value:
         """Write a node of one output."""
-        value = self.rewriter.write(
-            op_type,
-            inputs,
-            attributes,
-            shape,
-            sources=self.sources,
-            like=self.sources[0].outputs[0],
-        )
+        names = self.rewriter.names
+        name = fresh_name(f"{self.sources[0].name}_{op_type}", names)
+        node = ir.Node("", op_type, inputs, attributes, num_outputs=1, name=name)
+        value, kind = node.outputs[0], self.node.outputs[0].type
+        value.name, value.type, value.shape = name, kind, ir.Shape(shape)
+        inherit(node, self.sources, by=self.rewriter.by)
+        self.rewriter.graph.insert_before(self.node, node)
         self.values.append(value)
         return value

@@ -16,6 +16,7 @@ Spatial cross attention repeats its queries for every camera (Li et al., BEVForm
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -25,15 +26,147 @@ import onnx_ir as ir
 from me2e_compress.graph import array_of, is_standard, macs, rank_of, static_shape
 from me2e_compress.graph.nodes import integers_at, permutation_of
 from me2e_compress.graph.rewrite import Array, holds_numbers, is_read, sole_reader
-from me2e_compress.passes.hoist_linear.layers import is_product
-from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
-from me2e_compress.passes.hoist_linear.repeated_axes import RepeatedAxes, repeated_axes
+from me2e_compress.passes.digits import (
+    Digit,
+    Digits,
+    Layout,
+    before,
+    flat,
+    merged,
+    regrouped,
+    split_like,
+    whole,
+)
+from me2e_compress.passes.hoist_linear.rebuilding import NodeWriter, Rewriter
+from me2e_compress.passes.hoist_linear.sums import is_product
 from me2e_compress.passes.work import (
     MACS_PER_NODE,
     MOVED_BYTES_PER_NODE,
     item_bytes,
     work,
 )
+
+# The axes along which a value repeats, behind whatever regroups them: a Reshape of
+# Tile(x, [1, 6, 1, 1]) to [6, cells, heads, 32] repeats along its first axis, and so
+# does every layer's output that is made of it row by row. What counts are the digits of
+# the indices (:mod:`me2e_compress.passes.digits`): those that a Tile, Expand or Concat
+# adds make no difference to what the value holds.
+
+REPEATS = frozenset({"Concat", "Expand", "Tile"})
+"""Operators that may repeat axes."""
+LONGEST = 16
+"""Largest number of nodes between the source and the repeated value."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RepeatedAxes:
+    """A value that is ``Expand(Reshape(source, small), large)``, reshaped.
+
+    Attributes:
+        source: the value that holds every element once.
+        small: the sizes of ``large``, and 1 where the value repeats.
+        large: the shape of the value; axes that repeat in part are split.
+        nodes: the nodes between both, the last one first.
+    """
+
+    source: ir.Value
+    small: tuple[int, ...]
+    large: tuple[int, ...]
+    nodes: tuple[ir.Node, ...]
+
+
+def repeated_axes(value: ir.Value) -> RepeatedAxes | None:
+    """Return the smallest source of a value that repeats; None if it does not.
+
+    Of several sources of one size it is the last.
+    """
+    shape = static_shape(value)
+    if not shape or 0 in shape:
+        return None
+    layout: Layout = tuple(whole(str(axis), size) for axis, size in enumerate(shape))
+    best, least = None, math.prod(shape)
+    nodes: list[ir.Node] = []
+    while len(nodes) < LONGEST:
+        node = value.producer()
+        if node is None or node.graph is not value.graph:
+            break
+        source = node.inputs[0] if node.inputs else None
+        earlier = _before_repeats(node, layout)
+        if earlier is None or source is None:
+            break
+        value, layout = source, earlier
+        nodes.append(node)
+        size = math.prod(static_shape(value) or ())
+        sizes = _sizes(shape, merged(flat(layout))) if size < least else None
+        if sizes is not None:
+            best, least = RepeatedAxes(value, *sizes, tuple(nodes)), size
+    return best
+
+
+def broadcasts(node: ir.Node) -> bool:
+    """Return whether a node repeats only axes of size 1, as an Add does by itself.
+
+    A Concat of the same value does so too: ``torch.stack([x] * 6)``.
+    """
+    if not is_standard(node) or node.op_type not in REPEATS:
+        return False
+    if node.op_type == "Concat" and len(set(node.inputs)) != 1:
+        return False
+    small, large = static_shape(node.inputs[0]), static_shape(node.outputs[0])
+    if small is None or large is None:
+        return False
+    ends = large[len(large) - len(small) :]
+    return all(one in (1, many) for one, many in zip(small, ends, strict=True))
+
+
+def _before_repeats(node: ir.Node, layout: Layout) -> Layout | None:
+    """Return the layout of what a node moves or repeats; None if it does neither."""
+    if not is_standard(node) or not node.inputs:
+        return None
+    given = static_shape(node.inputs[0])
+    if given is None or node.op_type not in REPEATS:
+        return before(node, layout)
+    if node.op_type == "Concat" and len(set(node.inputs)) != 1:
+        return None
+    # The digits of an axis before it was repeated are its last ones
+    once: list[Digits] = []
+    for digits, size in zip(layout[len(layout) - len(given) :], given, strict=True):
+        times = math.prod(digit.size for digit in digits) // size
+        split = regrouped((digits,), (times, size))
+        if split is None:
+            return None
+        once.append(split[1])
+    return tuple(once)
+
+
+def _sizes(
+    shape: Sequence[int], kept: Digits
+) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
+    """Return the small and the large sizes; None if the source has another order."""
+    small: list[int] = []
+    large: list[int] = []
+    mine: list[Digit] = []
+
+    def is_kept(one: Digit) -> bool:
+        return any(
+            other.axis == one.axis
+            and other.stride <= one.stride
+            and one.end <= other.end
+            for other in kept
+        )
+
+    for axis, size in enumerate(shape):
+        pieces = split_like(whole(str(axis), size), kept)
+        if not pieces:
+            small.append(1)
+            large.append(1)
+        for stays, group in itertools.groupby(pieces, is_kept):
+            found = list(group)
+            large.append(math.prod(digit.size for digit in found))
+            small.append(large[-1] if stays else 1)
+            mine.extend(found if stays else ())
+    return (tuple(small), tuple(large)) if merged(mine) == kept else None
+
 
 # Operators that compute every element, or every row of the last axis, by itself.
 
@@ -85,23 +218,6 @@ def is_row_wise(node: ir.Node, opset: int) -> bool:
         return False
     default = 1 if softmax and opset < SOFTMAX_OPSET else -1
     return node.attributes.get_int("axis", default) in (-1, rank - 1)
-
-
-def along_last(
-    node: ir.Node,
-    inputs: Sequence[ir.Value | None],
-    rank: int,
-    rewriter: Rewriter,
-) -> tuple[list[ir.Value | None], list[ir.Attr]]:
-    """Return a moved node's inputs and attributes, its axis being the last."""
-    given, attributes = list(inputs), dict(node.attributes)
-    if node.op_type in ALONG_AXIS:
-        attributes["axis"] = ir.AttrInt64("axis", rank - 1)
-    elif "axes" in attributes:
-        attributes["axes"] = ir.AttrInt64s("axes", [rank - 1])
-    elif node.op_type in REDUCTIONS:
-        given[1] = rewriter.target((rank - 1,), f"{node.outputs[0].name}_axes")
-    return given, list(attributes.values())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -244,7 +360,8 @@ def _joined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
         elif value not in stored:
             return None
     for array in stored.values():
-        common = {at for at in common if array is not None and _repeats(array, at)}
+        assert array is not None
+        common = {at for at in common if np.all(array == np.take(array, [0], at))}
     if not common:
         return None
     operands = tuple(
@@ -252,11 +369,6 @@ def _joined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
     )
     small = [1 if at in common else size for at, size in enumerate(shape)]
     return _Plan(operands, tuple(small), shape)
-
-
-def _repeats(array: Array, axis: int) -> bool:
-    first = np.take(array, [0], axis)
-    return bool(np.all(array == first))
 
 
 def _once(
@@ -282,7 +394,11 @@ def _pays(node: ir.Node, plan: _Plan) -> bool:
         moved += math.prod(operand.shape) * item
         if operand.found is None:
             continue
-        before += sum(map(work, _owned(node, operand.found)))
+        # The nodes of a repetition that only this one needs
+        owned = itertools.takewhile(
+            lambda each: sole_reader(each.outputs[0]) is not None, operand.found.nodes
+        )
+        before += sum(map(work, owned))
         if static_shape(operand.found.source) != operand.found.small:
             after += 1.0
         if operand.shape != operand.found.small:
@@ -296,61 +412,36 @@ def _pays(node: ir.Node, plan: _Plan) -> bool:
     return before - after > moved / MOVED_BYTES_PER_NODE
 
 
-def _owned(node: ir.Node, found: RepeatedAxes) -> list[ir.Node]:
-    """List the nodes of a repetition that only the node needs."""
-    owned: list[ir.Node] = []
-    for each in found.nodes:
-        if sole_reader(each.outputs[0]) is None:
-            break
-        owned.append(each)
-    return owned
-
-
 def _rewrite(node: ir.Node, plan: _Plan, rewriter: Rewriter) -> None:
-    old = node.outputs[0]
+    old, rank = node.outputs[0], len(plan.small)
+    writer = NodeWriter(rewriter, node, old.name)
+    # Operands once; an operator along the last axis keeps to it
     inputs: list[ir.Value | None] = [
         _written(node, operand, rewriter) for operand in plan.operands
     ]
     inputs.extend(node.inputs[len(inputs) :])
-    attributes = list(node.attributes.values())
-    if node.op_type not in ("Concat", "Transpose"):
-        inputs, attributes = along_last(node, inputs, len(plan.small), rewriter)
-    new = rewriter.write(
-        node.op_type, inputs, attributes, plan.flat or plan.small,
-        sources=(node,), like=old,
-    )  # fmt: skip
+    attributes = dict(node.attributes)
+    if node.op_type in ALONG_AXIS:
+        attributes["axis"] = ir.AttrInt64("axis", rank - 1)
+    elif node.op_type in REDUCTIONS and "axes" in attributes:
+        attributes["axes"] = ir.AttrInt64s("axes", [rank - 1])
+    elif node.op_type in REDUCTIONS:
+        inputs[1] = rewriter.target((rank - 1,), f"{old.name}_axes")
+    shape = plan.flat or plan.small
+    new = writer.write(node.op_type, inputs, shape, list(attributes.values()))
     # Repeat the result, unless its readers see no difference
-    found = [each.found for each in plan.operands if each.found is not None]
-    sources = (node, *dict.fromkeys(one for each in found for one in each.nodes))
-    forms = (
-        ("Reshape", plan.small),
-        ("Expand", plan.large),
-        ("Reshape", static_shape(old) or ()),
-    )
-    for op_type, shape in forms:
-        if shape != static_shape(new):
-            target = rewriter.target(shape, f"{old.name}_shape")
-            new = rewriter.write(
-                op_type, [new, target], [], shape, sources=sources, like=old
-            )
-    rewriter.swap(old, new)
+    axes = [operand.found for operand in plan.operands if operand.found is not None]
+    writer.sources = (node, *dict.fromkeys(one for each in axes for one in each.nodes))
+    new = writer.shape(writer.shape(new, plan.small), plan.large, "Expand")
+    rewriter.swap(old, writer.shape(new, static_shape(old) or ()))
 
 
 def _written(node: ir.Node, operand: _Operand, rewriter: Rewriter) -> ir.Value:
     """Return what a node reads instead, written where needed."""
-    value, old = operand.value, node.outputs[0]
+    value, axes = operand.value, operand.found
     if operand.numbers is not None:
         return rewriter.store(operand.numbers, f"{value.name}_once")
-    if operand.found is None:
+    if axes is None:
         return value
-    value = operand.found.source
-    for op_type, shape in {
-        "Reshape": operand.found.small, "Expand": operand.shape
-    }.items():  # fmt: skip
-        if shape != static_shape(value):
-            target = rewriter.target(shape, f"{operand.value.name}_shape")
-            value = rewriter.write(
-                op_type, [value, target], [], shape, sources=operand.found.nodes,
-                like=old,
-            )  # fmt: skip
-    return value
+    writer = NodeWriter(rewriter, node, value.name, axes.nodes)
+    return writer.shape(writer.shape(axes.source, axes.small), operand.shape, "Expand")

@@ -16,20 +16,22 @@ import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import is_standard, static_shape
+from me2e_compress.graph import array_of, is_standard, static_shape
 from me2e_compress.graph.nodes import LAYOUT_OPERATORS, permutation_of
 from me2e_compress.graph.rewrite import (
+    FLOATS,
     Numbers,
     holds_numbers,
+    maker,
     numbers_of,
     overflow,
     sole_reader,
 )
-from me2e_compress.passes.hoist_linear.layers import LinearLayer, layer_behind
 from me2e_compress.passes.hoist_linear.rebuilding import NodeWriter, Rewriter
 from me2e_compress.passes.work import MACS_PER_NODE, item_bytes
 
@@ -38,16 +40,136 @@ DEEPEST = 32
 
 
 @dataclasses.dataclass(frozen=True)
-class Terms:
-    """What adds up to a product: values of the graph, and constant rows [.., N]."""
+class LinearLayer:
+    """``source @ weight + bias``: a MatMul or Gemm, and the Add of a separate bias."""
 
-    values: tuple[ir.Value, ...] = ()
-    constants: tuple[Numbers, ...] = ()
+    product: ir.Node
+    sum: ir.Node | None
 
-    def plus(self, vector: Numbers | None) -> "Terms":
-        """Add a vector, if there is one."""
-        more = () if vector is None else (vector,)
-        return Terms(self.values, (*self.constants, *more))
+    @property
+    def source(self) -> ir.Value:
+        """The rows, [..., K]."""
+        value = self.product.inputs[0]
+        assert value is not None
+        return value
+
+    @property
+    def weight(self) -> ir.Value:
+        """The constant matrix, [K, N], or [N, K] where the Gemm transposes it."""
+        value = self.product.inputs[1]
+        assert value is not None
+        return value
+
+    @property
+    def result(self) -> ir.Value:
+        """The output, [..., N]."""
+        return (self.sum or self.product).outputs[0]
+
+    @property
+    def nodes(self) -> tuple[ir.Node, ...]:
+        """Its nodes, the product first."""
+        return (self.product,) if self.sum is None else (self.product, self.sum)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the stored weight is exactly the matrix."""
+        return self.product.op_type == "MatMul" or (
+            not self.product.attributes.get_int("transB", 0)
+            and self.product.attributes.get_float("alpha", 1.0) == 1.0
+        )
+
+    def matrix(self) -> Numbers:
+        """Return the matrix, [K, N]."""
+        numbers = _known(self.weight)
+        if self.product.op_type == "MatMul":
+            return numbers
+        if self.product.attributes.get_int("transB", 0):
+            numbers = numbers.T
+        return numbers * self.product.attributes.get_float("alpha", 1.0)
+
+    def bias(self) -> Numbers | None:
+        """Return the added vector, [N]; None if there is none."""
+        total: Numbers | None = None
+        columns = (static_shape(self.result) or ())[-1:]
+        # A Gemm has its own bias
+        if len(self.product.inputs) > 2 and self.product.inputs[2] is not None:
+            beta = self.product.attributes.get_float("beta", 1.0)
+            total = _vector(self.product.inputs[2], columns) * beta
+        if self.sum is not None:
+            added = next(value for value in self.sum.inputs if holds_numbers(value))
+            more = _vector(added, columns)
+            total = more if total is None else total + more
+        return total
+
+
+def layer_at(product: ir.Node) -> LinearLayer | None:
+    """Return the layer of a product, with its bias where nothing else reads it."""
+    if not is_product(product):
+        return None
+    reader = sole_reader(product.outputs[0])
+    if reader is not None and reader.op_type == "Add" and _adds_bias(reader, product):
+        return LinearLayer(product, reader)
+    return LinearLayer(product, None)
+
+
+def layer_behind(value: ir.Value) -> LinearLayer | None:
+    """Return the layer that computes a value."""
+    node = maker(value, "MatMul", "Gemm", "Add")
+    if node is None or node.op_type != "Add":
+        is_layer = node is not None and is_product(node)
+        return LinearLayer(node, None) if node is not None and is_layer else None
+    for operand in node.inputs:
+        product = maker(operand, "MatMul", "Gemm")
+        if product is not None and is_product(product) and _adds_bias(node, product):
+            return LinearLayer(product, node)
+    return None
+
+
+def is_product(node: ir.Node) -> bool:
+    """Return whether a node multiplies rows by a constant matrix."""
+    if node.op_type not in ("MatMul", "Gemm") or node.domain not in ("", "ai.onnx"):
+        return False
+    if node.attributes.get_int("transA", 0):
+        return False
+    rows, result = static_shape(node.inputs[0]), static_shape(node.outputs[0])
+    if not rows or not result or 0 in rows or node.outputs[0].dtype not in FLOATS:
+        return False
+    weight = node.inputs[1]
+    if len(static_shape(weight) or ()) != 2 or not holds_numbers(weight):
+        return False
+    if array_of(node.inputs[0]) is not None:
+        return False
+    bias = node.inputs[2] if len(node.inputs) > 2 else None
+    return bias is None or _is_vector(bias, result)
+
+
+def _adds_bias(node: ir.Node, product: ir.Node) -> bool:
+    value, shape = product.outputs[0], static_shape(product.outputs[0])
+    others = [operand for operand in node.inputs if operand is not value]
+    if shape is None or len(others) != 1 or static_shape(node.outputs[0]) != shape:
+        return False
+    return _is_vector(others[0], shape)
+
+
+def _is_vector(value: ir.Value | None, result: tuple[int, ...]) -> bool:
+    shape = static_shape(value)
+    if shape is None or not holds_numbers(value) or len(shape) > len(result):
+        return False
+    return math.prod(shape[:-1]) == 1 and (not shape or shape[-1] in (1, result[-1]))
+
+
+def _vector(value: ir.Value | None, columns: tuple[int, ...]) -> Numbers:
+    return np.array(np.broadcast_to(_known(value).reshape(-1), columns))
+
+
+def _known(value: ir.Value | None) -> Numbers:
+    numbers = numbers_of(value)
+    assert numbers is not None
+    return numbers
+
+
+Terms: TypeAlias = list[ir.Value | Numbers]
+"""What adds up to a product: values of the graph, and constant rows [.., N]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,11 +197,11 @@ def multiply_earlier(
     if now.cost - best.cost < 1.0 or best.macs >= now.macs:
         return False
     # Write it, unless a product of two matrices is too large for its type
-    matrix, vector = layer.matrix(), layer.bias()
+    matrix, bias = layer.matrix(), layer.bias()
     if layer.is_plain:
         search.stored[id(matrix)] = matrix, layer.weight
     try:
-        terms = best.write(matrix).plus(vector)
+        terms = [*best.write(matrix), *([] if bias is None else [bias])]
         new = search.total(terms, static_shape(layer.result) or ())
     except OverflowError:
         rewriter.undo(search.writer.values)
@@ -99,7 +221,9 @@ class _Search:
         self.item_cost = item_bytes(layer.result) / max(bytes_per_node, 1e-9)
         self.known: dict[ir.Value, Form] = {}
         self.stored: dict[int, tuple[Numbers, ir.Value]] = {}
-        self.writer = NodeWriter(rewriter, layer.nodes, layer.result.name)
+        self.writer = NodeWriter(
+            rewriter, layer.product, layer.result.name, layer.nodes
+        )
 
     def of(self, value: ir.Value, *, owned: bool, depth: int) -> Form:
         """Return the cheapest form; ``owned``: only this product needs its reader."""
@@ -126,7 +250,7 @@ class _Search:
         def write(matrix: Numbers) -> Terms:
             inputs, rows = [value, self._stored(matrix, "weight")], shape[:-1]
             new = self.writer.write("MatMul", inputs, (*rows, self.columns))
-            return Terms((new,))
+            return [new]
 
         return Form(macs, 1.0 + macs / MACS_PER_NODE, write)
 
@@ -149,7 +273,7 @@ class _Search:
             self.writer.sources += layer.nodes
             bias = layer.bias()
             terms = inner.write(layer.matrix() @ matrix)
-            return terms.plus(None if bias is None else bias @ matrix)
+            return [*terms, *([] if bias is None else [bias @ matrix])]
 
         return Form(inner.macs - gone, cost, write)
 
@@ -171,8 +295,7 @@ class _Search:
 
         def write(matrix: Numbers) -> Terms:
             self.writer.sources += (node,)
-            left, right = one.write(matrix), two.write(-matrix if minus else matrix)
-            return Terms(left.values + right.values, left.constants + right.constants)
+            return [*one.write(matrix), *two.write(-matrix if minus else matrix)]
 
         return Form(one.macs + two.macs, cost, write)
 
@@ -196,18 +319,24 @@ class _Search:
             rows = self.total(found.write(matrix), (*inner[:-1], self.columns))
             moved = (*shape[:-1], self.columns)
             if order is None:
-                return Terms((self.writer.shape(rows, moved),))
-            return Terms((self.writer.transpose(rows, order),))
+                return [self.writer.shape(rows, moved)]
+            return [self.writer.transpose(rows, order)]
 
         return Form(found.macs, found.cost + (not owned), write)
 
     def total(self, terms: Terms, shape: tuple[int, ...]) -> ir.Value:
         """Write a sum, its terms of the fewest rows first; these take the vectors."""
-        # One row is added to the next smallest constant
-        rows = sorted(map(_one_row, terms.constants), key=np.size)
+        # A single row broadcasts as a vector, and is added to the next constant
+        rows = [
+            numbers.reshape(-1) if numbers.size == numbers.shape[-1] else numbers
+            for numbers in sorted(
+                (each for each in terms if not isinstance(each, ir.Value)), key=np.size
+            )
+        ]
         while len(rows) > 1 and rows[0].ndim == 1:
             rows = [rows[0] + rows[1], *rows[2:]]
-        items = [*terms.values, *(self._stored(each, "sum") for each in rows)]
+        values = [each for each in terms if isinstance(each, ir.Value)]
+        items = [*values, *(self._stored(each, "sum") for each in rows)]
         items.sort(key=lambda each: math.prod(static_shape(each) or ()))
         if len(items) > 1 and items[0].is_initializer():
             items[:2] = items[1], items[0]
@@ -233,12 +362,6 @@ class _Search:
 
 def _constant(value: ir.Value, matrix: Numbers) -> Terms:
     """Multiply constant rows; one column is that of all."""
-    numbers = numbers_of(value)
-    assert numbers is not None
+    numbers = _known(value)
     rows = np.broadcast_to(numbers, (*numbers.shape[:-1], len(matrix)))
-    return Terms((), (rows @ matrix,))
-
-
-def _one_row(numbers: Numbers) -> Numbers:
-    """Return a single row as a vector, which broadcasts as it does."""
-    return numbers.reshape(-1) if numbers.size == numbers.shape[-1] else numbers
+    return [rows @ matrix]

@@ -1,9 +1,13 @@
-"""A failure shrinks to the nodes that it takes."""
+"""A failure shrinks to the nodes that it takes, and is written beside what is there."""
+
+from pathlib import Path
 
 import onnx_ir as ir
 import pytest
 
+from me2e_compress.manager import reproducer
 from me2e_compress.manager.reproducer import shrink
+from tests.conftest import DRIVER
 from tests.passes.small import ops, read
 
 OPERATORS = ("Abs", "Neg", "Exp", "Tanh", "Cos", "Sin", "Erf")
@@ -44,3 +48,19 @@ def test_two_neighbours_stay_together(first: int) -> None:
 
 def test_a_failure_of_the_whole_stays_whole() -> None:
     assert ops(shrink(chain(7), lambda part: len(part.graph) == 7)) == [*OPERATORS]
+
+
+def test_a_folder_of_the_user_is_left_alone(tmp_path: Path) -> None:
+    theirs = tmp_path / "reproducer-fold-constants"
+    theirs.mkdir()
+    (theirs / "model.onnx").write_text("theirs")
+    model = ir.from_onnx_text(DRIVER)
+
+    made = [
+        reproducer.write(tmp_path, model, "fold-constants", 0, "broke").name
+        for _ in range(2)
+    ]
+
+    assert made == ["reproducer-fold-constants-2"] * 2
+    assert (theirs / "model.onnx").read_text() == "theirs"
+    assert len(list(tmp_path.iterdir())) == 2

@@ -1,0 +1,449 @@
+"""Find nodes that return their input unchanged, and pairs that one node can do.
+
+Rules of identities return the value that a node's first output equals, bit for bit, or
+None. Adding +0.0 is not an identity (-0.0 + 0.0 is +0.0); adding -0.0 is, and so is
+subtracting +0.0.
+
+Rules of pairs rewrite the graph around a node and return the node to look at again (the
+node itself, now unread, where nothing is left of it), or None where they do not apply.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of, provenance, static_shape
+from me2e_compress.graph.nodes import (
+    ELEMENTWISE,
+    VIEWS,
+    attribute_values,
+    input_at,
+    integers_at,
+    integers_of,
+    maker,
+    permutation_of,
+)
+from me2e_compress.graph.rewrite import (
+    Array,
+    add_constant,
+    bypass,
+    is_read,
+    is_standard,
+    put,
+    sole_reader,
+    value_names,
+)
+
+# Nodes that return their input.
+
+Identity = Callable[[ir.Node, int], ir.Value | None]
+
+OLDEST_OPSET = 7
+"""Broadcasting, Dropout and BatchNormalization followed other rules before."""
+
+
+def identity_of(node: ir.Node, opset: int) -> ir.Value | None:
+    """Return the value that a node only repeats; None if it does something."""
+    if not is_standard(node) or opset < OLDEST_OPSET or not node.outputs:
+        return None
+    rule = IDENTITIES.get(node.op_type)
+    if rule is None or any(is_read(value) for value in node.outputs[1:]):
+        return None
+    return rule(node, opset)
+
+
+def same_shape(one: ir.Value | None, other: ir.Value | None) -> bool:
+    """Return whether two values certainly have the same shape."""
+    shape = static_shape(one)
+    return shape is not None and shape == static_shape(other)
+
+
+def _if_same_shape(node: ir.Node, opset: int) -> ir.Value | None:
+    return node.inputs[0] if same_shape(node.inputs[0], node.outputs[0]) else None
+
+
+def _if_alone(node: ir.Node, opset: int) -> ir.Value | None:
+    """One operand of a Concat or Max, one part of a Split."""
+    values = node.outputs if node.op_type == "Split" else node.inputs
+    return node.inputs[0] if len(values) == 1 else None
+
+
+def _dropout(node: ir.Node, opset: int) -> ir.Value | None:
+    given = input_at(node, 2)
+    training = array_of(given)
+    off = given is None or (training is not None and not training.any())
+    return node.inputs[0] if off else None
+
+
+def _cast(node: ir.Node, opset: int) -> ir.Value | None:
+    source, like = node.inputs[0], input_at(node, 1)
+    if source is None or source.dtype is None:
+        return None
+    wanted = node.attributes.get_int("to", 0) if like is None else like.dtype
+    return source if source.dtype == wanted else None
+
+
+def _transpose(node: ir.Node, opset: int) -> ir.Value | None:
+    order = permutation_of(node)
+    if order is not None and order == sorted(order):
+        return node.inputs[0]
+    if moves_nothing(node) and same_shape(node.inputs[0], node.outputs[0]):
+        return node.inputs[0]
+    return None
+
+
+def moves_nothing(node: ir.Node) -> bool:
+    """Return whether a Transpose only moves axes of size 1, as a Reshape would."""
+    shape, order = static_shape(node.inputs[0]), permutation_of(node)
+    if shape is None or order is None:
+        return False
+    real = [axis for axis in order if shape[axis] != 1]
+    return real == sorted(real)
+
+
+def _slice(node: ir.Node, opset: int) -> ir.Value | None:
+    if input_at(node, 4) is not None:
+        steps = integers_of(input_at(node, 4))
+        if steps is None or any(step != 1 for step in steps):
+            return None
+    return _if_same_shape(node, opset) or _sliced_part(node)
+
+
+def _sliced_part(node: ir.Node) -> ir.Value | None:
+    """Return the operand of a Concat that a Slice takes out again, if it is one."""
+    inner, shape = maker(node.inputs[0], "Concat"), static_shape(node.inputs[0])
+    starts, ends = integers_at(node, "starts", 1), integers_at(node, "ends", 2)
+    axes = integers_at(node, "axes", 3)
+    if inner is None or shape is None or not starts or not ends:
+        return None
+    if axes is None or len(axes) != 1:
+        return None
+    axis = axes[0] % len(shape)
+    if inner.attributes.get_int("axis", 0) % len(shape) != axis:
+        return None
+    first, last, _ = slice(starts[0], ends[0]).indices(shape[axis])
+    at = 0
+    for part in inner.inputs:
+        sizes = static_shape(part)
+        if sizes is None or at > first:
+            return None
+        if (at, at + sizes[axis]) == (first, last):
+            return part
+        at += sizes[axis]
+    return None
+
+
+def _pad(node: ir.Node, opset: int) -> ir.Value | None:
+    pads = integers_at(node, "pads", 1)
+    return node.inputs[0] if pads is not None and not any(pads) else None
+
+
+def _clip(node: ir.Node, opset: int) -> ir.Value | None:
+    inner = _repeats(node, opset)
+    if inner is not None or opset < 11:
+        return inner
+    return None if any(node.inputs[1:]) else node.inputs[0]
+
+
+def _repeats(node: ir.Node, opset: int) -> ir.Value | None:
+    """Relu of Relu, Abs of Abs, ...: idempotent operators."""
+    inner = maker(node.inputs[0], node.op_type)
+    if inner is None or tuple(inner.inputs[1:]) != tuple(node.inputs[1:]):
+        return None
+    same = attribute_values(inner) == attribute_values(node)
+    return node.inputs[0] if same else None
+
+
+def _undoes(node: ir.Node, opset: int) -> ir.Value | None:
+    """Not of Not, Neg of Neg: self-inverse operators."""
+    inner = maker(node.inputs[0], node.op_type)
+    return None if inner is None else inner.inputs[0]
+
+
+def _neutral(test: Callable[[Array], bool], *, either: bool) -> Identity:
+    """Build the rule of a neutral constant; of ``either`` operand if they commute."""
+
+    def rule(node: ir.Node, opset: int) -> ir.Value | None:
+        for kept, other in ((0, 1), (1, 0))[: 2 if either else 1]:
+            array, source = array_of(node.inputs[other]), node.inputs[kept]
+            if array is None or source is None or not array.size or not test(array):
+                continue
+            # Broadcasting the constant must keep the shape of the other operand
+            spreads = same_shape(source, node.outputs[0]) or (
+                array.size == 1
+                and source.shape is not None
+                and array.ndim <= len(source.shape)
+            )
+            if source.dtype == node.outputs[0].dtype and spreads:
+                return source
+        return None
+
+    return rule
+
+
+def _zero(array: Array, *, negative: bool) -> bool:
+    """Return whether all numbers are zero, those with a sign of zero of this one."""
+    if array.dtype.kind in "iu":
+        return not array.any()
+    zero = array.dtype.kind == "f" and not array.any()
+    return zero and bool(np.all(np.signbit(array) == negative))
+
+
+def _one(array: Array) -> bool:
+    return array.dtype.kind in "iuf" and bool(np.all(array == 1))
+
+
+def _where(node: ir.Node, opset: int) -> ir.Value | None:
+    chosen, (_, yes, no) = array_of(node.inputs[0]), node.inputs
+    if yes is no and same_shape(yes, node.outputs[0]):
+        return yes
+    if chosen is None or not chosen.size:
+        return None
+    if chosen.all() and same_shape(yes, node.outputs[0]):
+        return yes
+    return no if not chosen.any() and same_shape(no, node.outputs[0]) else None
+
+
+IDENTITIES: dict[str, Identity] = {
+    **dict.fromkeys(("Abs", "Ceil", "Floor", "Relu", "Round", "Sign"), _repeats),
+    **dict.fromkeys(("Concat", "Max", "Mean", "Min", "Split", "Sum"), _if_alone),
+    **dict.fromkeys(("Expand", "Flatten", "Reshape", "Squeeze"), _if_same_shape),
+    **dict.fromkeys(("Tile", "Unsqueeze"), _if_same_shape),
+    **dict.fromkeys(("Neg", "Not"), _undoes),
+    **dict.fromkeys(("Div", "Pow"), _neutral(_one, either=False)),
+    "Add": _neutral(functools.partial(_zero, negative=True), either=True),
+    "And": _neutral(lambda array: bool(array.all()), either=True),
+    **dict.fromkeys(("Cast", "CastLike"), _cast),
+    "Clip": _clip,
+    "Dropout": _dropout,
+    "Identity": lambda node, opset: node.inputs[0],
+    "Mul": _neutral(_one, either=True),
+    "Or": _neutral(lambda array: not array.any(), either=True),
+    "Pad": _pad,
+    "Slice": _slice,
+    "Sub": _neutral(functools.partial(_zero, negative=False), either=False),
+    "Transpose": _transpose,
+    "Where": _where,
+}
+
+
+# Pairs that one node can do.
+
+_RESHAPING = VIEWS - {"Identity"}
+
+BROADCASTING = frozenset({*ELEMENTWISE, "Where"})
+
+WIDENS: dict[ir.DataType, str] = {
+    ir.DataType.BOOL: "UINT8 INT8 INT16 INT32 INT64 FLOAT16 FLOAT DOUBLE",
+    ir.DataType.UINT8: "UINT16 UINT32 UINT64 INT16 INT32 INT64 FLOAT16 FLOAT DOUBLE",
+    ir.DataType.INT8: "INT16 INT32 INT64 FLOAT16 FLOAT DOUBLE",
+    ir.DataType.INT16: "INT32 INT64 FLOAT DOUBLE",
+    ir.DataType.INT32: "INT64 DOUBLE",
+    ir.DataType.UINT32: "INT64 UINT64 DOUBLE",
+    ir.DataType.FLOAT16: "FLOAT DOUBLE",
+    ir.DataType.FLOAT: "DOUBLE",
+}
+"""The types that hold every value of a type: a Cast there loses nothing."""
+
+
+@dataclasses.dataclass
+class MergeSite:
+    """A graph that is being rewritten, and the constants made for it so far."""
+
+    graph: ir.Graph
+    opset: int
+    by: str
+    shapes: dict[tuple[int, ...], ir.Value] = dataclasses.field(default_factory=dict)
+    names: set[str] = dataclasses.field(default_factory=set)
+
+    def shape(self, sizes: tuple[int, ...], reader: ir.Node) -> ir.Value:
+        """Return the initializer of a shape, named uniquely after its first reader."""
+        value = self.shapes.get(sizes)
+        if value is None or value.graph is not self.graph:
+            name, array = f"{reader.outputs[0].name}_shape", np.array(sizes, np.int64)
+            self.names = self.names or value_names(self.graph)
+            value = add_constant(self.graph, array, name, self.names)
+            self.shapes[sizes] = value
+        return value
+
+
+Rule = Callable[[ir.Node, MergeSite], ir.Node | None]
+
+
+def merge(node: ir.Node, site: MergeSite) -> ir.Node | None:
+    """Merge a node with the one before it, if one node can do both."""
+    if not is_standard(node):
+        return None
+    if node.op_type in BROADCASTING:
+        return _drop_expand(node, site)
+    if node.op_type in _RESHAPING or node.op_type == "Transpose":
+        return _views(node, site) or (
+            _transposes(node, site) if node.op_type == "Transpose" else None
+        )
+    rule = PAIRS.get(node.op_type)
+    return None if rule is None else rule(node, site)
+
+
+def _before(node: ir.Node, index: int = 0) -> ir.Node | None:
+    value = node.inputs[index]
+    inner = None if value is None else value.producer()
+    if inner is None or not is_standard(inner) or inner.graph is not node.graph:
+        return None
+    return inner
+
+
+def _is_view(node: ir.Node) -> bool:
+    if node.op_type == "Transpose":
+        return moves_nothing(node)
+    return node.op_type in _RESHAPING
+
+
+def _views(node: ir.Node, site: MergeSite) -> ir.Node | None:
+    """Merge consecutive Reshape, Flatten, Squeeze and Unsqueeze into one or none."""
+    inner, sizes = _before(node), static_shape(node.outputs[0])
+    if inner is None or sizes is None or 0 in sizes or site.opset < 5:
+        return None
+    if not _is_view(node) or not _is_view(inner):
+        return None
+    source = inner.inputs[0]
+    if source is None:
+        return None
+    if static_shape(source) == sizes and bypass(node.outputs[0], source):
+        return node
+    if sole_reader(inner.outputs[0]) is None:
+        return None
+    shape = site.shape(sizes, node)
+    return put(node, "Reshape", [source, shape], by=site.by, sources=[inner])
+
+
+def _transposes(node: ir.Node, site: MergeSite) -> ir.Node | None:
+    inner = _before(node)
+    if inner is None or inner.op_type != "Transpose":
+        return None
+    outer_perm, inner_perm = permutation_of(node), permutation_of(inner)
+    source = inner.inputs[0]
+    if outer_perm is None or inner_perm is None or source is None:
+        return None
+    # Compose both permutations; drop the pair if nothing moves
+    perm = [inner_perm[axis] for axis in outer_perm]
+    if perm == sorted(perm) and bypass(node.outputs[0], source):
+        return node
+    if sole_reader(inner.outputs[0]) is None:
+        return None
+    attributes, sources = {"perm": perm}, [inner]
+    return put(
+        node, "Transpose", [source], by=site.by, sources=sources, attributes=attributes
+    )
+
+
+def _casts(node: ir.Node, site: MergeSite) -> ir.Node | None:
+    inner = _before(node)
+    if inner is None or inner.op_type != "Cast" or inner.inputs[0] is None:
+        return None
+    source, middle = inner.inputs[0].dtype, inner.outputs[0].dtype
+    if source is None or middle is None:
+        return None
+    # The first Cast must lose nothing
+    if middle.name not in WIDENS.get(source, "").split():
+        return None
+    if sole_reader(inner.outputs[0]) is None and source != node.outputs[0].dtype:
+        return None
+    options, read = {n: a.value for n, a in node.attributes.items()}, inner.inputs[:1]
+    return put(node, "Cast", read, by=site.by, sources=[inner], attributes=options)
+
+
+def _slices(node: ir.Node, site: MergeSite) -> ir.Node | None:
+    inner = _before(node)
+    if inner is None or inner.op_type != "Slice" or site.opset < 10:
+        return None
+    if sole_reader(inner.outputs[0]) is None:
+        return None
+    first, second = _window(inner), _window(node)
+    if first is None or second is None or set(first[2]) & set(second[2]):
+        return None
+    # Concatenate starts, ends, axes and steps; drop steps of 1
+    name = node.outputs[0].name or ""
+    inputs = [
+        add_constant(site.graph, np.array([*one, *two], np.int64), f"{name}_{part}")
+        for part, one, two in zip(
+            ("starts", "ends", "axes", "steps"), first, second, strict=True
+        )
+    ]
+    if all(step == 1 for step in (*first[3], *second[3])):
+        del site.graph.initializers[inputs.pop().name or ""]
+    return put(node, "Slice", [inner.inputs[0], *inputs], by=site.by, sources=[inner])
+
+
+def _window(node: ir.Node) -> list[list[int]] | None:
+    """Return starts, ends, axes (from the front) and steps, if all are constant."""
+    rank = 0 if node.outputs[0].shape is None else len(node.outputs[0].shape)
+    given: list[list[int] | None] = []
+    for value in node.inputs[1:]:
+        given.append(integers_of(value))
+        if value is not None and given[-1] is None:
+            return None
+    # Fill in the defaults of axes and steps
+    starts, ends, axes, steps = [*given, None, None, None, None][:4]
+    if not rank or starts is None or ends is None:
+        return None
+    axes = list(range(len(starts))) if axes is None else axes
+    steps = [1] * len(starts) if steps is None else steps
+    return [starts, ends, [axis % rank for axis in axes], steps]
+
+
+def _concats(node: ir.Node, site: MergeSite) -> ir.Node | None:
+    axis = node.attributes.get_int("axis", 0)
+    inputs: list[ir.Value | None] = []
+    inner_nodes: list[ir.Node] = []
+    # Take in the operands of Concats that nothing else reads
+    for index, value in enumerate(node.inputs):
+        inner = _before(node, index)
+        if (
+            inner is not None
+            and inner.op_type == "Concat"
+            and inner.attributes.get_int("axis", 0) == axis
+            and sole_reader(inner.outputs[0]) is node
+        ):
+            inputs.extend(inner.inputs)
+            inner_nodes.append(inner)
+        else:
+            inputs.append(value)
+    if not inner_nodes:
+        return None
+    options = {"axis": axis}
+    return put(
+        node, "Concat", inputs, by=site.by, sources=inner_nodes, attributes=options
+    )
+
+
+def _drop_expand(node: ir.Node, site: MergeSite) -> ir.Node | None:
+    """Drop an Expand, or a Tile that only repeats, before a broadcasting operator."""
+    target = static_shape(node.outputs[0])
+    if target is None or site.opset < 8:
+        return None
+    for index, value in enumerate(node.inputs):
+        inner = _before(node, index)
+        if inner is None or inner.op_type not in ("Expand", "Tile"):
+            continue
+        source = inner.inputs[0]
+        small, large = static_shape(source), static_shape(value)
+        if small is None or large is None or len(small) > len(large):
+            continue
+        pairs = zip(small[::-1], large[::-1], strict=False)
+        if any(one not in (1, two) for one, two in pairs):
+            continue
+        # The other operands must still broadcast to the same shape
+        others = [static_shape(other) for other in node.inputs]
+        others[index] = small
+        shapes = [shape for shape in others if shape is not None]
+        if len(shapes) == len(others) and np.broadcast_shapes(*shapes) == target:
+            node.replace_input_with(index, source)
+            provenance.inherit(node, (node, inner), by=site.by)
+            return node
+    return None
+
+
+PAIRS: dict[str, Rule] = {"Cast": _casts, "Concat": _concats, "Slice": _slices}
