@@ -33,7 +33,7 @@ from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.worker import Job
-from me2e_compress.metrics.abilities import ABILITIES
+from me2e_compress.metrics.bench2drive import ABILITIES
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores, score
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes

@@ -21,7 +21,7 @@ from me2e_compress.driving.host_stage import CollisionOptimizer, HostWork
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.runner import drive
-from me2e_compress.metrics.driving_score import route_score
+from me2e_compress.metrics.route_scores import route_score
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.routes import load_routes, pick_routes
 

@@ -21,8 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from me2e_compress.metrics.intervals import mean_estimate
-from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.measure import Estimate, mean_estimate
 
 TYPES, VARIANTS = 44, 5
 

@@ -35,12 +35,15 @@ from me2e_compress.evaluators.highway.generate import (
     seed_of,
 )
 from me2e_compress.evaluators.highway.runner import Listeners, drive
-from me2e_compress.metrics.intervals import mean_estimate
-from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.measure import Estimate, mean_estimate
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.runtime.children import pool
-from me2e_compress.simulator.routes import SHIPPED, Route, load_routes
-from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.simulator.routes import (
+    SCENARIO_ABILITIES,
+    SHIPPED,
+    Route,
+    load_routes,
+)
 from me2e_compress.simulator.scene import EventKind, Scene, SignalKind, SignalState
 from me2e_compress.simulator.world import World
 from me2e_compress.study.drive_record import DriveRecord

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.review import RangeFinding
-from me2e_compress.driving.adapter.port_uses import PortUse
+from me2e_compress.driving.adapter.outputs import PortUse
 from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.first_difference import FirstDifference
 from me2e_compress.fidelity.liveness import Liveness

@@ -15,11 +15,11 @@ from pydantic import ConfigDict, TypeAdapter, with_config
 
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.worker import Job
-from me2e_compress.metrics.infraction import COLLISIONS, InfractionKind
+from me2e_compress.metrics.episode import COLLISIONS, InfractionKind
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_json
-from me2e_compress.simulator.pictures import Moment
+from me2e_compress.simulator.pictures.route import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Actor, Ego
 from me2e_compress.simulator.world import World

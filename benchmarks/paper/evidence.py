@@ -1,7 +1,7 @@
 """What the drives say about a question: an estimate, and how sure it is."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -11,15 +11,16 @@ from benchmarks.paper.cells import Energy, measures_by_variant
 from benchmarks.paper.drives import ModelFacts, PaperDrives
 from benchmarks.paper.questions import PaperQuestion, PAt
 from me2e_compress.metrics.eer import Normalization, eer
-from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.metrics.intervals import (
+from me2e_compress.metrics.episode import InfractionKind
+from me2e_compress.metrics.measure import (
+    Estimate,
     Floats,
-    drawn_anew,
+    Measure,
+    drawn,
     intervals,
+    is_a_point,
     mean_estimate,
-    p_value,
 )
-from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.route_summary import COLUMNS, POINTS
 from me2e_compress.study.cells import number
 from me2e_compress.study.drive_record import DriveRecord
@@ -34,6 +35,10 @@ NOISE = 0.035
 drives (430.1 and 415.2 ms, tag ``road-1``); float and optimizer have 430.2 and 414.6 ms
 in ``benchmarks/road_2/paper/variants.json``. Samples of one run tell nothing of it:
 their lag-1 autocorrelation is 0.8."""
+
+
+TRIALS = 20_000
+"""Draws for a p-value: thirty tests corrected by Holm ask for small ones."""
 
 
 @dataclass(frozen=True)
@@ -146,6 +151,40 @@ def _way(values: Sequence[float], types: Sequence[str], seed: int) -> tuple[floa
     rows = np.stack([values, np.ones(len(values))], axis=1)
     draws = drawn_anew(rows, types, lambda sums: sums[:, 0] / sums[:, 1], seed)
     return float(rows[:, 0].mean()), partial(p_value, draws)
+
+
+def drawn_anew(
+    rows: Floats, types: Sequence[str], of_sums: Callable[[Floats], Floats], seed: int
+) -> Floats:
+    """Return a statistic of `TRIALS` sets of types drawn anew, as `intervals` draws.
+
+    Of fewer than two types there are none.
+
+    Args:
+        rows: Numbers of each route [routes, k].
+        types: The scenario type of each route.
+        of_sums: Takes sums over the drawn routes [trials, k], returns [trials].
+        seed: The same seed gives the same draws.
+    """
+    names, type_of = np.unique(np.array(types, str), return_inverse=True)
+    if len(names) < 2:
+        return np.zeros(0)
+    sums = np.zeros((len(names), rows.shape[1]))
+    np.add.at(sums, type_of, rows)
+    weights = drawn(np.random.default_rng(seed), len(names), TRIALS)
+    return np.asarray(of_sums(weights @ sums))
+
+
+def p_value(draws: Floats, edge: float) -> float:
+    """Return the two-sided p-value of an edge: below 0.05 as the interval excludes it.
+
+    It is at least 2 / (draws + 1). Draws that all are equal say nothing of what was not
+    seen: 1.
+    """
+    if not len(draws) or is_a_point((float(draws.min()), float(draws.max()))):
+        return 1.0
+    beyond = min(int((draws <= edge).sum()), int((draws >= edge).sum()))
+    return min(1.0, 2.0 * (1 + beyond) / (len(draws) + 1))
 
 
 def _static(drives: Sequence[DriveRecord], seed: int) -> Found:

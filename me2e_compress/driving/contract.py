@@ -212,7 +212,6 @@ class Policy(Protocol):
 
         The same observations must then give the same answers, whatever came before.
         """
-        ...
 
     def plan(self, observation: Observation) -> Answer:
         """Return the plan or the controls for one observation, once per decision.
@@ -281,12 +280,21 @@ def checked(answer: object) -> Trajectory | PedalsAndWheel:
             range.
     """
     if isinstance(answer, PedalsAndWheel):
-        return _in_range(answer)
+        for name, (low, high) in RANGES.items():
+            value = getattr(answer, name)
+            if not low <= value <= high:  # which NaN is not either
+                raise EvaluationError(
+                    f"{name} is {value:g}, it must be from {low:g} to {high:g}"
+                )
+        return answer
     if isinstance(answer, Trajectory):
         return Trajectory(_finite(answer.points), np.asarray(answer.times_s))
     # an array of six waypoints
     if not isinstance(answer, np.ndarray) or answer.dtype.kind != "f":
-        raise EvaluationError(f"the plan is not a float array but {_kind(answer)}")
+        kind = type(answer).__name__
+        if isinstance(answer, np.ndarray):
+            kind = f"an array of {answer.dtype}"
+        raise EvaluationError(f"the plan is not a float array but {kind}")
     if answer.shape != PLAN_SHAPE:
         raise EvaluationError(
             f"the plan has shape {list(answer.shape)}, it must be {list(PLAN_SHAPE)}"
@@ -313,19 +321,3 @@ def _finite(points: Plan) -> Plan:
     if not np.isfinite(points).all():
         raise EvaluationError("the plan is not finite")
     return points.astype(np.float64)
-
-
-def _in_range(control: PedalsAndWheel) -> PedalsAndWheel:
-    for name, (low, high) in RANGES.items():
-        value = getattr(control, name)
-        if not low <= value <= high:  # which NaN is not either
-            raise EvaluationError(
-                f"{name} is {value:g}, it must be from {low:g} to {high:g}"
-            )
-    return control
-
-
-def _kind(answer: object) -> str:
-    if isinstance(answer, np.ndarray):
-        return f"an array of {answer.dtype}"
-    return type(answer).__name__

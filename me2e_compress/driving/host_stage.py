@@ -17,8 +17,6 @@ from pydantic_core import CoreSchema
 from me2e_compress.errors import EvaluationError
 from me2e_compress.registry import Registry
 
-__all__ = ["HOST_STAGES", "HostStage", "HostWork"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HostWork:
@@ -38,7 +36,7 @@ class HostStage(abc.ABC):
     """Changes the plan on the host after the network has run; its fields are options.
 
     A measured latency includes its time, and `HostStageLatency` of
-    `me2e_compress.driving.layered_latency` charges its iterations.
+    `me2e_compress.driving.latency` charges its iterations.
     """
 
     name: ClassVar[str]
@@ -148,15 +146,30 @@ class CollisionOptimizer(HostStage):
         """Return the plan moved off occupied cells; the same plan if none are near."""
         from scipy.optimize import minimize  # takes a second to import
 
-        cells, step = self.near(plan, self._occupancy(outputs))
+        occupancy = outputs.get(self.output)
+        if occupancy is None:
+            raise EvaluationError(
+                f"{self.name}: the model has no output {self.output}; there are "
+                f"{', '.join(outputs)}"
+            )
+        if occupancy.ndim != 4 or occupancy.shape[0] != 1 or not occupancy.size:
+            raise EvaluationError(
+                f"{self.name}: output {self.output} has shape {list(occupancy.shape)},"
+                " it must be [1, T, rows, columns]"
+            )
+        cells, step = self.near(plan, np.asarray(occupancy[0], np.float64))
         if not len(cells):
             return HostWork(plan)
         # UniAD's weight is of its own cells
         reference = np.asarray(plan, np.float64)
         weight = self.weight * (self.cell_m / UNIAD_CELL_M) ** 2
-        problem = _Problem(reference, cells, step, self.sigma_m, weight)
-        found = minimize(problem.cost, reference.ravel(), jac=True, method=self.solver)
-        return HostWork(found.x.reshape(reference.shape), int(found.nit), len(cells))
+        problem = reference, cells, step, self.sigma_m, weight
+        solution = minimize(
+            cost, reference.ravel(), problem, jac=True, method=self.solver
+        )
+        return HostWork(
+            solution.x.reshape(reference.shape), int(solution.nit), len(cells)
+        )
 
     def near(
         self, plan: Floats, occupancy: Floats
@@ -176,40 +189,24 @@ class CollisionOptimizer(HostStage):
         kept = np.hypot(*(cells - plan[step]).T) <= self.radius_m
         return cells[kept], step[kept]
 
-    def _occupancy(self, outputs: Mapping[str, npt.NDArray[np.generic]]) -> Floats:
-        if self.output not in outputs:
-            raise EvaluationError(
-                f"{self.name}: the model has no output {self.output}; there are "
-                f"{', '.join(outputs)}"
-            )
-        found = outputs[self.output]
-        if found.ndim != 4 or found.shape[0] != 1 or not found.size:
-            raise EvaluationError(
-                f"{self.name}: output {self.output} has shape {list(found.shape)}, it "
-                "must be [1, T, rows, columns]"
-            )
-        return np.asarray(found[0], np.float64)
 
+def cost(
+    flat: Floats,
+    reference: Floats,
+    cells: Floats,
+    step: npt.NDArray[np.intp],
+    sigma: float,
+    weight: float,
+) -> tuple[float, Floats]:
+    """Return the objective of waypoints [12], and its gradient [12].
 
-@dataclass(frozen=True)
-class _Problem:
-    """The objective and its gradient, for waypoints [6, 2] and cells [N, 2].
-
-    ``step`` [N] is the waypoint that each cell is near, ``weight`` that of one cell.
+    ``reference`` is [6, 2], ``step`` [N] the waypoint that each of the cells [N, 2] is
+    near, ``weight`` that of one cell.
     """
-
-    reference: Floats
-    cells: Floats
-    step: npt.NDArray[np.intp]
-    sigma: float
-    weight: float
-
-    def cost(self, flat: Floats) -> tuple[float, Floats]:
-        """Return the cost of waypoints [12], and its gradient [12]."""
-        moved = flat.reshape(self.reference.shape) - self.reference
-        away = flat.reshape(self.reference.shape)[self.step] - self.cells
-        height = self.weight / (math.sqrt(2.0 * math.pi) * self.sigma)
-        hills = height * np.exp(-(away**2).sum(axis=1) / (2.0 * self.sigma**2))
-        gradient = 2.0 * moved
-        np.add.at(gradient, self.step, -hills[:, None] * away / self.sigma**2)
-        return float((moved**2).sum() + hills.sum()), gradient.ravel()
+    waypoints = flat.reshape(reference.shape)
+    moved, away = waypoints - reference, waypoints[step] - cells
+    height = weight / (math.sqrt(2.0 * math.pi) * sigma)
+    hills = height * np.exp(-(away**2).sum(axis=1) / (2.0 * sigma**2))
+    gradient = 2.0 * moved
+    np.add.at(gradient, step, -hills[:, None] * away / sigma**2)
+    return float((moved**2).sum() + hills.sum()), gradient.ravel()

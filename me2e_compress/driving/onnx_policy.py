@@ -5,24 +5,135 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
+import numpy as np
+
+from me2e_compress.display import reason
 from me2e_compress.driving.adapter import Adapter, ImageNormalization
+from me2e_compress.driving.adapter.adapter import ZEROS, RecurrentEntry
 from me2e_compress.driving.adapter.inputs import ModelInputs, contract_names
 from me2e_compress.driving.adapter.outputs import ModelOutputs
-from me2e_compress.driving.adapter.recurrent import FirstValues, answers_by_input
 from me2e_compress.driving.contract import (
     PLAN_TIMES_S,
     Answer,
     Observation,
     RouteInfo,
     Trajectory,
+    fed,
     fits,
     six_waypoints,
+    zeros,
 )
 from me2e_compress.driving.host_stage import HostStage, HostWork
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
+from me2e_compress.registry.documents import UNREADABLE, check_regular
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import Session
+from me2e_compress.runtime.session import DTYPES, Session, SessionPort
+
+Entries = Mapping[str, RecurrentEntry] | None
+
+
+def answers_by_input(
+    session: Session, entries: Entries, fed_otherwise: set[str]
+) -> dict[str, str]:
+    """Return each recurrent input with the output that answers it.
+
+    The pairs of the model's own metadata are added to the adapter's entries, except for
+    inputs in ``fed_otherwise``, which the adapter feeds.
+    """
+    own = {k: v for k, v in session.recurrent.items() if k not in fed_otherwise}
+    found: dict[str, str] = {}
+    for name, entry in (entries or {}).items():
+        answer = entry.answer or own.get(name)
+        if answer is None:
+            raise EvaluationError(
+                f"recurrent input {name}: no output answers it by its name; say from ="
+                f" one of {', '.join(session.outputs)}"
+            )
+        found[name] = answer
+    return {**own, **found}
+
+
+@dataclass(frozen=True)
+class FirstValues:
+    """What recurrent inputs hold at the first decision of a route.
+
+    ``held`` values are read from files; ``given`` maps a recurrent input to the input
+    whose value it takes; ``zeros`` are for inputs that only the adapter calls
+    recurrent.
+    """
+
+    held: Mapping[str, Array]
+    given: Mapping[str, str]
+    zeros: Mapping[str, Array]
+
+    @classmethod
+    def of(
+        cls, session: Session, entries: Entries, recurrent: Mapping[str, str]
+    ) -> Self:
+        """Read the files, and check every value against its input."""
+        held: dict[str, Array] = {}
+        given: dict[str, str] = {}
+        ports = session.inputs
+        for name, entry in (entries or {}).items():
+            where = f"first value of {name}: {entry.first}"
+            if entry.file is not None:
+                held[name] = _from_file(entry.file, name, ports[name], where)
+            elif entry.first != ZEROS:
+                given[name] = _input(entry.first, ports[name], ports, recurrent, where)
+        # all others start from zeros
+        known = {*held, *given, *session.recurrent}
+        others = [name for name in recurrent if name not in known]
+        return cls(held, given, {name: zeros(name, ports[name]) for name in others})
+
+    def at(self, feeds: Mapping[str, Array]) -> dict[str, Array]:
+        """Return those that are not zeros, given the feeds of the first decision."""
+        return {**self.held, **{to: feeds[name] for to, name in self.given.items()}}
+
+
+def _from_file(path: Path, name: str, port: SessionPort, where: str) -> Array:
+    """Read an array; from an ``.npz``, the one named like the input."""
+    try:
+        check_regular(path)
+        value = np.load(path, allow_pickle=False)
+        if not isinstance(value, np.ndarray):
+            with value as archive:
+                value = archive[name]
+    except KeyError as error:
+        raise EvaluationError(f"{where} holds no array {name}") from error
+    except UNREADABLE as error:
+        raise EvaluationError(f"{where} cannot be read: {reason(error)}") from error
+    # it must fit the port
+    missing = max(0, len(port.shape) - value.ndim)
+    if not fits((1,) * missing + value.shape, port.shape):
+        raise EvaluationError(
+            f"{where} has shape {list(value.shape)}, the input takes {list(port.shape)}"
+        )
+    if not np.can_cast(value.dtype, DTYPES[port.type], "same_kind"):
+        raise EvaluationError(f"{where} is {value.dtype}, the input takes {port.type}")
+    return fed(value, port)
+
+
+def _input(
+    source: str,
+    port: SessionPort,
+    ports: Mapping[str, SessionPort],
+    recurrent: Mapping[str, str],
+    where: str,
+) -> str:
+    if source not in ports or source in recurrent:
+        plain = ", ".join(name for name in ports if name not in recurrent)
+        raise EvaluationError(
+            f"{where} is none of {ZEROS}, a file .npy or .npz, and an input that is not"
+            f" recurrent; those are {plain or 'none'}"
+        )
+    other = ports[source]
+    if other.type != port.type or not fits(other.shape, port.shape):
+        raise EvaluationError(
+            f"{where} is {other.type} {list(other.shape)}, the input takes {port.type}"
+            f" {list(port.shape)}"
+        )
+    return source
 
 
 @dataclass
@@ -90,7 +201,15 @@ class OnnxPolicy:
         first = FirstValues.of(session, adapter.recurrent, recurrent)
         policy = cls(session, adapter, inputs, outputs, recurrent, first, stage)
         # a misfit that only a run shows
-        policy._dry_run()
+        policy.reset(None)
+        policy.plan(inputs.nothing(command=0))
+        for name, answer in recurrent.items():
+            given, wanted = policy._state[name].shape, session.inputs[name].shape
+            if not fits(given, wanted):
+                raise EvaluationError(
+                    f"output {answer} has shape {list(given)}, the recurrent input "
+                    f"{name} takes {list(wanted)}"
+                )
         return policy
 
     @property
@@ -125,40 +244,22 @@ class OnnxPolicy:
         outputs = self.session.run({**self._state, **feeds})
         self._begins = False
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
-        # the host stage may change the plan
+        # the host stage may change the plan, as six waypoints every 0.5 s
         plan = self.outputs.trajectory(outputs, feeds, observation)
         if plan is not None and self.stage is not None:
-            plan = self._changed(plan, self.stage, outputs)
+            work = self.stage.work(six_waypoints(plan), outputs)
+            if not isinstance(work, HostWork):
+                raise EvaluationError(
+                    f"{self.stage.name}: work returned {type(work).__name__}: it must"
+                    " be a HostWork"
+                )
+            self.host_iterations, self.host_cells = work.iterations, work.cells
+            plan = Trajectory(work.plan, PLAN_TIMES_S)
         return self.outputs.answer(plan, outputs)
-
-    def _changed(
-        self, plan: Trajectory, stage: HostStage, outputs: dict[str, Array]
-    ) -> Trajectory:
-        """Run the host stage on the plan, as six waypoints every 0.5 s."""
-        work = stage.work(six_waypoints(plan), outputs)
-        if not isinstance(work, HostWork):
-            kind = type(work).__name__
-            raise EvaluationError(
-                f"{stage.name}: work returned {kind}: it must be a HostWork"
-            )
-        self.host_iterations, self.host_cells = work.iterations, work.cells
-        return Trajectory(work.plan, PLAN_TIMES_S)
 
     def feeds(self, observation: Observation) -> dict[str, Array]:
         """Convert an observation to the graph's inputs, without recurrent ones."""
         return self.inputs.feeds(observation)
-
-    def _dry_run(self) -> None:
-        """Run once on zeros: what does not fit here would fail on every route."""
-        self.reset(None)
-        self.plan(self.inputs.nothing(command=0))
-        for name, answer in self.recurrent.items():
-            given, wanted = self._state[name].shape, self.session.inputs[name].shape
-            if not fits(given, wanted):
-                raise EvaluationError(
-                    f"output {answer} has shape {list(given)}, the recurrent input "
-                    f"{name} takes {list(wanted)}"
-                )
 
 
 def recurrent_of(session: Session, adapter: Adapter) -> dict[str, str]:

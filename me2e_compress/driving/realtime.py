@@ -8,11 +8,12 @@ Beside it stands the other published model, a pipeline that delays every control
 skips no decision: `LatencyModel`.
 """
 
+import abc
 from collections import deque
 from dataclasses import dataclass, field
 from enum import StrEnum
 from numbers import Integral
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 from me2e_compress.errors import EvaluationError
 
@@ -33,31 +34,36 @@ class LatencyModel(StrEnum):
     Bench2Drive-Robust."""
 
 
-class ControlClock(Protocol[T]):
-    """Says in which frames a control acts and a decision is due."""
-
-    @property
-    def decision_is_due(self) -> bool:
-        """Whether the policy looks at this frame."""
-        ...
-
-    def decide(self, control: T, latency_us: int) -> None:
-        """Take the decision that is due at this frame."""
-        ...
-
-    def advance(self) -> T:
-        """Return the control that acts in this frame, and go to the next."""
-        ...
-
-
-def control_clock(model: LatencyModel, in_force: T, dt_us: int) -> ControlClock[T]:
-    """Build the clock of a model.
+@dataclass
+class ControlClock(abc.ABC, Generic[T]):
+    """Says in which frames a control acts and a decision is due.
 
     Args:
-        model: Which.
         in_force: The control before any decision acts.
         dt_us: Step of the simulated world, microseconds.
     """
+
+    in_force: T
+    dt_us: int = DT_US
+    _frame: int = field(default=0, init=False)
+
+    @property
+    @abc.abstractmethod
+    def decision_is_due(self) -> bool:
+        """Whether the policy looks at this frame."""
+
+    @abc.abstractmethod
+    def decide(self, control: T, latency_us: int) -> None:
+        """Take the decision that is due, whose control took so long, at this frame."""
+
+    def advance(self) -> T:
+        """Return the control that acts in this frame, and go to the next."""
+        self._frame += 1
+        return self.in_force
+
+
+def control_clock(model: LatencyModel, in_force: T, dt_us: int) -> ControlClock[T]:
+    """Build the clock of a model; see `ControlClock`."""
     if model is LatencyModel.FIFO:
         return PipelinedControl(in_force, dt_us)
     return HeldControl(in_force, dt_us)
@@ -70,33 +76,22 @@ def skipped_decisions(latency_us: int, dt_us: int = DT_US) -> int:
     and 90 ms drive alike. A finer step tells them apart; it also charges the same
     latency differently (int() drops the remainder of another step: 120 ms are n = 1 at
     50 ms, a delay of 100 ms, and n = 11 at 10 ms, a delay of 120 ms) and lets a fast
-    policy decide more often than 20 times a second. Results at different steps must
-    not be compared with each other.
-
-    Args:
-        latency_us: How long the inference took, microseconds.
-        dt_us: Step of the simulated world, microseconds.
+    policy decide more often than 20 times a second. Results at different steps must not
+    be compared with each other.
     """
     return max(0, _whole(latency_us) // dt_us - 1)
 
 
 @dataclass
-class HeldControl(Generic[T]):
-    """Decides in which frames a control acts and a decision is due.
+class HeldControl(ControlClock[T]):
+    """Takes one decision at a time.
 
     A decision taken at frame k that skips n = 0 decisions acts at once. With n > 0 the
     control in force before frame k stays for the frames k to k + n, whose observations
     are not used, and the new one acts from frame k + n + 1 on, where the next decision
     is taken.
-
-    Args:
-        in_force: The control before any decision acts.
-        dt_us: Step of the simulated world, microseconds.
     """
 
-    in_force: T
-    dt_us: int = DT_US
-    _frame: int = field(default=0, init=False)
     _due: int = field(default=0, init=False)
     _coming: T | None = field(default=None, init=False)
 
@@ -106,12 +101,7 @@ class HeldControl(Generic[T]):
         return self._frame == self._due
 
     def decide(self, control: T, latency_us: int) -> None:
-        """Take the decision that is due at this frame.
-
-        Args:
-            control: What follows from the plan for this frame's observation.
-            latency_us: How long it took, microseconds.
-        """
+        """Take the decision that is due at this frame."""
         # the last decision's control acts from this frame on
         if self._coming is not None:
             self.in_force = self._coming
@@ -122,19 +112,9 @@ class HeldControl(Generic[T]):
         # the next decision is due when this one's control acts
         self._due = self._frame + skipped + 1
 
-    def advance(self) -> T:
-        """Return the control that acts in this frame, and go to the next."""
-        self._frame += 1
-        return self.in_force
-
 
 def delayed_frames(latency_us: int, dt_us: int = DT_US) -> int:
-    """Return ceil(t / dt): how many frames later a control acts in a pipeline.
-
-    Args:
-        latency_us: How long the inference took, microseconds.
-        dt_us: Step of the simulated world, microseconds.
-    """
+    """Return ceil(t / dt): how many frames later a control acts in a pipeline."""
     return -(-_whole(latency_us) // dt_us)
 
 
@@ -148,22 +128,15 @@ def _whole(latency_us: int) -> int:
 
 
 @dataclass
-class PipelinedControl(Generic[T]):
+class PipelinedControl(ControlClock[T]):
     """Delays every control; a decision is due at every frame.
 
     The control decided at frame k acts from frame k + ceil(t / dt) on, until the next
     one does. First in, first out: a fast decision does not overtake a slow one before
     it. As many decisions run side by side as the delay has frames, so the model says
     what a delay does, not what one computer that takes t can do.
-
-    Args:
-        in_force: The control before any decision acts.
-        dt_us: Step of the simulated world, microseconds.
     """
 
-    in_force: T
-    dt_us: int = DT_US
-    _frame: int = field(default=0, init=False)
     _coming: deque[tuple[int, T]] = field(default_factory=deque, init=False)
 
     @property
@@ -172,12 +145,7 @@ class PipelinedControl(Generic[T]):
         return True
 
     def decide(self, control: T, latency_us: int) -> None:
-        """Take the decision of this frame.
-
-        Args:
-            control: What follows from the plan for this frame's observation.
-            latency_us: How long it took, microseconds.
-        """
+        """Take the decision of this frame."""
         ready = self._frame + delayed_frames(latency_us, self.dt_us)
         self._coming.append((ready, control))
 
@@ -185,5 +153,4 @@ class PipelinedControl(Generic[T]):
         """Return the control that acts in this frame, and go to the next."""
         while self._coming and self._coming[0][0] <= self._frame:
             _, self.in_force = self._coming.popleft()
-        self._frame += 1
-        return self.in_force
+        return super().advance()

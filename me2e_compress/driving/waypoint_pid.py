@@ -4,7 +4,6 @@ import math
 from collections import deque
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from me2e_compress.driving.contract import PedalsAndWheel, Plan, timed
@@ -84,20 +83,6 @@ class WaypointPid:
             raise EvaluationError("a plan of one waypoint cannot be followed by PID")
         steps = np.hypot(*np.diff(waypoints, axis=0).T)
         wanted_mps = float(np.mean(steps) / np.mean(np.diff(trajectory.times_s)))
-        steer = self._steering(waypoints, node)
-        # throttle towards that speed; brake where the plan is slow or the ego too fast
-        missing = min(max(wanted_mps - speed_mps, 0.0), asked.clip_delta_mps)
-        self._misses.append(missing)
-        gains = asked.speed_kp, asked.speed_ki, asked.speed_kd
-        throttle = min(max(_pid(self._misses, *gains), 0.0), asked.max_throttle)
-        too_fast = speed_mps > asked.brake_ratio * wanted_mps
-        if wanted_mps < asked.brake_speed_mps or too_fast:
-            return PedalsAndWheel(0.0, steer, 1.0)
-        coasting = speed_mps > asked.coast_above_mps
-        return PedalsAndWheel(0.0 if coasting else throttle, steer, 0.0)
-
-    def _steering(self, waypoints: npt.NDArray[np.float64], node: Place) -> float:
-        asked = self.options
         # the waypoint aimed at
         middles = (waypoints[1:] + waypoints[:-1]) / 2
         aim = int(np.argmin(np.abs(np.hypot(*middles.T) - asked.aim_m)))
@@ -110,8 +95,18 @@ class WaypointPid:
         follow = abs(to_node) < abs(angle) or (outlier and near)
         self._angles.append(to_node if follow else angle)
         # PID over the window
-        gains = asked.turn_kp, asked.turn_ki, asked.turn_kd
-        return min(max(_pid(self._angles, *gains), -1.0), 1.0)
+        turns = asked.turn_kp, asked.turn_ki, asked.turn_kd
+        steer = min(max(_pid(self._angles, *turns), -1.0), 1.0)
+        # throttle towards that speed; brake where the plan is slow or the ego too fast
+        missing = min(max(wanted_mps - speed_mps, 0.0), asked.clip_delta_mps)
+        self._misses.append(missing)
+        gains = asked.speed_kp, asked.speed_ki, asked.speed_kd
+        throttle = min(max(_pid(self._misses, *gains), 0.0), asked.max_throttle)
+        too_fast = speed_mps > asked.brake_ratio * wanted_mps
+        if wanted_mps < asked.brake_speed_mps or too_fast:
+            return PedalsAndWheel(0.0, steer, 1.0)
+        coasting = speed_mps > asked.coast_above_mps
+        return PedalsAndWheel(0.0 if coasting else throttle, steer, 0.0)
 
 
 def _quarter_turns(right: float, forward: float) -> float:

@@ -12,22 +12,23 @@ is reproduced here with its faults:
   twice.
 """
 
+from collections.abc import Sequence
 from statistics import fmean
 
 import numpy as np
-import numpy.typing as npt
 
-from me2e_compress.metrics.comfort import WINDOW, Floats, filtered
-from me2e_compress.metrics.efficiency import (
+from me2e_compress.metrics.episode import EgoFrame, Episode, InfractionKind
+from me2e_compress.metrics.measure import Estimate, Measure, binomial_interval
+from me2e_compress.metrics.route_scores import (
     CHECKPOINTS,
     DONE_PERCENT,
     OUTLIER_PERCENT,
     PERCENT,
+    WINDOW,
+    Floats,
     beside_traffic,
+    filtered,
 )
-from me2e_compress.metrics.episode import EgoFrame, Episode
-from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.metrics.measure import Measure
 
 BLOCK_FRAMES = 20
 DELTA_S = 0.1
@@ -96,7 +97,11 @@ def smoothness(episode: Episode) -> Measure:
             (
                 frame.acceleration_mps2,
                 frame.lateral_acceleration_mps2,
-                _norm(frame),
+                (
+                    np.hypot(frame.acceleration_mps2, frame.lateral_acceleration_mps2)
+                    if frame.acceleration_norm_mps2 is None
+                    else frame.acceleration_norm_mps2
+                ),
                 np.degrees(frame.yaw_rate_radps),
             )
             for frame in frames
@@ -106,41 +111,102 @@ def smoothness(episode: Episode) -> Measure:
     length = min(len(frames), BLOCK_FRAMES)
     blocks = len(frames) // length
     cut = columns[:, : blocks * length].reshape(len(columns), blocks, length)
-    return Measure(fmean(smooth_blocks(*cut).tolist()), "ratio")
-
-
-def smooth_blocks(
-    along: Floats, across: Floats, length: Floats, yaw_rate_degps: Floats
-) -> npt.NDArray[np.bool_]:
-    """Return [B] whether all samples of a block lie within the bounds.
-
-    All arguments are [B, N]: the acceleration along the heading, across it and its norm
-    in the plane (m/s2), and the yaw rate in degrees per second.
-    """
+    a_along, a_across, a_length = map(_smoothed, cut[:3])
     # as the original: degrees are unwrapped as if they were radians
-    a_along, a_across, a_length = map(_smoothed, (along, across, length))
-    turns = np.round(np.diff(yaw_rate_degps) / (2.0 * np.pi)).cumsum(axis=1)
+    turns = np.round(np.diff(cut[3]) / (2.0 * np.pi)).cumsum(axis=1)
     turned = np.pad(turns, ((0, 0), (1, 0)))
-    yaw_rate = _smoothed(yaw_rate_degps - 2.0 * np.pi * turned)
-    yaw_acceleration = yaw_rate
-    # the last two bounds are in radians, the yaw rate is in degrees
+    yaw_rate = _smoothed(cut[3] - 2.0 * np.pi * turned)
+    # the last bound is in radians; the original's yaw acceleration is the yaw rate, of
+    # which it asks less than 1.93 too
     within = (
         (a_along > -4.05) & (a_along < 2.40),
         np.abs(a_across) < 4.89,
         np.abs(_smoothed(a_length, 1)) < 8.37,
         np.abs(_smoothed(a_along, 1)) < 4.13,
-        np.abs(yaw_acceleration) < 1.93,
         np.abs(yaw_rate) < 0.95,
     )
-    return np.asarray(np.logical_and.reduce(within).all(axis=1))
-
-
-def _norm(frame: EgoFrame) -> float:
-    if frame.acceleration_norm_mps2 is not None:
-        return frame.acceleration_norm_mps2
-    return float(np.hypot(frame.acceleration_mps2, frame.lateral_acceleration_mps2))
+    smooth = np.logical_and.reduce(within).all(axis=1)
+    return Measure(fmean(smooth.tolist()), "ratio")
 
 
 def _smoothed(values: Floats, derivative: int = 0) -> Floats:
     """Smooth every row of [B, N] on its own."""
     return filtered(values, DELTA_S, derivative, min(WINDOW, values.shape[1]))
+
+
+# Bench2Drive's five abilities. A route counts under every ability that it tests; routes
+# without a record are not counted. For Traffic_Signs a route also counts that failed,
+# but *passed the junction*: the ego came more than 8 m into it and ran no stop sign or
+# red light (tools/ability_benchmark.py, branch 0.0.4).
+
+
+ABILITIES = ("Overtaking", "Merging", "Emergency_Brake", "Give_Way", "Traffic_Signs")
+TRAFFIC_SIGNS = "Traffic_Signs"
+MEAN = "mean"
+
+JUNCTION_MARGIN_M = 8.0
+"""How far past the start of a junction the ego must come to have obeyed its signs."""
+
+
+def mastered(episode: Episode, ability: str) -> bool:
+    """Return whether a route of ours counts as a success for one of its abilities."""
+    if episode.succeeded:
+        return True
+    if ability != TRAFFIC_SIGNS or episode.junction_m is None:
+        return False
+    passed_m = episode.completion_percent / 100.0 * episode.route_length_m
+    return passed_m > episode.junction_m + JUNCTION_MARGIN_M and not _ran_a_sign(
+        episode
+    )
+
+
+def successes(episodes: Sequence[Episode]) -> dict[str, tuple[bool, ...]]:
+    """Return, for each ability, whether each route that tests it was mastered."""
+    return {
+        ability: tuple(
+            mastered(episode, ability)
+            for episode in episodes
+            if ability in episode.abilities
+        )
+        for ability in ABILITIES
+    }
+
+
+def ability_rates(episodes: Sequence[Episode]) -> dict[str, Estimate]:
+    """Return the rate of each ability of a real run in percent, and their mean.
+
+    A real run does not say where junctions are. Where that decides, the rate of
+    Traffic_Signs is None, and so is the mean.
+    """
+    rates = dict[str, Estimate]()
+    for ability in ABILITIES:
+        won = [success(one) for one in episodes if ability in one.abilities]
+        if not won:
+            rates[ability] = Estimate.missing("%", "no such route was driven")
+            continue
+        measure = Measure(100.0 * sum(won) / len(won), "%")
+        interval = binomial_interval(sum(won), len(won))
+        rates[ability] = Estimate(measure, *interval, len(won))
+    # failed routes that would count if the ego passed their junction
+    tested = [one for one in episodes if TRAFFIC_SIGNS in one.abilities]
+    unknown = [
+        one.route
+        for one in tested
+        if one.completion_percent > 0.0 and not (success(one) or _ran_a_sign(one))
+    ]
+    if unknown:
+        others = f" and {len(unknown) - 1} others" if len(unknown) > 1 else ""
+        reason = f"where the junction is on {unknown[0]}{others} is not known"
+        rates[TRAFFIC_SIGNS] = Estimate.missing("%", reason, len(tested))
+    # the mean, if all five are known
+    lacks = [name for name, rate in rates.items() if rate.value is None]
+    if lacks:
+        reason = f"{lacks[0]}: {rates[lacks[0]].measure.reason}"
+        return {**rates, MEAN: Estimate.missing("%", reason, len(episodes))}
+    mean = fmean(rate.value or 0.0 for rate in rates.values())
+    return {**rates, MEAN: Estimate(Measure(mean, "%"), None, None, len(episodes))}
+
+
+def _ran_a_sign(episode: Episode) -> bool:
+    broken = (InfractionKind.STOP, InfractionKind.RED_LIGHT)
+    return any(each.kind in broken for each in episode.infractions)

@@ -7,7 +7,7 @@ from typing import Any
 
 from me2e_compress.metrics.episode import FRAME_US, Episode
 from me2e_compress.metrics.measure import Measure, percentile, too_few
-from me2e_compress.metrics.surrogate_safety import TTC_CRITICAL_S
+from me2e_compress.metrics.route_scores import TTC_CRITICAL_S
 
 BUDGET_MS = FRAME_US / 1000
 """One frame at 20 Hz."""
@@ -69,10 +69,15 @@ def deadlines(
     count = len(latencies_us)
     samples = count if measured is None else min(count, measured)
     late = sum(each > 1e3 * budget_ms for each in latencies_us)
+    percentiles = dict[float, Measure]()
+    for p in PERCENTILES:
+        why = too_few(p, samples)
+        value = None if why else percentile(latencies_us, p) / 1e3
+        percentiles[p] = Measure(value, "ms", why)
     return Deadlines(
         budget_ms,
         count,
-        {p: _percentile(latencies_us, p, samples) for p in PERCENTILES},
+        percentiles,
         Measure(fmean(latencies_us) / 1e3, "ms"),
         Measure(max(latencies_us) / 1e3, "ms"),
         Measure(100.0 * late / count, "%"),
@@ -92,18 +97,9 @@ def charged(
     taken = [each.latency_us for episode in driven for each in episode.decisions]
     if not any(taken):
         return None
-    critical, other = _by_danger(driven)
-    return replace(
-        deadlines(taken, budget_ms, measured),
-        critical_ms=_mean(critical, "no decision on a frame with TTC below 1.5 s"),
-        other_ms=_mean(other, "no decision on another frame"),
-    )
-
-
-def _by_danger(episodes: Iterable[Episode]) -> tuple[list[int], list[int]]:
-    """Return latencies on frames with a low time to collision, and on others."""
+    # latencies on frames with a low time to collision, and on others
     critical, other = list[int](), list[int]()
-    for episode in episodes:
+    for episode in driven:
         ttc_s = () if episode.conflicts is None else episode.conflicts.ttc_s
         for decision in episode.decisions:
             frame = decision.time_us // FRAME_US
@@ -111,16 +107,14 @@ def _by_danger(episodes: Iterable[Episode]) -> tuple[list[int], list[int]]:
                 seconds = ttc_s[frame]
                 near = seconds is not None and seconds < TTC_CRITICAL_S
                 (critical if near else other).append(decision.latency_us)
-    return critical, other
+    return replace(
+        deadlines(taken, budget_ms, measured),
+        critical_ms=_mean(critical, "no decision on a frame with TTC below 1.5 s"),
+        other_ms=_mean(other, "no decision on another frame"),
+    )
 
 
 def _mean(latencies_us: Sequence[int], why: str) -> Measure:
     if not latencies_us:
         return Measure(None, "ms", why)
     return Measure(fmean(latencies_us) / 1e3, "ms")
-
-
-def _percentile(latencies_us: Sequence[int], percent: float, samples: int) -> Measure:
-    if why := too_few(percent, samples):
-        return Measure(None, "ms", why)
-    return Measure(percentile(latencies_us, percent) / 1e3, "ms")

@@ -20,10 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.efficiency import CHECKPOINTS
 from me2e_compress.metrics.episode import FAILURES
-from me2e_compress.metrics.intervals import mean_estimate
-from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.measure import Estimate, mean_estimate
+from me2e_compress.metrics.route_scores import CHECKPOINTS
 from me2e_compress.metrics.route_summary import RouteSummary
 
 # The four measures of EER_AV, route by route.
@@ -62,28 +61,24 @@ def route_measures(
     left out too. A route without moving traffic has no efficiency, nor has one without
     recorded frames or decisions.
     """
-    rows = [_measures(each, j_per_frame) for each in routes]
+    rows = list[tuple[float, float, float, float]]()
+    for route in routes:
+        efficiency, comfort, joules = route.efficiency, route.comfort, math.nan
+        # without frames the record lacks them, not the drive, unless the driver failed
+        failed = route.ending in FAILURES
+        recorded = bool(route.duration_us) or failed
+        if efficiency is None:
+            begun = route.completion >= 100.0 / CHECKPOINTS
+            efficiency = math.nan if begun or not recorded else 0.0
+        if comfort is None:
+            comfort = 0.0 if recorded else math.nan
+        if j_per_frame is not None and (route.decisions or failed):
+            joules = j_per_frame * route.decisions
+        rows.append((route.driving_score, efficiency, comfort, joules))
     return RouteMeasures(
         np.array(rows, np.float64).reshape(-1, 4),
         np.array([bool(each.collisions) for each in routes], np.bool_),
     )
-
-
-def _measures(
-    route: RouteSummary, j_per_frame: float | None
-) -> tuple[float, float, float, float]:
-    efficiency, comfort, joules = route.efficiency, route.comfort, math.nan
-    # without frames the record lacks them, not the drive, unless the driver failed
-    failed = route.ending in FAILURES
-    recorded = bool(route.duration_us) or failed
-    if efficiency is None:
-        begun = route.completion >= 100.0 / CHECKPOINTS
-        efficiency = math.nan if begun or not recorded else 0.0
-    if comfort is None:
-        comfort = 0.0 if recorded else math.nan
-    if j_per_frame is not None and (route.decisions or failed):
-        joules = j_per_frame * route.decisions
-    return route.driving_score, efficiency, comfort, joules
 
 
 MEASURES: tuple[str, ...] = ("driving score", "efficiency", "comfort", "energy")
@@ -164,25 +159,24 @@ def eer(
     ``scale`` is given. ``types`` are the routes' scenario types for the intervals; None
     treats each route as its own type.
 
-    Example: two variants on two routes, only b crashed, on the second:
-
-        a: DS 100, 60   DE 100, 80   DC 1.0, 0.5   E 10, 10 J
-        b: DS 100, 40   DE 120, 80   DC 0.5, 0.0   E  5,  5 J
-
-    min-max gives a: x = (1, 1/2, 1, 1), (1/3, 0, 1/2, 1); b: (1, 1, 1/2, 0), (0, 0, 0,
-    0). With weights of 1/4 each, a has Q = (1 + 1/2 + 1 - 1) / 4 = 3/8 and (1/3 + 0 +
-    1/2 - 1) / 4 = -1/24, so 16.7 points; b has 5/8 and, after its collision, 0: 31.3
-    points.
-
     Raises:
         EvaluationError: The variants differ in the number of routes.
     """
     if len({len(each.table) for each in variants.values()}) > 1:
         raise EvaluationError("EER_AV compares variants on the same routes")
     # variants and routes that can be scored
-    missing = {name: _missing(each) for name, each in variants.items()}
+    missing = dict[str, str]()
+    for name, each in variants.items():
+        absent = np.asarray(np.isnan(each.table).all(axis=0))
+        lacks = [m for m, gone in zip(MEASURES, absent, strict=True) if gone]
+        missing[name] = f"{' and '.join(lacks)}: not measured" if lacks else ""
     able = {name: each for name, each in variants.items() if not missing[name]}
-    kept, left_out = _kept(able)
+    # the routes that have all measures of all of them, and the gaps of the others
+    kept, left_out = np.zeros(0, np.bool_), dict[str, int]()
+    if able:
+        gone = np.any([np.isnan(each.table) for each in able.values()], axis=0)
+        kept, gaps = ~gone.any(axis=1), gone.sum(axis=0).tolist()
+        left_out = {m: n for m, n in zip(MEASURES, gaps, strict=True) if n}
     tables = {name: each.table[kept] for name, each in able.items()}
     # weights and scales, unless they are given
     reason = "" if kept.any() else "no route has all four measures"
@@ -198,19 +192,15 @@ def eer(
         if why or scale is None:
             scores[name] = Estimate.missing(POINTS, why)
             continue
-        routes[name] = route_eer(tables[name], measures.crashed[kept], scale)
+        # equation 8
+        rows = (tables[name] - np.array(scale.offset)) / np.array(scale.span)
+        terms = rows * np.array(scale.weights) * SIGNS
+        safe = np.where(measures.crashed[kept], 0.0, terms[:, 1:].sum(axis=1))
+        routes[name] = np.asarray(100.0 * (terms[:, 0] + safe))
         kinds = types or [str(i) for i in range(len(kept))]
         kinds = [kind for kind, keep in zip(kinds, kept, strict=True) if keep]
         scores[name] = mean_estimate(routes[name].tolist(), kinds, POINTS, seed)
     return EerResult(scores, routes, None if reason else scale, left_out, kept)
-
-
-def route_eer(table: Floats, crashed: npt.NDArray[np.bool_], scale: EerScale) -> Floats:
-    """Return [routes] 100 times Q_i (equation 8) of a table [routes, 4]."""
-    normalized = (table - np.array(scale.offset)) / np.array(scale.span)
-    terms = normalized * np.array(scale.weights) * SIGNS
-    safe = np.where(crashed, 0.0, terms[:, 1:].sum(axis=1))
-    return np.asarray(100.0 * (terms[:, 0] + safe))
 
 
 def scale_of(tables: Mapping[str, Floats], normalization: Normalization) -> EerScale:
@@ -278,24 +268,6 @@ def rankings(
     """Return the variants, best first, under every normalization that gives weights."""
     found = {each: eer(variants, normalization=each) for each in Normalization}
     return {each: result.ranking for each, result in found.items() if result.scale}
-
-
-def _missing(measures: RouteMeasures) -> str:
-    """Name the measures that a variant has on no route."""
-    absent = np.asarray(np.isnan(measures.table).all(axis=0))
-    names = [name for name, gone in zip(MEASURES, absent, strict=True) if gone]
-    return f"{' and '.join(names)}: not measured" if names else ""
-
-
-def _kept(
-    variants: Mapping[str, RouteMeasures],
-) -> tuple[npt.NDArray[np.bool_], dict[str, int]]:
-    """Return which routes have all measures of all variants, and counts of gaps."""
-    if not variants:
-        return np.zeros(0, np.bool_), {}
-    gone = np.any([np.isnan(each.table) for each in variants.values()], axis=0)
-    counts = zip(MEASURES, gone.sum(axis=0).tolist(), strict=True)
-    return ~gone.any(axis=1), {name: count for name, count in counts if count}
 
 
 def _four(values: Floats) -> tuple[float, float, float, float]:

@@ -7,18 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from me2e_compress.metrics import bench2drive, comfort, efficiency, surrogate_safety
-from me2e_compress.metrics.abilities import ABILITIES, MEAN, ability_rates, successes
-from me2e_compress.metrics.driving_score import route_score
+from me2e_compress.metrics import bench2drive, route_scores
+from me2e_compress.metrics.bench2drive import (
+    ABILITIES,
+    MEAN,
+    ability_rates,
+    success,
+    successes,
+)
 from me2e_compress.metrics.episode import FAILURES, Episode
-from me2e_compress.metrics.intervals import (
+from me2e_compress.metrics.measure import (
     Bounds,
+    Estimate,
     Floats,
+    Measure,
     binomial_interval,
     intervals,
     mean_estimate,
 )
-from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.route_summary import PERCENT, SHARE
 
 FULL_SET = 220
@@ -90,11 +96,9 @@ class Scores:
     def to_json(self) -> dict[str, Any]:
         """Return one object per score, and the number of routes."""
         abilities = {name: each.to_json() for name, each in self.each_ability.items()}
+        plain = ("driving_score", "success_rate", "efficiency", "comfort")
         return {
-            "driving_score": self.driving_score.to_json(),
-            "success_rate": self.success_rate.to_json(),
-            "efficiency": self.efficiency.to_json(),
-            "comfort": self.comfort.to_json(),
+            **{name: getattr(self, name).to_json() for name in plain},
             "comfort_in_motion": self.comfort_in_motion.to_json(),
             "abilities": {**self.abilities.to_json(), "each": abilities},
             "bench2drive": {
@@ -116,15 +120,19 @@ def score(
 ) -> Scores:
     """Score a set of routes; their order affects nothing but the bootstrap."""
     # means over routes with their intervals
-    in_motion = comfort.comfort_in_motion
+    in_motion = route_scores.comfort_in_motion
+
+    def driving_score(episode: Episode) -> Measure:
+        return Measure(route_scores.route_score(episode).composed, "%")
+
     mean_ability, each_ability = _abilities(episodes, seed)
     return Scores(
-        driving_score=_over(episodes, _driving_score, "%", seed, PERCENT),
+        driving_score=_over(episodes, driving_score, "%", seed, PERCENT),
         success_rate=_rate(
             [episode.succeeded for episode in episodes], _types(episodes), seed
         ),
-        efficiency=_over(episodes, efficiency.efficiency, "%", seed),
-        comfort=_over(episodes, comfort.comfort, "ratio", seed, SHARE),
+        efficiency=_over(episodes, route_scores.efficiency, "%", seed),
+        comfort=_over(episodes, route_scores.comfort, "ratio", seed, SHARE),
         comfort_in_motion=_over(episodes, in_motion, "ratio", seed, SHARE),
         abilities=mean_ability,
         each_ability=each_ability,
@@ -144,7 +152,7 @@ def score(
 
 
 def _safety(episodes: Sequence[Episode], seed: int) -> SafetyScores:
-    faults = [surrogate_safety.at_fault_collision(episode) for episode in episodes]
+    faults = [route_scores.at_fault_collision(episode) for episode in episodes]
     known = [fault for fault in faults if fault is not None]
     if len(known) == len(faults):
         at_fault = _rate(known, _types(episodes), seed)
@@ -153,17 +161,13 @@ def _safety(episodes: Sequence[Episode], seed: int) -> SafetyScores:
         reason = f"whose fault {len(faults) - len(known)} collisions were is not known"
         at_fault = Estimate.missing("%", reason)
     return SafetyScores(
-        _over(episodes, surrogate_safety.room_kept, "%", seed, PERCENT),
-        _over(episodes, surrogate_safety.ttc_exposure, "%", seed, PERCENT),
-        _over(episodes, surrogate_safety.smallest_ttc, "s", seed),
-        _over(episodes, surrogate_safety.smallest_pet, "s", seed),
-        _over(episodes, surrogate_safety.smallest_distance, "m", seed),
+        _over(episodes, route_scores.room_kept, "%", seed, PERCENT),
+        _over(episodes, route_scores.ttc_exposure, "%", seed, PERCENT),
+        _over(episodes, route_scores.smallest_ttc, "s", seed),
+        _over(episodes, route_scores.smallest_pet, "s", seed),
+        _over(episodes, route_scores.smallest_distance, "m", seed),
         at_fault,
     )
-
-
-def _driving_score(episode: Episode) -> Measure:
-    return Measure(route_score(episode).composed, "%")
 
 
 def _types(episodes: Iterable[Episode]) -> list[str]:
@@ -240,3 +244,80 @@ def _mean_ability(
     value = fmean(100.0 * sum(each) / len(each) for each in outcomes.values())
     here, anew = intervals(mean_rate, _types(episodes), seed, value, PERCENT)
     return Estimate(Measure(value, "%"), *here, len(episodes), *anew)
+
+
+# Scores of a set of records, as the simulator wrote them and as computed here.
+# Bench2Drive's tools/merge_route_json.py divides by 220 however many records there are,
+# so that a missing route counts as zero; both quotients are given.
+
+
+@dataclass(frozen=True, slots=True)
+class Quotients:
+    """One sum over records, divided by the size of the set or by the records."""
+
+    over_set: Measure
+    over_driven: Measure
+
+    def to_json(self) -> dict[str, float | None]:
+        """Return both values."""
+        return {"set": self.over_set.value, "driven": self.over_driven.value}
+
+
+@dataclass(frozen=True, slots=True)
+class LeaderboardScores:
+    """Scores of a set of records, as given by the simulator and as computed here.
+
+    Driving scores, completion and success rate are percentages; a penalty is the
+    product of the factors of all infractions. A success has status Completed or Perfect
+    and no infraction but low speed.
+    """
+
+    set_size: int
+    driven: int
+    given_score: Quotients
+    given_completion: Quotients
+    given_penalty: Quotients
+    score: Quotients
+    penalty: Quotients
+    success_rate: Quotients
+
+    def to_json(self) -> dict[str, Any]:
+        """Return given and computed scores, apart."""
+        return {
+            "given": {
+                "driving_score": self.given_score.to_json(),
+                "completion": self.given_completion.to_json(),
+                "penalty": self.given_penalty.to_json(),
+            },
+            "computed": {
+                "driving_score": self.score.to_json(),
+                "penalty": self.penalty.to_json(),
+                "success_rate": self.success_rate.to_json(),
+            },
+        }
+
+
+def leaderboard_scores(
+    episodes: Sequence[Episode], set_size: int = FULL_SET
+) -> LeaderboardScores:
+    """Score a set of records as the leaderboard and as Bench2Drive's tools do."""
+    given = [each.given for each in episodes if each.given is not None]
+    scored = [route_scores.route_score(each) for each in episodes]
+
+    def quotients(values: Sequence[float], unit: str = "%") -> Quotients:
+        if not values:
+            nothing = Measure(None, unit, "there is no record")
+            return Quotients(nothing, nothing)
+        over_set = Measure(sum(values) / set_size, unit)
+        return Quotients(over_set, Measure(fmean(values), unit))
+
+    return LeaderboardScores(
+        set_size,
+        len(episodes),
+        given_score=quotients([each.composed_percent for each in given]),
+        given_completion=quotients([each.completion_percent for each in given]),
+        given_penalty=quotients([each.penalty for each in given], "ratio"),
+        score=quotients([each.composed for each in scored]),
+        penalty=quotients([each.penalty for each in scored], "ratio"),
+        success_rate=quotients([100.0 * success(each) for each in episodes]),
+    )

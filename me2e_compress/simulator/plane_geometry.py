@@ -1,7 +1,7 @@
 """Geometry of a route and of the roads around it, in the right-handed plane."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from functools import cached_property
 
@@ -36,17 +36,11 @@ class LaneMarking(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """One lane: its centre line in driving direction.
+    """One lane: its centre line [N, 2] in driving direction, points at most 2 m apart.
 
-    Args:
-        name: Unique name, ``from>to:index``.
-        centre: [N, 2] metres, at most 2 m apart.
-        width: Metres.
-        left: Marking of the left edge, seen in driving direction.
-        right: Marking of the right edge.
-        speed_limit_mps: Speed limit.
-        shoulder: Paved but not meant for driving: no route uses it, yet a car on it
-            is not off-road.
+    The name ``from>to:index`` is unique; the markings are those of its edges, seen in
+    driving direction. No route uses a shoulder, which is paved but not meant for
+    driving, yet a car on it is not off-road.
     """
 
     name: str
@@ -54,7 +48,6 @@ class Lane:
     width: float
     left: LaneMarking
     right: LaneMarking
-    speed_limit_mps: float
     shoulder: bool = False
 
     @cached_property
@@ -79,7 +72,11 @@ class Roadmap:
     def outside_all(self, points: Floats) -> Floats:
         """Return [N], `outside_m` of [N, 2] points at once."""
         start, direction, length, half_width = self._chords
-        away = _distance_to_chords(points, start, direction, length) - half_width
+        # [N, C] distances of N points to C chords
+        dx, dy = (points[:, i, None] - start[:, i] for i in (0, 1))
+        way_x, way_y = direction.T
+        along = (dx * way_x + dy * way_y).clip(0.0, length)
+        away = np.hypot(dx - along * way_x, dy - along * way_y) - half_width
         return np.asarray(np.maximum(np.min(away, axis=1), 0.0))
 
     @cached_property
@@ -122,11 +119,10 @@ class RoutePath:
     left_m: Floats
     right_m: Floats
     oncoming_m: Floats
-    _direction: Floats = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        """Precompute the chord directions."""
-        object.__setattr__(self, "_direction", np.diff(self.points, axis=0))
+    @cached_property
+    def _direction(self) -> Floats:
+        return np.diff(self.points, axis=0)
 
     @property
     def length_m(self) -> float:
@@ -198,13 +194,3 @@ def resample(points: Floats, spacing_m: float) -> Floats:
     stations = np.arange(0.0, arc[-1] + 1e-9, spacing_m)
     columns: Iterable[Floats] = (np.interp(stations, arc, c) for c in points.T)
     return np.stack(list(columns), axis=1)
-
-
-def _distance_to_chords(
-    points: Floats, start: Floats, direction: Floats, length: Floats
-) -> Floats:
-    """Return [N, C] distances of N points to C chords."""
-    dx, dy = (points[:, i, None] - start[:, i] for i in (0, 1))
-    way_x, way_y = direction.T
-    along = (dx * way_x + dy * way_y).clip(0.0, length)
-    return np.asarray(np.hypot(dx - along * way_x, dy - along * way_y))

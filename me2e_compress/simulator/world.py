@@ -1,18 +1,14 @@
-"""One route, stepped frame by frame."""
+"""One route, stepped frame by frame, and what only a privileged policy sees of it."""
 
 import math
 from collections.abc import Collection
+from dataclasses import dataclass
 from enum import StrEnum
 
-from highway_env.vehicle.objects import RoadObject
+import numpy as np
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.simulator.plane_geometry import Roadmap, RoutePath
-from me2e_compress.simulator.privileged import (
-    Privileged,
-    intent_of,
-    phase_of,
-)
+from me2e_compress.simulator.plane_geometry import Floats, Roadmap, RoutePath
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.builders import Builder, stage_of
 from me2e_compress.simulator.scene import (
@@ -22,11 +18,83 @@ from me2e_compress.simulator.scene import (
     EventKind,
     Scene,
     SignalKind,
+    SignalState,
 )
-from me2e_compress.simulator.traffic.bodies import Contacts, StaticObject, Walker
-from me2e_compress.simulator.traffic.cars import Car
+from me2e_compress.simulator.traffic.bodies import Car, Contacts, StaticObject, Walker
 from me2e_compress.simulator.traffic.right_of_way import RightOfWay
 from me2e_compress.simulator.traffic.traffic_road import TrafficRoad
+
+FORESEEN_M = 90.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Intent:
+    """The plan of one moving actor, by its id in the scene.
+
+    Attributes:
+        path: [M, 2] metres: its position, then the way that it will take.
+        target_mps: The speed that it wants on this way; 0 while it waits.
+        acceleration_mps2: Its present acceleration.
+        sees_ego: Whether it brakes for the ego.
+    """
+
+    actor_id: int
+    path: Floats
+    target_mps: float
+    acceleration_mps2: float
+    sees_ego: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """A signal on the ego's route, by its id in the scene.
+
+    The route crosses its line at the arc length ``line_s``, m; signs have no state.
+    """
+
+    signal_id: int
+    line_s: float
+    state: SignalState | None
+
+
+@dataclass(frozen=True, slots=True)
+class Privileged:
+    """What a privileged policy may see besides the scene."""
+
+    intents: tuple[Intent, ...]
+    phases: tuple[Phase, ...]
+
+
+def intent_of(body: Car | Walker) -> Intent:
+    """Return what an actor will do if nothing disturbs it."""
+    if isinstance(body, Walker):
+        target = body.top_speed_mps if body.going and not body.done else 0.0
+        return Intent(body.id, body.rest(), target, 0.0, False)
+    acceleration = float(body.action["acceleration"])
+    forced = body.forced_mps2
+    target = float(body.target_speed)
+    if forced is not None:
+        target = 0.0 if forced < -1.0 else float(body.speed)
+    # the centre lines of the lanes ahead
+    pieces = [np.array([[body.pose.x, body.pose.y]])]
+    skip, found = body.lane_s + body.speed * 0.5 + 1.0, 0.0
+    for index in body.lanes[body.leg :]:
+        stations, centre = body.network.samples(index)
+        length = body.network.length(index)
+        ahead = centre[stations > skip]
+        if body.offset_m and len(ahead) > 1:
+            steps = np.gradient(ahead, axis=0)
+            steps /= np.hypot(steps[:, :1], steps[:, 1:])
+            left = np.stack([-steps[:, 1], steps[:, 0]], axis=1)
+            ahead = ahead + body.offset_m * left
+        pieces.append(ahead)
+        found += length - max(skip, 0.0)
+        skip = max(0.0, skip - length)
+        if found > FORESEEN_M:
+            break
+    way = np.concatenate(pieces)
+    return Intent(body.id, way, target, acceleration, body.behaviour.sees_ego)
+
 
 DT_US = 50_000
 """20 Hz, as Bench2Drive."""
@@ -109,18 +177,14 @@ class World:
         self.first_collision: tuple[int, float, float] | None = None
         self._drive_on, self._contacts = drive_on, Contacts()
         self.weather = stage.weather
-        self._set_signs(rules)
+        # right of way decides at the ego's signs
+        meets = min((begin for begin, _ in rules.priority_over_ego()), default=math.inf)
+        for sign in stage.regulators:
+            if sign.kind is SignalKind.GIVE_WAY and sign.line_s is not None:
+                sign.nearest_s, sign.conflict_s = rules.soonest_s, meets
         stage.schedule.show(0)
         self._take_stage()
         self._road.refresh()
-
-    def _set_signs(self, rules: RightOfWay) -> None:
-        """Let right of way decide at the ego's signs."""
-        meets = [begin for begin, _ in rules.priority_over_ego()]
-        for sign in self._stage.regulators:
-            if sign.kind is SignalKind.GIVE_WAY and sign.line_s is not None:
-                sign.nearest_s = rules.soonest_s
-                sign.conflict_s = min(meets, default=math.inf)
 
     @property
     def time_us(self) -> int:
@@ -159,14 +223,14 @@ class World:
 
     def privileged(self, actors: Collection[int] | None = None) -> Privileged:
         """Return intents, of all or only of some actors, and signal phases."""
-        phases = (phase_of(regulator) for regulator in self._stage.regulators)
+        signs = [sign for sign in self._stage.regulators if sign.line_s is not None]
         return Privileged(
             tuple(
                 intent_of(body)
                 for body in self._stage.bodies
                 if actors is None or body.id in actors
             ),
-            tuple(phase for phase in phases if phase is not None),
+            tuple(Phase(sign.id, sign.line_s or 0.0, sign.state) for sign in signs),
         )
 
     def step(self, control: Control) -> None:
@@ -196,12 +260,21 @@ class World:
         self._road.step(self.dt_us / 1e6)
         stage.time_us += self.dt_us
         stage.schedule.show(stage.time_us)
-        self._follow_route()
+        pose = stage.ego.pose
+        stage.ego_s, self.lateral_m = self.path.project(pose.x, pose.y, stage.ego_s)
+        self._furthest_m = max(self._furthest_m, stage.ego_s)
         self._check_lanes()
-        self._check_signals()
+        half = stage.ego.LENGTH / 2
+        for sign in stage.regulators:
+            front, tail = stage.ego_s + half, stage.ego_s - half
+            kind = sign.check(front, tail, stage.ego.speed)
+            if kind is not None:
+                stage.events.append(stage.event(kind, f"signal {sign.id}"))
         self._check_collisions()
         if not self.done and self._furthest_m >= self.path.goal_m:
-            self._reach_goal()
+            self.reason = EndReason.GOAL
+            at_goal = (judge() for judge in stage.at_goal)
+            stage.events += [event for event in at_goal if event is not None]
 
     def _take_stage(self) -> None:
         """Take over the bodies that scripts added and removed; drop cars that left."""
@@ -214,11 +287,6 @@ class World:
         for body in stage.bodies:
             body.road = self._road
 
-    def _follow_route(self) -> None:
-        stage, pose = self._stage, self._stage.ego.pose
-        stage.ego_s, self.lateral_m = self.path.project(pose.x, pose.y, stage.ego_s)
-        self._furthest_m = max(self._furthest_m, stage.ego_s)
-
     def _check_lanes(self) -> None:
         stage, pose = self._stage, self._stage.ego.pose
         self.outside_m = self.roadmap.outside_m(pose.x, pose.y)
@@ -229,14 +297,6 @@ class World:
                 words = f"{self.outside_m:.2f} m outside every lane"
                 stage.events.append(stage.event(EventKind.OUTSIDE_LANES, words))
         self._was_outside = outside
-
-    def _check_signals(self) -> None:
-        stage, half = self._stage, self._stage.ego.LENGTH / 2
-        for regulator in stage.regulators:
-            front, tail = stage.ego_s + half, stage.ego_s - half
-            kind = regulator.check(front, tail, stage.ego.speed)
-            if kind is not None:
-                stage.events.append(stage.event(kind, f"signal {regulator.id}"))
 
     def _check_collisions(self) -> None:
         for a, b in self._road.touching():
@@ -251,29 +311,19 @@ class World:
                 event = self._stage.event(EventKind.STRUCK, "the standing ego", b)
             elif a.id == 0:
                 event = self._stage.event(EventKind.COLLISION, "the ego", b)
-                self._collide(b)
+                # the route ends, or both bodies stand
+                self.collided.setdefault(self.time_us, self.scene())
+                if self.first_collision is None:
+                    first = (self.progress_m, self.outside_distance_m)
+                    self.first_collision = (self.time_us, *first)
+                if self._drive_on:
+                    self._stage.ego.speed = b.speed = 0.0
+                else:
+                    self.reason = EndReason.COLLISION
             else:
                 words = f"actor {a.id}"
                 event = self._stage.event(EventKind.ACTOR_COLLISION, words, b)
             self._stage.events.append(event)
-
-    def _collide(self, body: RoadObject) -> None:
-        """Note a collision of the ego's; the route ends, or both bodies stand."""
-        self.collided.setdefault(self.time_us, self.scene())
-        if self.first_collision is None:
-            passed = self.progress_m, self.outside_distance_m
-            self.first_collision = self.time_us, *passed
-        if not self._drive_on:
-            self.reason = EndReason.COLLISION
-            return
-        self._stage.ego.speed = body.speed = 0.0
-
-    def _reach_goal(self) -> None:
-        self.reason = EndReason.GOAL
-        for judge in self._stage.at_goal:
-            event = judge()
-            if event is not None:
-                self._stage.events.append(event)
 
 
 def _actor(body: Car | Walker | StaticObject) -> Actor:

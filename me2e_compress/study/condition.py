@@ -6,8 +6,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from me2e_compress.display import counted
-from me2e_compress.driving.latency import LATENCY_SOURCES, LatencySource, with_draws
-from me2e_compress.driving.layered_latency import LimitedLatency
+from me2e_compress.driving.latency import (
+    LATENCY_SOURCES,
+    LatencySource,
+    LimitedLatency,
+    with_draws,
+)
 from me2e_compress.errors import EvaluationError, StudyError
 from me2e_compress.evaluators.highway.conditions import ConditionOptions, Conditions
 from me2e_compress.registry import name_in

@@ -13,11 +13,11 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from me2e_compress.errors import StudyError
-from me2e_compress.metrics.differences import PairedDifference
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_summary import (
     DS,
+    PairedDifference,
     RouteColumn,
     RouteSummary,
     RouteValues,

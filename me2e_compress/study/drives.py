@@ -10,8 +10,8 @@ from me2e_compress.evaluators.highway.engine import Engine
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
 from me2e_compress.evaluators.highway.results import fingerprint
 from me2e_compress.evaluators.highway.worker import Job
-from me2e_compress.metrics.differences import difference
 from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.route_summary import difference
 from me2e_compress.metrics.scores import score
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study

@@ -11,7 +11,12 @@ from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.simulator.cameras import paint_texture
-from me2e_compress.simulator.pictures import Moment, RoutePicture, overlay, write_png
+from me2e_compress.simulator.pictures.route import (
+    Moment,
+    RoutePicture,
+    overlay,
+    write_png,
+)
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.world import World
 from me2e_compress.study.condition import Condition

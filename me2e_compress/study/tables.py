@@ -2,9 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 
-from me2e_compress.metrics.abilities import ABILITIES
-from me2e_compress.metrics.differences import PairedDifference, holm
-from me2e_compress.metrics.route_summary import COLUMNS, RouteSummary
+from me2e_compress.metrics.bench2drive import ABILITIES
+from me2e_compress.metrics.route_summary import (
+    COLUMNS,
+    PairedDifference,
+    RouteSummary,
+    holm,
+)
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.cells import MISSING, anew_cell, estimate_cell, measure_cell
 from me2e_compress.study.changes import Change

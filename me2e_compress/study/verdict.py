@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from me2e_compress.metrics.differences import PairedDifference, shown_by
 from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.route_summary import PairedDifference, shown_by
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.cells import MISSING, measure_cell, number
 from me2e_compress.study.drive_record import DriveRecord

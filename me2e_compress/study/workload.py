@@ -9,8 +9,7 @@ import numpy as np
 
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import LatencyModel, skipped_decisions
-from me2e_compress.simulator.routes import Route
-from me2e_compress.simulator.scenarios.catalogue import EXPERT_S
+from me2e_compress.simulator.routes import EXPERT_S, Route
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.workspace import Workspace

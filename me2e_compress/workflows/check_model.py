@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress.driving.adapter.adapter import Adapter
-from me2e_compress.driving.adapter.port_uses import OutputUses, PortUse, input_uses
+from me2e_compress.driving.adapter.outputs import OutputUses, PortUse, input_uses
 from me2e_compress.driving.onnx_policy import OnnxPolicy, recurrent_of
 from me2e_compress.driving.policies import opened
 from me2e_compress.errors import EvaluationError, FramesError, GraphError

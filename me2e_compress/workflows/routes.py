@@ -16,11 +16,12 @@ from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.simulator.routes import (
     ROAD_VERSION,
+    SCENARIO_ABILITIES,
+    VARIANTS,
     load_routes,
     pick_routes,
     save_routes,
 )
-from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES, VARIANTS
 from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import check_count
 from me2e_compress.workflows.claims import writing

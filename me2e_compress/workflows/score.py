@@ -8,10 +8,10 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.result_files import holds_records
 from me2e_compress.evaluators.highway.results import MANIFEST, ResultsFolder
 from me2e_compress.metrics import scores as metrics
-from me2e_compress.metrics.comfort import stood_most
 from me2e_compress.metrics.deadlines import BUDGET_MS, Deadlines, charged
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_scores import stood_most
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.workflows.deadlines_table import check_budget, deadlines_table
 from me2e_compress.workflows.listener import SILENT, Listener

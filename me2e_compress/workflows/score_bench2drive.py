@@ -10,14 +10,14 @@ from me2e_compress.evaluators.bench2drive.real_results import (
     CollectedResults,
 )
 from me2e_compress.metrics import scores as metrics
-from me2e_compress.metrics.comfort import stood_most
-from me2e_compress.metrics.leaderboard_scores import (
+from me2e_compress.metrics.measure import Measure
+from me2e_compress.metrics.route_scores import stood_most
+from me2e_compress.metrics.scores import (
     LeaderboardScores,
     Quotients,
+    Scores,
     leaderboard_scores,
 )
-from me2e_compress.metrics.measure import Measure
-from me2e_compress.metrics.scores import Scores
 from me2e_compress.workflows.result import Table, number, table
 
 STANDING = "the ego stood most of the time, which is comfortable: see comfort in motion"

@@ -12,8 +12,12 @@ from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayE
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores, score
-from me2e_compress.simulator.routes import Route, load_routes, pick_routes
-from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.simulator.routes import (
+    SCENARIO_ABILITIES,
+    Route,
+    load_routes,
+    pick_routes,
+)
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.workflows.routes import RoutesOptions, make_routes
 from models.driver.curriculum import Trial

@@ -20,8 +20,8 @@ from benchmarks.bench_intervals import (
 from benchmarks.bench_road import drives_of, means_of
 from benchmarks.paper.drives import KeptFacts
 from benchmarks.paper.evidence import NOISE
-from me2e_compress.metrics.differences import SCATTER
 from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_summary import SCATTER
 from me2e_compress.study import load_study
 from me2e_compress.study.cells import MINUS
 

@@ -134,7 +134,9 @@ def test_the_driver_on_the_cpu(tmp_path: Path) -> None:
     words = "--providers cpu --subjects highway --frames 2 --runs 5 --warm-up 1"
     command = [sys.executable, "-m", "benchmarks.bench_gpu", str(tmp_path)]
 
-    subprocess.run([*command, "--no-energy", *words.split()], check=True, capture_output=True)
+    subprocess.run(
+        [*command, "--no-energy", *words.split()], check=True, capture_output=True
+    )
 
     rows = json.loads((tmp_path / "results.json").read_text())["rows"]
     names = [name for name, row in ROWS.items() if not row.on]

@@ -8,8 +8,7 @@ import numpy as np
 import pynvml
 import pytest
 
-from me2e_compress.metrics.episode import Ending
-from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.episode import Ending, InfractionKind
 from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import LatencyTrace

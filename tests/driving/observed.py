@@ -5,10 +5,14 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.axes import Axes
 from me2e_compress.driving.contract import EgoKinematics, Observation
-from me2e_compress.driving.ego_track import EgoTrack, can_bus_between
-from me2e_compress.driving.input_sources import INPUT_SOURCES, Observed
+from me2e_compress.driving.input_sources import (
+    INPUT_SOURCES,
+    Axes,
+    EgoTrack,
+    Observed,
+    can_bus_between,
+)
 from me2e_compress.simulator.cameras import CameraRig
 
 RIG = CameraRig(90, 160)

@@ -19,15 +19,11 @@ def read(control: dict[str, Any], **outputs: Any) -> PedalsAndWheel:
 THREE = {"throttle": "gas", "steer": "wheel", "brake": "stop"}
 
 
-def test_three_outputs() -> None:
+def test_three_outputs_or_one_vector() -> None:
     found = read(THREE, gas=[[0.5]], wheel=[-0.25], stop=0.0)
-
-    assert found == PedalsAndWheel(0.5, -0.25, 0.0)
-
-
-def test_one_vector() -> None:
     control = {"throttle": "c[1]", "steer": "c[0]"}
 
+    assert found == PedalsAndWheel(0.5, -0.25, 0.0)
     assert read(control, c=[[0.25, 0.5]]) == PedalsAndWheel(0.5, 0.25, 0.0)
 
 

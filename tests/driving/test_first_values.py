@@ -92,23 +92,19 @@ def test_another_file_is_another_driver(tmp_path: Path) -> None:
     assert OnnxDriver(model, toml).fingerprint() != before
 
 
-def test_the_models_other_pairs_stay(tmp_path: Path) -> None:
-    policy = policy_of(
-        tmp_path, counter(tmp_path), "[recurrent]\nprev_time = 'next_time'"
-    )
+@pytest.mark.parametrize(
+    ("text", "more"),
+    [
+        ("[recurrent]\nprev_time = 'next_time'", {"prev_time": "next_time"}),
+        ("[feeds.prev_time]\nsource = 'speed'", {}),
+    ],
+)
+def test_the_models_other_pairs_stay_but_for_what_the_adapter_feeds(
+    tmp_path: Path, text: str, more: dict[str, str]
+) -> None:
+    policy = policy_of(tmp_path, counter(tmp_path), text)
 
-    assert policy.recurrent == {
-        "prev_tracks": "next_tracks",
-        "prev_time": "next_time",
-    }
-
-
-def test_what_the_adapter_feeds_is_not_recurrent(tmp_path: Path) -> None:
-    policy = policy_of(
-        tmp_path, counter(tmp_path), "[feeds.prev_time]\nsource = 'speed'"
-    )
-
-    assert policy.recurrent == {"prev_tracks": "next_tracks"}
+    assert policy.recurrent == {"prev_tracks": "next_tracks"} | more
 
 
 @pytest.mark.parametrize(
@@ -123,10 +119,7 @@ def test_what_the_adapter_feeds_is_not_recurrent(tmp_path: Path) -> None:
             "[recurrent]\nprev_tracks = { first = 'timestamp' }",
             r"is tensor\(float\) \[1\], the input takes tensor\(float\) \[1, 6, 2\]",
         ),
-        (
-            "[recurrent]\nprev_tracks = { first = 'none.npy' }",
-            "none.npy cannot be read",
-        ),
+        ("[recurrent]\nprev_tracks.first = 'none.npy'", "none.npy cannot be read"),
         (
             "[recurrent]\nprev_time = { first = 'queries.npz' }",
             "queries.npz holds no array prev_time",
@@ -134,6 +127,10 @@ def test_what_the_adapter_feeds_is_not_recurrent(tmp_path: Path) -> None:
         (
             "[recurrent]\nprev_tracks = { first = 'queries.npz' }",
             r"has shape \[5, 2\], the input takes \[1, 6, 2\]",
+        ),
+        (
+            "[recurrent]\nprev_time = { begin = 'zeros' }",
+            r"adapter recurrent.prev_time.begin",
         ),
     ],
 )
@@ -144,11 +141,3 @@ def test_a_first_value_that_does_not_fit_is_one_line(
     with pytest.raises(EvaluationError, match=words) as caught:
         policy_of(tmp_path, counter(tmp_path), text)
     assert "\n" not in str(caught.value)
-
-
-def test_an_unknown_key_is_named(tmp_path: Path) -> None:
-    toml = tmp_path / "a.toml"
-    toml.write_text("[recurrent]\nprev_time = { begin = 'zeros' }")
-
-    with pytest.raises(EvaluationError, match=r"adapter recurrent.prev_time.begin"):
-        Adapter.load(toml)

@@ -4,8 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from me2e_compress.driving.axes import Axes
-from me2e_compress.driving.input_sources import INPUT_SOURCES
+from me2e_compress.driving.input_sources import INPUT_SOURCES, Axes
 from me2e_compress.errors import EvaluationError
 from me2e_compress.testing import check_form
 from tests.driving.observed import RIG, observed, value
@@ -40,25 +39,25 @@ def test_a_source_says_it_in_the_models_axes(
     np.testing.assert_allclose(value(text, axes), np.array(expected), atol=1e-6)
 
 
-def test_the_past_is_seen_from_now_and_interpolated() -> None:
-    """It drove north: what lies behind is at negative x, and was slower."""
-    past = value("past{steps=4, spacing_s=0.25, quantities=[x, y, heading, speed]}")
-
-    expected = np.array([[-5, 0, 0, 4], [-4, 0, 0, 4], [-3, 0, 0, 4], [-1.5, 0, 0, 5]])
-    np.testing.assert_allclose(past, expected, atol=1e-9)
-
-
-def test_before_the_route_the_ego_stood() -> None:
-    past = value("past{steps=3, spacing_s=1.0, newest_first=true}", LIDAR)
-
-    np.testing.assert_allclose(past, [[0, -5]] * 3, atol=1e-9)
-
-
-def test_the_past_as_steps_ends_now() -> None:
-    """VAD's ``ego_his_trajs``: two steps of half a second, in the lidar frame."""
-    past = value("past{steps=2, deltas=true}", LIDAR)
-
-    np.testing.assert_allclose(past, [[0, 2], [0, 3]], atol=1e-9)
+@pytest.mark.parametrize(
+    ("text", "axes", "expected"),
+    [
+        # it drove north: what lies behind is at negative x, and was slower
+        (
+            "past{steps=4, spacing_s=0.25, quantities=[x, y, heading, speed]}",
+            Axes.FORWARD_LEFT,
+            [[-5, 0, 0, 4], [-4, 0, 0, 4], [-3, 0, 0, 4], [-1.5, 0, 0, 5]],
+        ),
+        # before the route the ego stood
+        ("past{steps=3, spacing_s=1.0, newest_first=true}", LIDAR, [[0, -5]] * 3),
+        # VAD's ``ego_his_trajs``: two steps of half a second, the last to now
+        ("past{steps=2, deltas=true}", LIDAR, [[0, 2], [0, 3]]),
+    ],
+)
+def test_the_past_is_seen_from_now_and_interpolated(
+    text: str, axes: Axes, expected: object
+) -> None:
+    np.testing.assert_allclose(value(text, axes), np.array(expected), atol=1e-9)
 
 
 def test_the_can_bus_of_nuscenes_is_laid_out_otherwise() -> None:
@@ -66,11 +65,7 @@ def test_the_can_bus_of_nuscenes_is_laid_out_otherwise() -> None:
 
     np.testing.assert_array_equal(theirs[[0, 1, 3, 16, 17]], ours[[0, 1, 3, 16, 17]])
     np.testing.assert_allclose(theirs[7:16], [1, 2, 9, 0, 0, 0.5, 6, 0, 0])
-
-
-def test_an_absolute_can_bus_holds_the_place() -> None:
     bus = value("can-bus{absolute=true}")
-
     np.testing.assert_allclose(bus[[0, 1, 17]], [10.0, 5.0, 90.0], rtol=1e-6)
 
 
@@ -112,9 +107,6 @@ def test_intrinsics_are_those_of_the_rig_in_any_axes(axes: Axes) -> None:
 
     np.testing.assert_allclose(k[:, :3, :3], RIG.intrinsics, rtol=1e-4)
     np.testing.assert_array_equal(k[:, 3], [[0, 0, 0, 1]] * 6)
-
-
-def test_in_our_axes_the_extrinsics_are_those_of_the_rig() -> None:
     np.testing.assert_allclose(value("lidar2cam")[:, :3, :3], RIG.rotations, atol=1e-5)
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from me2e_compress.driving.latency import (
     LATENCY_SOURCES,
+    AgentsLatency,
     DecisionFacts,
     FrameRate,
     LatencySource,
@@ -16,7 +17,6 @@ from me2e_compress.driving.latency import (
     parse_latency,
     with_draws,
 )
-from me2e_compress.driving.layered_latency import AgentsLatency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.runtime.latency_trace import LatencyTrace
@@ -38,12 +38,9 @@ def charges(source: LatencySource, route: str, count: int = 60) -> list[int]:
     return [charge(DecisionFacts(123)) for _ in range(count)]
 
 
-def test_a_frame_rate_charges_its_period() -> None:
+def test_a_frame_rate_charges_its_period_and_none_nothing() -> None:
     assert charges(parse_latency("fps:10"), "r", 2) == [100_000, 100_000]
     assert charges(parse_latency(f"fps:{1 / 0.15}"), "r", 1) == [150_000]
-
-
-def test_none_charges_nothing() -> None:
     assert parse_latency("none") == NoLatency()
 
 
@@ -100,6 +97,17 @@ def test_a_measurement_is_scaled_and_says_so() -> None:
         ("fps:", "a value is expected behind fps:"),
         ("10", "no latency source '10'; there are none, fps"),
         ("trace:/no/such/file", "No such file"),
+        ("none{scale=2}", "none has no option 'scale'; it has none"),
+        ("fps{fps=10, scale=2}", "fps has no option 'scale'; it has fps"),
+        ("measured{in_order=true}", "measured has no option 'in_order'"),
+        *((f"measured{{scale={each}}}", "scale") for each in ("0", "-1", "inf", "nan")),
+        ("limited{source=fps:5, fps=0}", "limited: fps 0 is not a positive number"),
+        ("limited{source=often, fps=10}", "no latency source 'often'"),
+        ("limited{source=10, fps=10}", "limited: source: Input should be an instance"),
+        ("agents{source=none, per_agent_us=-1}", "per_agent_us -1: must be 0 or more"),
+        ("agents{source=none, per_agent_us=1, fov_deg=0}", "fov_deg 0: above 0"),
+        ("agents{source=none, per_agent_us=1, range_m=inf}", "range_m inf is not a"),
+        ("host-stage{source=none, per_iteration_us=-2}", "a cost of -2 us"),
     ],
 )
 def test_other_words_are_refused_on_one_line(text: str, words: str) -> None:
@@ -108,40 +116,16 @@ def test_other_words_are_refused_on_one_line(text: str, words: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("none{scale=2}", "none has no option 'scale'; it has none"),
-        ("fps{fps=10, scale=2}", "fps has no option 'scale'; it has fps"),
-        ("measured{in_order=true}", "measured has no option 'in_order'"),
-    ],
-)
-def test_an_option_that_a_source_has_not_is_refused(text: str, words: str) -> None:
-    with pytest.raises(EvaluationError, match=words):
-        parse_latency(text)
-
-
 def test_a_seed_is_of_everything_and_harms_no_source_without() -> None:
     assert parse_latency("fps:10", seed=3) == FrameRate(10.0)
 
 
-@pytest.mark.parametrize("scale", [0.0, -1.0, float("inf"), float("nan")])
-def test_a_scale_is_positive(scale: float) -> None:
-    with pytest.raises(EvaluationError, match="scale"):
-        parse_latency(f"measured{{scale={scale}}}")
+def test_a_trace_comes_back_and_its_percentiles_are_samples(trace: Path) -> None:
+    record = LatencyTrace("abc", "a bench", tuple(range(1, 101))).to_json()
 
-
-def test_percentiles_are_samples() -> None:
-    trace = LatencyTrace("abc", "a bench", tuple(range(1, 101)))
-
-    record = trace.to_json()
-
+    assert LatencyTrace.load(trace) == LatencyTrace("abc", "a bench", SAMPLES)
     assert [record[f"p{p}_us"] for p in (50, 90, 99)] == [50, 90, 99]
     assert record["max_us"] == 100
-
-
-def test_a_trace_comes_back(trace: Path) -> None:
-    assert LatencyTrace.load(trace) == LatencyTrace("abc", "a bench", SAMPLES)
 
 
 @pytest.mark.parametrize(
@@ -228,24 +212,6 @@ def test_a_host_stage_is_charged_for_what_it_did() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("limited{source=fps:5, fps=0}", "limited: fps 0 is not a positive number"),
-        ("limited{source=often, fps=10}", "no latency source 'often'"),
-        ("limited{source=10, fps=10}", "limited: source: Input should be an instance"),
-        ("agents{source=none, per_agent_us=-1}", "per_agent_us -1: must be 0 or more"),
-        ("agents{source=none, per_agent_us=1, fov_deg=0}", "fov_deg 0: above 0"),
-        ("agents{source=none, per_agent_us=1, range_m=inf}", "range_m inf is not a"),
-        ("host-stage{source=none, per_iteration_us=-2}", "a cost of -2 us"),
-    ],
-)
-def test_what_makes_no_sense_is_refused_on_one_line(text: str, words: str) -> None:
-    with pytest.raises(EvaluationError, match=words) as caught:
-        parse_latency(text)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
     "text",
     [
         "limited{source=fps:20, fps=10}",
@@ -269,16 +235,11 @@ def test_options_of_a_trace_reach_it_through_layers() -> None:
     assert not source.with_trace((1, 2), 3.0).lacks_trace
 
 
-def test_an_option_that_the_source_below_has_not_is_refused() -> None:
-    with pytest.raises(EvaluationError, match="fps has no option 'in_order'"):
-        with_draws(parse_latency("limited{source=fps:10, fps=5}"), in_order=True)
-
-
-def test_a_layer_on_a_measurement_is_measured() -> None:
+def test_what_a_layer_has_of_the_source_below() -> None:
+    """Whether it is measured; neither options that it has not, nor a study's trace."""
     assert parse_latency("limited{source=measured, fps=10}").measures
     assert not parse_latency("limited{source=none, fps=10}").measures
-
-
-def test_a_trace_without_a_file_is_a_study_s() -> None:
+    with pytest.raises(EvaluationError, match="fps has no option 'in_order'"):
+        with_draws(parse_latency("limited{source=fps:10, fps=5}"), in_order=True)
     with pytest.raises(EvaluationError, match=r"names no file \(trace:FILE\)"):
         Conditions(parse_latency("limited{source=trace, fps=10}"))

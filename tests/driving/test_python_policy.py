@@ -56,13 +56,10 @@ def test_a_function_of_the_working_folder_makes_a_policy(write: Write) -> None:
     assert driver.open() == Blind(5.0)
 
 
-def test_it_keeps_the_contract(write: Write) -> None:
-    assert len(check_policy(driver_named(f"{write(BLIND)}:make"))) == 8
-
-
-def test_a_driver_is_opened(write: Write) -> None:
+def test_it_keeps_the_contract_and_a_driver_is_opened(write: Write) -> None:
     module = write(BLIND)
 
+    assert len(check_policy(driver_named(f"{module}:make"))) == 8
     assert driver_named(f"{module}:driver").open() == Blind(6.0)
 
 
@@ -132,11 +129,8 @@ class Empty(Driver):
         return object()  # type: ignore[return-value]
 
 
-def test_a_driver_that_opens_no_policy() -> None:
+def test_a_driver_that_opens_no_policy_and_another_form_are_refused() -> None:
     with pytest.raises(EvaluationError, match="empty: a object is no policy: it has"):
         opened(Empty())
-
-
-def test_another_form_is_refused() -> None:
     with pytest.raises(EvaluationError, match=r"not of the form package\.module:func"):
         driver_named("python:here")

@@ -24,11 +24,8 @@ def first(
     return WaypointPid(asked).control(plan, speed_mps, node)
 
 
-def test_straight_ahead_at_the_right_speed_does_nothing() -> None:
+def test_missing_speed_alone_presses_the_throttle() -> None:
     assert first(straight(4.0), 4.0) == PedalsAndWheel(0.0, 0.0, 0.0)
-
-
-def test_missing_speed_presses_the_throttle() -> None:
     # 5 x 0.1 + 0.5 x 0.1 / 40 + 1 x 0.1, at most 0.75
     assert first(straight(4.0), 3.9).throttle == pytest.approx(0.60125)
     assert first(straight(4.0), 0.0) == PedalsAndWheel(0.75, 0.0, 0.0)
@@ -88,16 +85,11 @@ def test_it_aims_4_m_ahead_unless_told_otherwise() -> None:
     assert len(set(steers)) == 3
 
 
-def test_a_node_more_nearly_ahead_is_followed() -> None:
-    assert first(straight(4.0, left=-0.4), 4.0, AHEAD).steer == 0.0
-
-
-def test_a_near_node_is_followed_where_the_end_of_the_plan_is_an_outlier() -> None:
+def test_nodes_are_followed_more_nearly_ahead_or_near_an_outlying_end() -> None:
     near, far = (5.0, 5.0), (15.0, 15.0)
 
+    assert first(straight(4.0, left=-0.4), 4.0, AHEAD).steer == 0.0
     assert first(straight(4.0), 4.0, near).steer > 0.0
     assert first(straight(4.0), 4.0, far).steer == 0.0
-
-
-def test_steering_is_limited() -> None:
+    # and steering is limited
     assert first(straight(4.0, left=np.pi / 2), 4.0, (-30.0, 1.0)).steer == -1.0

@@ -11,8 +11,9 @@ from me2e_compress.metrics.episode import (
     Ending,
     Episode,
     InferenceRecord,
+    Infraction,
+    InfractionKind,
 )
-from me2e_compress.metrics.infraction import Infraction, InfractionKind
 
 STILL = EgoFrame(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, None)
 

@@ -1,7 +1,7 @@
 import pytest
 
-from me2e_compress.metrics.abilities import mastered, successes
-from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.bench2drive import mastered, successes
+from me2e_compress.metrics.episode import Infraction, InfractionKind
 from tests.metrics.drives import drive, infraction
 
 SIGNS = ("Merging", "Traffic_Signs")
@@ -27,12 +27,17 @@ def test_signs_are_mastered_eight_metres_into_the_junction(
     assert not mastered(crashed_later, "Merging")
 
 
-@pytest.mark.parametrize("kind", [InfractionKind.STOP, InfractionKind.RED_LIGHT])
-def test_a_broken_sign_is_not_mastered(kind: InfractionKind) -> None:
-    ran_it = drive(infraction(kind), abilities=SIGNS, junction_m=10.0)
+@pytest.mark.parametrize(
+    ("broken", "junction_m"),
+    [
+        (infraction(InfractionKind.STOP), 10.0),
+        (infraction(InfractionKind.RED_LIGHT), 10.0),
+        (CRASH, None),
+    ],
+)
+def test_a_broken_sign_is_not_mastered_nor_without_a_junction_anything_but_success(
+    broken: Infraction, junction_m: float | None
+) -> None:
+    ran_it = drive(broken, abilities=SIGNS, junction_m=junction_m)
 
     assert not mastered(ran_it, "Traffic_Signs")
-
-
-def test_without_a_junction_only_success_counts() -> None:
-    assert not mastered(drive(CRASH, abilities=SIGNS), "Traffic_Signs")

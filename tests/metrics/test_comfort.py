@@ -5,14 +5,14 @@ import numpy.typing as npt
 import pytest
 
 from me2e_compress.metrics import bench2drive
-from me2e_compress.metrics.comfort import (
+from me2e_compress.metrics.episode import EgoFrame, Ending, Episode
+from me2e_compress.metrics.route_scores import (
     comfort,
     comfort_in_motion,
     smooth_frames,
     standing_share,
     stood_most,
 )
-from me2e_compress.metrics.episode import EgoFrame, Ending, Episode
 from tests.metrics.drives import drive, frames
 
 Floats = npt.NDArray[np.float64]
@@ -52,18 +52,12 @@ def local_fit(values: Floats, dt: float) -> tuple[Floats, Floats]:
 
 
 def columns(driven: tuple[EgoFrame, ...]) -> tuple[Floats, Floats, Floats, Floats]:
-    table = np.array(
-        [
-            (
-                f.acceleration_mps2,
-                f.lateral_acceleration_mps2,
-                f.yaw_rate_radps,
-                f.heading,
-            )
-            for f in driven
-        ]
-    ).T
-    return table[0], table[1], table[2], table[3]
+    names = "acceleration_mps2", "lateral_acceleration_mps2", "yaw_rate_radps"
+    a, b, w, heading = (
+        np.array([getattr(frame, name) for frame in driven])
+        for name in (*names, "heading")
+    )
+    return a, b, w, heading
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -84,15 +78,14 @@ def test_si_comfort_against_local_fits(seed: int) -> None:
     assert comfort(drive(driven=driven)).value == np.mean(whole)
 
 
+A, B, W = "acceleration_mps2", "lateral_acceleration_mps2", "yaw_rate_radps"
+
+
 @pytest.mark.parametrize(
     ("name", "inside", "outside"),
     [
-        ("acceleration_mps2", 2.39, 2.41),
-        ("acceleration_mps2", -4.04, -4.06),
-        ("lateral_acceleration_mps2", 4.88, 4.90),
-        ("lateral_acceleration_mps2", -4.88, -4.90),
-        ("yaw_rate_radps", 0.94, 0.96),
-        ("yaw_rate_radps", -0.94, -0.96),
+        *((A, 2.39, 2.41), (A, -4.04, -4.06), (B, 4.88, 4.90), (B, -4.88, -4.90)),
+        *((W, 0.94, 0.96), (W, -0.94, -0.96)),
     ],
 )
 def test_bounds_of_the_three_levels(name: str, inside: float, outside: float) -> None:
@@ -101,12 +94,7 @@ def test_bounds_of_the_three_levels(name: str, inside: float, outside: float) ->
 
 
 @pytest.mark.parametrize(
-    ("name", "inside", "outside"),
-    [
-        ("acceleration_mps2", 4.12, 4.14),
-        ("lateral_acceleration_mps2", 8.36, 8.38),
-        ("yaw_rate_radps", 1.92, 1.94),
-    ],
+    ("name", "inside", "outside"), [(A, 4.12, 4.14), (B, 8.36, 8.38), (W, 1.92, 1.94)]
 )
 def test_bounds_of_the_three_slopes(name: str, inside: float, outside: float) -> None:
     def ramp(slope: float) -> Episode:
@@ -117,16 +105,11 @@ def test_bounds_of_the_three_slopes(name: str, inside: float, outside: float) ->
     assert comfort(ramp(outside)).value == 0.0
 
 
-def test_fewer_than_20_frames_are_left_out() -> None:
+def test_fewer_than_20_frames_and_an_incomplete_segment_are_left_out() -> None:
+    rough = drive(driven=frames(39, lambda k: {A: 3.0 if k > 30 else 0.0}))
+
     assert comfort(held(19)).reason == "19 frames, 20 are needed"
     assert comfort(held(20)).value == 1.0
-
-
-def test_an_incomplete_segment_is_dropped() -> None:
-    rough = drive(
-        driven=frames(39, lambda k: {"acceleration_mps2": 3.0 if k > 30 else 0.0})
-    )
-
     assert comfort(rough).value == 1.0
 
 
@@ -182,13 +165,10 @@ def test_bench2drive_takes_degrees_for_radians() -> None:
 
 
 def test_bench2drive_halves_the_jerk() -> None:
-    def ramp(slope: float) -> Episode:
-        return drive(
-            driven=frames(20, lambda k: {"acceleration_mps2": slope * 0.05 * (k - 9.5)})
-        )
+    ramp = drive(driven=frames(20, lambda k: {A: 4.7 * 0.05 * (k - 9.5)}))
 
-    assert bench2drive.smoothness(ramp(4.7)).value == 1.0
-    assert comfort(ramp(4.7)).value == 0.0
+    assert bench2drive.smoothness(ramp).value == 1.0
+    assert comfort(ramp).value == 0.0
 
 
 def original(driven: tuple[EgoFrame, ...]) -> list[bool]:
@@ -216,16 +196,7 @@ def test_bench2drive_smoothness_against_local_fits(seed: int) -> None:
     calm = random_frames(seed, 215)
     scale = float(rng.uniform(0.01, 0.2))
     driven = tuple(
-        EgoFrame(
-            *(f.time_us, f.x, f.y, f.heading, f.speed_mps),
-            acceleration_mps2=f.acceleration_mps2,
-            lateral_acceleration_mps2=f.lateral_acceleration_mps2,
-            yaw_rate_radps=f.yaw_rate_radps * scale,
-            steering_rad=0.0,
-            route_m=0.0,
-            traffic_speed_mps=None,
-        )
-        for f in calm
+        dataclasses.replace(f, yaw_rate_radps=f.yaw_rate_radps * scale) for f in calm
     )
     expected = original(driven)
 

@@ -5,10 +5,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.differences import PairedDifference, difference, holm
-from me2e_compress.metrics.infraction import Infraction, InfractionKind
+from me2e_compress.metrics.episode import Infraction, InfractionKind
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.metrics.route_summary import RouteSummary
+from me2e_compress.metrics.route_summary import (
+    PairedDifference,
+    RouteSummary,
+    difference,
+    holm,
+)
 from tests.metrics.drives import drive, infraction
 
 CRASH = infraction(InfractionKind.COLLISION_VEHICLE)

@@ -2,9 +2,8 @@ import math
 
 import pytest
 
-from me2e_compress.metrics.driving_score import RouteScore, route_score
-from me2e_compress.metrics.episode import Ending
-from me2e_compress.metrics.infraction import PENALTY, InfractionKind
+from me2e_compress.metrics.episode import PENALTY, Ending, InfractionKind
+from me2e_compress.metrics.route_scores import RouteScore, route_score
 from tests.metrics.drives import drive, infraction
 
 # Bench2Drive, statistics_manager.py; give way is ours.

@@ -20,8 +20,7 @@ from me2e_compress.metrics.eer import (
     route_measures,
     scale_of,
 )
-from me2e_compress.metrics.episode import Ending, Episode, Given
-from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.episode import Ending, Episode, Given, InfractionKind
 from me2e_compress.metrics.route_summary import RouteSummary
 from tests.metrics.drives import cruise, drive, infraction
 
@@ -174,6 +173,7 @@ def test_the_ranking_under_every_normalization() -> None:
 def test_joules_of_a_route_are_those_of_its_decisions() -> None:
     found = measured([drive(driven=cruise(traffic=5.0))], 2.5)
 
+    assert np.isnan(measured([drive()], None).table[0, 3])
     # a drive by hand has one decision
     assert found.table.tolist() == [pytest.approx([100.0, 200.0, 1.0, 2.5])]
 
@@ -186,10 +186,6 @@ def test_without_a_log_of_decisions_a_recorded_step_of_a_real_run_is_one() -> No
     )
 
     assert measured([real], 2.5).table[0, 3] == 20.0
-
-
-def test_no_counter_no_joules() -> None:
-    assert np.isnan(measured([drive()], None).table[0, 3])
 
 
 def test_a_driver_that_failed_at_once_is_not_left_out() -> None:

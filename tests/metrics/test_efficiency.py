@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from me2e_compress.metrics import bench2drive
-from me2e_compress.metrics.efficiency import efficiency, speed_ratios
 from me2e_compress.metrics.episode import EgoFrame, Ending, Episode
+from me2e_compress.metrics.route_scores import efficiency, speed_ratios
 from tests.metrics.drives import cruise, drive, frames
 
 

@@ -10,14 +10,16 @@ from hypothesis import strategies as st
 from me2e_compress.metrics.episode import (
     LARGEST,
     ConflictRecord,
+    Contact,
     EgoFrame,
     Encounter,
     Ending,
     Episode,
     Given,
     InferenceRecord,
+    Infraction,
+    InfractionKind,
 )
-from me2e_compress.metrics.infraction import Contact, Infraction, InfractionKind
 from tests.metrics.drives import cruise, drive, infraction
 
 numbers = st.floats(-LARGEST, LARGEST)

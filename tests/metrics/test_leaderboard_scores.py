@@ -2,10 +2,9 @@ import dataclasses
 
 import pytest
 
-from me2e_compress.metrics.abilities import ability_rates
-from me2e_compress.metrics.episode import Ending, Episode, Given
-from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.metrics.leaderboard_scores import leaderboard_scores
+from me2e_compress.metrics.bench2drive import ability_rates
+from me2e_compress.metrics.episode import Ending, Episode, Given, InfractionKind
+from me2e_compress.metrics.scores import leaderboard_scores
 from tests.metrics.drives import drive, infraction
 
 SIGNS = ("Merging", "Traffic_Signs")
@@ -33,21 +32,19 @@ ROUTES = (
 def test_both_quotients_of_what_was_given_and_computed() -> None:
     found = leaderboard_scores(ROUTES)
 
-    assert found.given_score.over_set.value == pytest.approx(189.9 / 220)
-    assert found.given_score.over_driven.value == pytest.approx(189.9 / 3)
-    assert found.score.over_set.value == pytest.approx(190.0 / 220)
-    assert found.score.over_driven.value == pytest.approx(190.0 / 3)
-    assert found.success_rate.over_set.value == pytest.approx(100 / 220)
-    assert found.success_rate.over_driven.value == pytest.approx(100 / 3)
+    for quotients, total in (
+        (found.given_score, 189.9),
+        (found.score, 190.0),
+        (found.success_rate, 100.0),
+    ):
+        assert quotients.over_set.value == pytest.approx(total / 220)
+        assert quotients.over_driven.value == pytest.approx(total / 3)
 
 
-def test_no_record_has_no_score() -> None:
-    assert leaderboard_scores(()).score.over_set.reason == "there is no record"
-
-
-def test_a_completed_route_with_another_status_is_no_success() -> None:
+def test_no_record_has_no_score_and_another_status_is_no_success() -> None:
     odd = given(drive(), "Failed - TickRuntime", 100.0)
 
+    assert leaderboard_scores(()).score.over_set.reason == "there is no record"
     assert leaderboard_scores([odd]).success_rate.over_driven.value == 0.0
 
 

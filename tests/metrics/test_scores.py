@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.metrics.abilities import ABILITIES
-from me2e_compress.metrics.episode import Ending
-from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.bench2drive import ABILITIES
+from me2e_compress.metrics.episode import Ending, InfractionKind
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.metrics.scores import score
 from me2e_compress.workflows.evaluate import EvaluateResult
@@ -61,25 +60,18 @@ def test_an_ability_that_was_not_driven_is_not_zero() -> None:
 def test_json_has_value_low_high_and_n_for_each_score() -> None:
     record = score(SET).to_json()
 
-    for key in (
-        "driving_score",
-        "success_rate",
-        "efficiency",
-        "comfort",
-        "abilities",
-    ):
+    for key in ("driving_score", "success_rate", "efficiency", "comfort", "abilities"):
         assert {"value", "low", "high", "n"} <= set(record[key])
     assert set(record["abilities"]["each"]) == set(ABILITIES)
     assert set(record["bench2drive"]) == {"efficiency", "smoothness"}
 
 
-def test_no_routes_no_scores() -> None:
-    assert score([]).driving_score.measure == Measure(None, "%", "no route was driven")
-
-
-def test_the_order_of_the_routes_changes_no_mean() -> None:
+def test_the_order_of_the_routes_changes_no_mean_and_without_any_there_is_none() -> (
+    None
+):
     forward, backward = score(SET), score(SET[::-1])
 
+    assert score([]).driving_score.measure == Measure(None, "%", "no route was driven")
     assert forward.driving_score.value == backward.driving_score.value
     assert forward.success_rate.value == backward.success_rate.value
 

@@ -4,12 +4,15 @@ from collections.abc import Callable
 
 import pytest
 
-from me2e_compress.metrics.episode import ConflictRecord, Encounter, Episode
-from me2e_compress.metrics.infraction import Infraction, InfractionKind
+from me2e_compress.metrics.episode import (
+    ConflictRecord,
+    Encounter,
+    Episode,
+    Infraction,
+    InfractionKind,
+)
 from me2e_compress.metrics.measure import Measure
-from me2e_compress.metrics.route_summary import RouteSummary
-from me2e_compress.metrics.scores import score
-from me2e_compress.metrics.surrogate_safety import (
+from me2e_compress.metrics.route_scores import (
     at_fault_collision,
     room_kept,
     smallest_distance,
@@ -17,6 +20,8 @@ from me2e_compress.metrics.surrogate_safety import (
     smallest_ttc,
     ttc_exposure,
 )
+from me2e_compress.metrics.route_summary import RouteSummary
+from me2e_compress.metrics.scores import score
 from tests.metrics.drives import drive, infraction
 
 
@@ -39,15 +44,15 @@ NEAR_MISS = drive(
 ALONE = drive(conflicts=ConflictRecord((None,), (None,), ()))
 
 
-def test_two_of_four_frames_were_a_conflict() -> None:
+def test_two_of_four_frames_were_a_conflict_and_the_smallest_of_a_route() -> None:
     assert ttc_exposure(NEAR_MISS) == Measure(50.0, "%")
     assert ttc_exposure(ALONE) == Measure(0.0, "%")
-
-
-def test_the_smallest_of_a_route() -> None:
     assert smallest_ttc(NEAR_MISS) == Measure(0.8, "s")
     assert smallest_distance(NEAR_MISS) == Measure(3.5, "m")
     assert smallest_pet(NEAR_MISS) == Measure(2.5, "s")
+    assert smallest_ttc(ALONE).reason == "no contact was ever within 10 s"
+    assert smallest_distance(ALONE).reason == "nobody else was there"
+    assert smallest_pet(ALONE).reason == "no paths crossed within 5 s"
 
 
 def test_room_is_kept_by_who_comes_near_nobody() -> None:
@@ -74,12 +79,6 @@ def test_room_is_kept_by_who_comes_near_nobody() -> None:
     assert unknown == Measure(None, "%", "whose fault a collision was is not known")
 
 
-def test_who_met_nobody_has_no_smallest() -> None:
-    assert smallest_ttc(ALONE).reason == "no contact was ever within 10 s"
-    assert smallest_distance(ALONE).reason == "nobody else was there"
-    assert smallest_pet(ALONE).reason == "no paths crossed within 5 s"
-
-
 @pytest.mark.parametrize(
     "measure", [room_kept, ttc_exposure, smallest_ttc, smallest_distance, smallest_pet]
 )
@@ -99,15 +98,11 @@ def test_whether_a_collision_was_the_egos_fault(
     assert at_fault_collision(drive(*map(crash, faults))) is answer
 
 
-def test_the_rate_of_collisions_at_fault() -> None:
+def test_the_rate_of_collisions_at_fault_and_none_of_one_unknown_fault() -> None:
     found = score([drive(), drive(crash(False)), drive(crash(True)), drive()]).safety
+    unknown = score([drive(), drive(crash(None))]).safety
 
     assert found.at_fault_collisions.value == 25.0
     assert found.at_fault_collisions.n == 4
-
-
-def test_one_unknown_fault_leaves_no_rate() -> None:
-    found = score([drive(), drive(crash(None))]).safety
-
     reason = "whose fault 1 collisions were is not known"
-    assert found.at_fault_collisions.measure == Measure(None, "%", reason)
+    assert unknown.at_fault_collisions.measure == Measure(None, "%", reason)

@@ -5,8 +5,7 @@ from typing import Any
 
 import pytest
 
-from me2e_compress.driving.latency import TraceLatency
-from me2e_compress.driving.layered_latency import AgentsLatency, LimitedLatency
+from me2e_compress.driving.latency import AgentsLatency, LimitedLatency, TraceLatency
 from me2e_compress.driving.realtime import LatencyModel
 from me2e_compress.errors import Me2eError, StudyError
 from me2e_compress.study import Condition, Timing, run_study

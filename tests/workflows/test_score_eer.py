@@ -12,8 +12,12 @@ from me2e_compress.cli.app import app
 from me2e_compress.errors import EnergyError, EvaluationError
 from me2e_compress.evaluators.highway.results import ResultsFolder
 from me2e_compress.evaluators.highway.worker import Driven
-from me2e_compress.metrics.episode import Episode, Given, InferenceRecord
-from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.episode import (
+    Episode,
+    Given,
+    InferenceRecord,
+    InfractionKind,
+)
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.simulator.routes import ROAD_VERSION, VERSION
 from me2e_compress.workflows.score_eer import EerOptions, joules_named, score_eer

@@ -26,7 +26,7 @@ from me2e_compress.driving.contract import (
     PedalsAndWheel,
     checked,
 )
-from me2e_compress.driving.ego_track import can_bus_between
+from me2e_compress.driving.input_sources import can_bus_between
 from me2e_compress.driving.latency import DecisionFacts, parse_latency
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.realtime import DT_US, HeldControl

@@ -7,7 +7,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
-from me2e_compress.simulator.scenarios.catalogue import VARIANTS
+from me2e_compress.simulator.routes import VARIANTS
 from me2e_compress.workflows import routes as workflow
 
 Output = Annotated[

@@ -2,6 +2,6 @@
 
 from me2e_compress.driving.adapter.adapter import Adapter
 from me2e_compress.driving.adapter.image_inputs import ImageNormalization
-from me2e_compress.driving.axes import Axes
+from me2e_compress.driving.input_sources import Axes
 
 __all__ = ["Adapter", "Axes", "ImageNormalization"]

@@ -9,20 +9,74 @@ from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from me2e_compress.driving.adapter.image_inputs import ImageInput, ImageNormalization
-from me2e_compress.driving.adapter.recurrent import RecurrentEntry
-from me2e_compress.driving.axes import Axes
 from me2e_compress.driving.contract import PedalsAndWheel
-from me2e_compress.driving.input_sources import INPUT_SOURCES, InputSource, Observed
-from me2e_compress.driving.input_sources.navigation import NavigationCommand
+from me2e_compress.driving.input_sources import (
+    INPUT_SOURCES,
+    Axes,
+    InputSource,
+    Observed,
+)
+from me2e_compress.driving.input_sources.sources import NavigationCommand
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph.files import sha256_of
 from me2e_compress.graph.recurrence import RECURRENT, declared_pairs
 from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
+
+# Which inputs are fed back, and their values where a route begins.
+
+
+ZEROS = "zeros"
+_FILES = (".npy", ".npz")
+
+
+class RecurrentEntry(BaseModel):
+    """One entry of ``[recurrent]``; a text alone is the output.
+
+    Attributes:
+        answer: The output that is fed back; in the file ``from``. None leaves it to the
+            model's metadata and the naming rules.
+        first: The value where a route begins: ``zeros``; a file ``.npy``, or ``.npz``
+            with an array of the input's name, relative to the adapter; or an input of
+            the graph, whose value at that moment it takes.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    answer: str | None = Field(default=None, alias="from")
+    first: str = ZEROS
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_text(cls, value: Any) -> Any:
+        return {"from": value} if isinstance(value, str) else value
+
+    @field_validator("first")
+    @classmethod
+    def _beside(cls, text: str, info: ValidationInfo) -> str:
+        """Resolve a file relative to the adapter."""
+        if Path(text).suffix in _FILES and info.context is not None:
+            return str(info.context / text)
+        return text
+
+    @property
+    def file(self) -> Path | None:
+        """The file of the first value, if it is read from one."""
+        path = Path(self.first)
+        return path if path.suffix in _FILES else None
+
 
 # Read throttle, steering and brake from a model's outputs.
 
@@ -297,12 +351,8 @@ class Adapter(BaseModel):
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a TOML file."""
-        try:
+        with documents.reading(path, EvaluationError, "not TOML"):
             content = documents.from_toml(documents.content(path))
-        except OSError as error:
-            raise EvaluationError(f"{path}: {error.strerror}") from error
-        except documents.MalformedError as error:
-            raise EvaluationError(f"{path}: not TOML: {error}") from error
         return cls.parse(content, f"{path}: adapter", path.parent)
 
     @classmethod

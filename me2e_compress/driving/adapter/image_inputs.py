@@ -1,8 +1,8 @@
 """One image input of a graph: its cameras, crops, layout and normalisation."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self, TypeAlias
+from typing import Annotated, Literal, Self, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -83,14 +83,7 @@ class ImageNormalization(BaseModel):
 CameraName = Literal[
     "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK", "BACK_LEFT", "BACK_RIGHT"
 ]
-CAMERA_NAMES: tuple[CameraName, ...] = (
-    "FRONT",
-    "FRONT_LEFT",
-    "FRONT_RIGHT",
-    "BACK",
-    "BACK_LEFT",
-    "BACK_RIGHT",
-)
+CAMERA_NAMES: tuple[CameraName, ...] = get_args(CameraName)
 """In the order of `Observation.images`."""
 
 Side: TypeAlias = Annotated[int, Field(ge=1, le=8192)]
@@ -155,7 +148,18 @@ class ImageInput(BaseModel):
         if self.crop is not None:
             if self.camera_size is None:
                 raise ValueError("crop needs the camera_size whose pixels it counts")
-            self._check_crops(*self.camera_size)
+            rows, columns = self.camera_size
+            crops = self.crops or ()
+            if len(crops) != len(self.cameras):
+                raise ValueError(f"{len(crops)} crops for {len(self.cameras)} cameras")
+            for left, top, right, bottom in crops:
+                if not (0 <= left < right <= columns and 0 <= top < bottom <= rows):
+                    raise ValueError(
+                        f"crop {[left, top, right, bottom]} does not lie in {rows} rows"
+                        f" of {columns} columns"
+                    )
+            if self.stitch and len({bottom - top for _, top, _, bottom in crops}) > 1:
+                raise ValueError("stitch: the crops have different heights")
         return self
 
     @property
@@ -164,19 +168,6 @@ class ImageInput(BaseModel):
         if self.crop is None or len(self.crop) > 1:
             return self.crop
         return self.crop * len(self.cameras)
-
-    def _check_crops(self, rows: int, columns: int) -> None:
-        crops = self.crops or ()
-        if len(crops) != len(self.cameras):
-            raise ValueError(f"{len(crops)} crops for {len(self.cameras)} cameras")
-        for left, top, right, bottom in crops:
-            if not (0 <= left < right <= columns and 0 <= top < bottom <= rows):
-                raise ValueError(
-                    f"crop {[left, top, right, bottom]} does not lie in {rows} rows of "
-                    f"{columns} columns"
-                )
-        if self.stitch and len({bottom - top for _, top, _, bottom in crops}) > 1:
-            raise ValueError("stitch: the crops have different heights")
 
     def normalization(
         self, name: str, otherwise: ImageNormalization | None
@@ -330,29 +321,40 @@ class InputImages:
             planes = planes[:, ::-1] if self.table.order == "bgr" else planes
         else:
             planes = self.normalization.apply(taken)[0]
-        return _laid_out(_padded(planes, self.port.size), self.port.layout)
+        # zeros below and to the right of pictures that are smaller than the input
+        height, width = planes.shape[-2:]
+        if (height, width) != self.port.size:
+            padded = np.zeros((*planes.shape[:2], *self.port.size), planes.dtype)
+            padded[..., :height, :width] = planes
+            planes = padded
+        # [n, c, h, w] in the graph's layout
+        letters, layout = "nchw", self.port.layout
+        if "n" not in layout:
+            planes, letters = planes[0], "chw"
+        order = [letters.index(letter) for letter in layout if letter != "b"]
+        turned = planes.transpose(order)
+        if "b" in layout:
+            turned = np.expand_dims(turned, layout.index("b"))
+        return np.ascontiguousarray(turned)
 
     def projections(
         self, lidar2img: npt.NDArray[np.float32]
     ) -> npt.NDArray[np.float32]:
         """Convert [6, 4, 4] to rendered pixels into [cameras, 4, 4] to this input's."""
         chosen = lidar2img[list(self.indices)]
-        moves = np.stack([self._pixel_move(at) for at in range(len(self.windows))])
+        # from rendered pixels of a camera to those of this input: move, then scale
+        widths = [right - left for left, _, right, _ in self.windows]
+        moves = np.tile(np.eye(4), (len(widths), 1, 1))
+        for at, (left, top, _, bottom) in enumerate(self.windows):
+            stitched = self.table.stitch
+            before = sum(widths[:at]) if stitched else 0
+            across = self.size[1] / (sum(widths) if stitched else widths[at])
+            down = self.size[0] / (bottom - top)
+            moves[at, 0, 0], moves[at, 1, 1] = across, down
+            moves[at, 0, 2], moves[at, 1, 2] = across * (before - left), -down * top
         if np.array_equal(moves, np.broadcast_to(np.eye(4), moves.shape)):
             return chosen
         return np.asarray(moves @ chosen, np.float32)
-
-    def _pixel_move(self, at: int) -> npt.NDArray[np.float64]:
-        """Return [4, 4], rendered pixels of a camera to those of this input."""
-        widths = [right - left for left, _, right, _ in self.windows]
-        left, top, right, bottom = self.windows[at]
-        before, width = 0, right - left
-        if self.table.stitch:
-            before, width = sum(widths[:at]), sum(widths)
-        across, down = self.size[1] / width, self.size[0] / (bottom - top)
-        move = np.diag([across, down, 1.0, 1.0])
-        move[0, 2], move[1, 2] = across * (before - left), -down * top
-        return move
 
     def _taken(self, images: Bytes) -> Bytes:
         """Return uint8 RGB [pictures, h, w, 3]."""
@@ -370,37 +372,13 @@ class InputImages:
         ]
         if self.table.stitch:
             parts = [np.concatenate(parts, axis=1)]
-        return np.stack([_resized(part, self.size) for part in parts])
-
-
-def _resized(picture: Bytes, size: tuple[int, int]) -> Bytes:
-    """Resize a picture [rows, columns, 3] bilinearly, by pixel centres."""
-    if picture.shape[:2] == size:
-        return picture
-    try:
-        import cv2
-    except ImportError as error:
-        raise explained(error) from error
-    made = cv2.resize(picture, size[::-1], interpolation=cv2.INTER_LINEAR)
-    return np.asarray(made, np.uint8)
-
-
-def _padded(planes: Array, size: Sequence[int]) -> Array:
-    """Pad [n, c, rows, columns] with zeros below and to the right."""
-    if planes.shape[-2:] == tuple(size):
-        return planes
-    padded = np.zeros((*planes.shape[:2], *size), planes.dtype)
-    padded[..., : planes.shape[2], : planes.shape[3]] = planes
-    return padded
-
-
-def _laid_out(planes: Array, layout: str) -> Array:
-    """Return [n, c, h, w] in a layout, contiguous."""
-    if "n" not in layout:
-        planes = planes[0]
-    letters = "nchw" if "n" in layout else "chw"
-    order = [letters.index(letter) for letter in layout if letter != "b"]
-    turned = planes.transpose(order)
-    if "b" in layout:
-        turned = np.expand_dims(turned, layout.index("b"))
-    return np.ascontiguousarray(turned)
+        if all(part.shape[:2] == self.size for part in parts):
+            return np.stack(parts)
+        try:
+            import cv2
+        except ImportError as error:
+            raise explained(error) from error
+        # bilinear, by pixel centres; a picture of that size stays as it is
+        size, how = self.size[::-1], cv2.INTER_LINEAR
+        made = [cv2.resize(part, size, interpolation=how) for part in parts]
+        return np.stack(made).astype(np.uint8, copy=False)

@@ -24,8 +24,7 @@ from me2e_compress.driving.contract import (
     fed,
     fits,
 )
-from me2e_compress.driving.ego_track import EgoTrack
-from me2e_compress.driving.input_sources import INPUT_SOURCES, Observed
+from me2e_compress.driving.input_sources import INPUT_SOURCES, EgoTrack, Observed
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import DTYPES, Session, SessionPort
@@ -76,9 +75,25 @@ class ModelInputs:
         """Return what can be fed, and by input why the rest cannot."""
         ports = {k: v for k, v in session.inputs.items() if k not in recurrent}
         # every input is fed by something
-        tables, given = _image_tables(adapter, ports), _feeds(adapter, ports)
+        tables = {k: v for k, v in adapter.images.items() if k in ports}
+        usual = adapter.inputs.get(IMAGES, IMAGES)
+        if usual in ports and usual not in {**adapter.images, **adapter.feeds}:
+            tables = {usual: ImageInput(), **tables}
+        named, names = {**adapter.images, **adapter.feeds}, contract_names(adapter)
+        given = {
+            names[ours]: Feed.by(INPUT_SOURCES.build(source, {}))
+            for ours, source in CONTRACT.items()
+            if names[ours] in ports and names[ours] not in named
+        } | {k: v for k, v in adapter.feeds.items() if k in ports}
         fed_by = {**tables, **given}
-        problems = {name: _unfed(name) for name in ports if name not in fed_by}
+        sources = ", ".join(INPUT_SOURCES.names())
+        problems = {
+            name: f"input {name} is none of {', '.join((IMAGES, *CONTRACT))}, no output"
+            f" is known to feed it back, and the adapter has no [feeds.{name}]"
+            f" (sources: {sources}) or [images.{name}]"
+            for name in ports
+            if name not in fed_by
+        }
         # and by something that fits
         images, size, faults = _images(session, adapter, tables)
         found = cls(session.inputs, adapter, tables, images, given, size)
@@ -135,10 +150,7 @@ class ModelInputs:
             name: each.projections(lidar2img) for name, each in self.images.items()
         }
         return Observed(
-            observation,
-            self.adapter.axes,
-            self._track,
-            projections or {"": lidar2img},
+            observation, self.adapter.axes, self._track, projections or {"": lidar2img}
         )
 
     def faults(self) -> dict[str, str]:
@@ -165,28 +177,6 @@ def contract_names(adapter: Adapter) -> dict[str, str]:
     return {ours: ours for ours in (IMAGES, *CONTRACT)} | {**adapter.inputs}
 
 
-def _image_tables(
-    adapter: Adapter, ports: Mapping[str, SessionPort]
-) -> dict[str, ImageInput]:
-    """Return the settings of each image input, from the adapter and the contract."""
-    tables = {k: v for k, v in adapter.images.items() if k in ports}
-    usual = adapter.inputs.get(IMAGES, IMAGES)
-    if usual in ports and usual not in {**adapter.images, **adapter.feeds}:
-        return {usual: ImageInput(), **tables}
-    return tables
-
-
-def _feeds(adapter: Adapter, ports: Mapping[str, SessionPort]) -> dict[str, Feed]:
-    """Return the feed of each other input, from the adapter and the contract."""
-    named = {**adapter.images, **adapter.feeds}
-    usual = contract_names(adapter)
-    return {
-        usual[ours]: Feed.by(INPUT_SOURCES.build(source, {}))
-        for ours, source in CONTRACT.items()
-        if usual[ours] in ports and usual[ours] not in named
-    } | {k: v for k, v in adapter.feeds.items() if k in ports}
-
-
 def _images(
     session: Session, adapter: Adapter, tables: Mapping[str, ImageInput]
 ) -> tuple[dict[str, InputImages], tuple[int, int], dict[str, str]]:
@@ -207,25 +197,18 @@ def _images(
     rendered = max(rows), max(columns)
     for name, port in ports.items():
         try:
-            norm = _normalization(session, adapter, name, tables[name])
+            # inputs of bytes are not normalised
+            norm, usual = None, adapter.image
+            if session.inputs[name].type != BYTES:
+                if usual is None and tables[name].mean is None:
+                    usual = ImageNormalization.of(session.metadata)
+                norm = tables[name].normalization(name, usual)
             made = InputImages(tables[name], port, rendered, norm)
             made.check(name)
             found[name] = made
         except EvaluationError as error:
             faults[name] = str(error)
     return found, rendered, faults
-
-
-def _normalization(
-    session: Session, adapter: Adapter, name: str, table: ImageInput
-) -> ImageNormalization | None:
-    """Return how an image input is normalised; inputs of bytes are not."""
-    if session.inputs[name].type == BYTES:
-        return None
-    usual = adapter.image
-    if usual is None and table.mean is None:
-        usual = ImageNormalization.of(session.metadata)
-    return table.normalization(name, usual)
 
 
 def _check_names(
@@ -252,15 +235,6 @@ def _exists(name: str, ports: Mapping[str, SessionPort], kind: str) -> None:
         raise EvaluationError(
             f"the adapter names {kind} {name}; there are {', '.join(ports)}"
         )
-
-
-def _unfed(name: str) -> str:
-    """Return the message for an input that nothing feeds."""
-    return (
-        f"input {name} is none of {', '.join((IMAGES, *CONTRACT))}, no output is known"
-        f" to feed it back, and the adapter has no [feeds.{name}] (sources:"
-        f" {', '.join(INPUT_SOURCES.names())}) or [images.{name}]"
-    )
 
 
 def _fault(name: str, port: SessionPort, array: Array, sizes: str) -> str:

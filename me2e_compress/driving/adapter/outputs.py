@@ -8,16 +8,23 @@ from typing import Self, TypeAlias
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.driving.adapter.adapter import Adapter, ControlAdapter, output_named
-from me2e_compress.driving.contract import Answer, Observation, Trajectory
+from me2e_compress.driving.adapter.adapter import (
+    ZEROS,
+    Adapter,
+    ControlAdapter,
+    output_named,
+)
+from me2e_compress.driving.adapter.inputs import ModelInputs
+from me2e_compress.driving.contract import Answer, Observation, Shape, Trajectory, zeros
+from me2e_compress.driving.input_sources import INPUT_SOURCES
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.modules.module_map import Ports
 from me2e_compress.graph.recurrence import declared_pairs, recurrence, sides
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
-from me2e_compress.runtime.session import Session
+from me2e_compress.runtime.plan_adapter import CONTRACT_STEP_S, PLAN, PlanAdapter
+from me2e_compress.runtime.session import DTYPES, Session
 
 COMMAND = "command"
 """Name of the navigator's command among the inputs."""
@@ -39,7 +46,14 @@ class ModelOutputs:
         """Find the outputs of a graph to read."""
         outputs, control = list(session.outputs), adapter.control
         if control is not None:
-            check_control(control, outputs)
+            there = dict.fromkeys(outputs)
+            for text, what in control.outputs.items():
+                name, _ = output_named(text, there)
+                if name not in there:
+                    raise EvaluationError(
+                        f"no output {name}, which the adapter names as {what}; there"
+                        f" are {', '.join(outputs)}"
+                    )
             return cls(adapter, None, control)
         plan = plan_of(adapter.plan, session.metadata, outputs)
         check_command(plan, session.inputs)
@@ -66,18 +80,6 @@ class ModelOutputs:
         return plan
 
 
-def check_control(control: ControlAdapter, outputs: Sequence[str]) -> None:
-    """Check that a graph has the outputs that are read as controls."""
-    there = dict.fromkeys(outputs)
-    for text, what in control.outputs.items():
-        name, _ = output_named(text, there)
-        if name not in there:
-            raise EvaluationError(
-                f"no output {name}, which the adapter names as {what}; there are "
-                f"{', '.join(outputs)}"
-            )
-
-
 def check_command(plan: PlanAdapter, inputs: Collection[str]) -> None:
     """Check that the input that picks the plan's mode exists, or is the command."""
     if plan.command_input not in (None, COMMAND, *inputs):
@@ -100,14 +102,11 @@ def plan_of(
             f"the model has no output plan, and no adapter or metadata names one; "
             f"there are {there}"
         )
-    if found.output not in outputs:
-        raise EvaluationError(
-            f"no output {found.output}, which is named as the plan; there are {there}"
-        )
-    if found.scores is not None and found.scores not in outputs:
-        raise EvaluationError(
-            f"no output {found.scores}, which is named as the scores; there are {there}"
-        )
+    for what, name in (("plan", found.output), ("scores", found.scores)):
+        if name is not None and name not in outputs:
+            raise EvaluationError(
+                f"no output {name}, which is named as the {what}; there are {there}"
+            )
     return found
 
 
@@ -188,3 +187,129 @@ def _check_stated(
         recurrence({**model.metadata_props, **said}, *sides(model))
     except (EvaluationError, GraphError) as error:
         raise EvaluationError(f"{origin}: {error}") from error
+
+
+# The use of each input and output of a graph, whether or not it could drive.
+
+
+@dataclass(frozen=True)
+class PortUse:
+    """One input or output of a graph, and its part in driving.
+
+    ``use`` is an input's feed or how an output is read, None for nothing; ``problem``
+    says why the model cannot drive so, and is empty where it can.
+    """
+
+    name: str
+    shape: Shape
+    type: str
+    use: str | None
+    problem: str = ""
+
+
+def element_type(of_port: str) -> str:
+    """Return ``int64`` of ``tensor(int64)``."""
+    return of_port.removeprefix("tensor(").removesuffix(")")
+
+
+def input_uses(
+    session: Session, adapter: Adapter, recurrent: Mapping[str, str]
+) -> tuple[PortUse, ...]:
+    """List the inputs of a graph, in its order, with what each is fed."""
+    found, problems = ModelInputs.found(session, adapter, recurrent)
+    # each input's feed in words
+    words = {
+        name: f"{answer} of the frame before" for name, answer in recurrent.items()
+    }
+    for name, table in found.tables.items():
+        cameras = ", ".join(table.cameras)
+        words[name] = "the six cameras" if len(table.cameras) == 6 else cameras
+        words[name] += ", side by side" if table.stitch else ""
+    for name, feed in found.given.items():
+        words[name] = ", ".join(INPUT_SOURCES.text(part.source) for part in feed.parts)
+    # faults of types and first values
+    for name, port in session.inputs.items():
+        if port.type not in DTYPES:
+            problems[name] = f"input {name} is {port.type}: it cannot be fed"
+        elif name in recurrent:
+            entry = (adapter.recurrent or {}).get(name)
+            if entry is None or entry.first == ZEROS:
+                try:
+                    zeros(name, port)
+                except EvaluationError as error:
+                    problems[name] = str(error)
+    return tuple(
+        PortUse(
+            name,
+            port.shape,
+            element_type(port.type),
+            words.get(name),
+            problems.get(name, ""),
+        )
+        for name, port in session.inputs.items()
+    )
+
+
+@dataclass(frozen=True)
+class OutputUses:
+    """Which outputs drive, and how they are read.
+
+    ``drives_by`` names the plan or the controls in words, and is empty if there
+    is none; ``uses`` is by output; ``problems`` are names that do not exist.
+    """
+
+    drives_by: str
+    uses: Mapping[str, str]
+    problems: tuple[str, ...]
+
+    @classmethod
+    def of(cls, session: Session, adapter: Adapter) -> Self:
+        """Find the uses of a graph's outputs."""
+        try:
+            found = ModelOutputs.of(session, adapter)
+        except (EvaluationError, GraphError) as error:
+            return cls("", {}, (str(error),))
+        uses: dict[str, str] = {}
+        if found.plan is not None:
+            output = found.plan.output
+            uses[output] = plan_words(found.plan, session.outputs[output].shape)
+            if found.plan.scores is not None:
+                uses[found.plan.scores] = "scores, which pick the plan's mode"
+        if found.control is not None:
+            # what is read of each output as a control
+            for text, what in found.control.outputs.items():
+                output, _ = output_named(text, session.outputs)
+                before = f"{uses[output]}, " if output in uses else "control: "
+                uses[output] = before + what
+        return cls("its plan" if found.control is None else "its controls", uses, ())
+
+    def ports(
+        self, session: Session, recurrent: Mapping[str, str]
+    ) -> tuple[PortUse, ...]:
+        """List the outputs of the graph, in its order."""
+        back = {answer: f"fed back to {name}" for name, answer in recurrent.items()}
+        listed = list[PortUse]()
+        for name, port in session.outputs.items():
+            words = [each[name] for each in (self.uses, back) if name in each]
+            use = "; ".join(words) or None
+            listed.append(PortUse(name, port.shape, element_type(port.type), use))
+        return tuple(listed)
+
+
+def plan_words(plan: PlanAdapter, shape: Shape) -> str:
+    """Tell how a plan is read: how many waypoints, how far apart, by which mode."""
+    sides = plan.shape or shape
+    count = sides[-2] if len(sides) > 1 else None
+    step_s = CONTRACT_STEP_S if plan.step_s is None else plan.step_s
+    many = f"{count} waypoints" if isinstance(count, int) else "waypoints"
+    words = f"plan: {many} {step_s:g} s apart"
+    if plan.deltas:
+        words += ", as steps"
+    # how the mode is picked, if there are several
+    if plan.command_input is not None:
+        words += f", mode by {plan.command_input}"
+    elif plan.default_mode is not None and len(sides) > (
+        3 if plan.shape is None else 2
+    ):
+        words += f", mode {plan.default_mode}"
+    return words

@@ -4,21 +4,126 @@ To add a source: write its class, then add it to the table.
 """
 
 import abc
+import math
+from bisect import bisect_right
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.axes import Axes
-from me2e_compress.driving.contract import EgoKinematics, Observation
-from me2e_compress.driving.ego_track import EgoTrack
+from me2e_compress.driving.contract import CAN_BUS_SIZE, EgoKinematics, Observation
 from me2e_compress.errors import EvaluationError
 from me2e_compress.registry import Registry
 from me2e_compress.runtime.frames import Array
 
 __all__ = ["INPUT_SOURCES", "InputSource", "Observed"]
+
+
+class Axes(StrEnum):
+    """Ground frame of a model's waypoints and of its lidar2img."""
+
+    FORWARD_LEFT = "forward-left"
+    """x forward, y left: ours."""
+    RIGHT_FORWARD = "right-forward"
+    """x right, y forward: the lidar of nuScenes, of UniAD and of VAD."""
+    FORWARD_RIGHT = "forward-right"
+    """x forward, y right, left-handed: CARLA's, and Bench2DriveZoo's TCP's."""
+    RIGHT_BACKWARD = "right-backward"
+    """x right, y backward, left-handed: OpenDriveLab's TCP's."""
+
+    @property
+    def to_ego(self) -> npt.NDArray[np.float64]:
+        """Matrix [3, 3] from this frame to the ego frame, orthogonal."""
+        return np.array(_TO_EGO[self], np.float64)
+
+    def projection(self, lidar2img: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """Convert [n, 4, 4] projections of the ego frame to this frame."""
+        turn = np.eye(4)
+        turn[:3, :3] = self.to_ego
+        return np.asarray(np.asarray(lidar2img, np.float64) @ turn, np.float32)
+
+    @property
+    def is_left_handed(self) -> bool:
+        """Whether angles grow clockwise."""
+        return self in (Axes.FORWARD_RIGHT, Axes.RIGHT_BACKWARD)
+
+
+_TO_EGO = {
+    Axes.FORWARD_LEFT: ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    Axes.RIGHT_FORWARD: ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
+    Axes.FORWARD_RIGHT: ((1, 0, 0), (0, -1, 0), (0, 0, 1)),
+    Axes.RIGHT_BACKWARD: ((0, -1, 0), (-1, 0, 0), (0, 0, 1)),
+}
+
+
+# The ego's motion since the last decision, and its poses on this route.
+
+
+def can_bus_between(
+    now: EgoKinematics, last: EgoKinematics | None
+) -> npt.NDArray[np.float32]:
+    """Return float32 [18], laid out as in `Observation`.
+
+    ``last`` is the state at the previous decision, None at the first.
+    """
+    bus = np.zeros(CAN_BUS_SIZE, np.float64)
+    # quaternion of the heading, then motion
+    bus[3], bus[6] = math.cos(now.heading / 2), math.sin(now.heading / 2)
+    bus[7] = now.speed_mps
+    bus[10:13] = now.acceleration_mps2
+    bus[13:16] = now.angular_velocity_radps
+    bus[16] = now.heading % (2 * math.pi)
+    # what changed since the last decision
+    if last is not None:
+        bus[0:2] = now.x - last.x, now.y - last.y
+        turned = math.remainder(now.heading - last.heading, 2 * math.pi)
+        bus[17] = math.degrees(turned)
+    return bus.astype(np.float32)
+
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass
+class EgoTrack:
+    """Poses and speeds by time, since the route began."""
+
+    decisions: int = field(default=0, init=False)
+    _times_us: list[int] = field(default_factory=list, init=False)
+    _states: list[tuple[float, float, float, float]] = field(
+        default_factory=list, init=False
+    )
+
+    def note(self, time_us: int, motion: EgoKinematics | None) -> None:
+        """Count a decision, and keep the ego's pose if it is known."""
+        self.decisions += 1
+        if motion is not None:
+            state = (motion.x, motion.y, motion.heading, motion.speed_mps)
+            self._times_us.append(time_us)
+            self._states.append(state)
+
+    def clear(self) -> None:
+        """Begin a route."""
+        self.decisions = 0
+        self._times_us.clear()
+        self._states.clear()
+
+    def at(self, times_us: npt.NDArray[np.floating]) -> Floats:
+        """Return [n, 4] of n times: x, y (m), heading (rad, unwrapped), speed (m/s).
+
+        Interpolates between decisions, constant before the first; needs one pose or
+        more.
+        """
+        # what is older than all of them is not looked at: a route has thousands
+        first = max(0, bisect_right(self._times_us, float(np.min(times_us))) - 1)
+        states = np.array(self._states[first:], np.float64)
+        states[:, 2] = np.unwrap(states[:, 2])
+        known = self._times_us[first:]
+        columns = [np.interp(times_us, known, each) for each in states.T]
+        return np.stack(columns, axis=1)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -68,28 +173,28 @@ class InputSource(abc.ABC):
         """
 
 
-_HERE = "me2e_compress.driving.input_sources"
+_HERE = "me2e_compress.driving.input_sources.sources"
 
 INPUT_SOURCES: Registry[InputSource] = Registry(
     "input source",
     "me2e_compress.input_sources",
     EvaluationError,
     {
-        "speed": f"{_HERE}.ego_motion:Speed",
-        "velocity": f"{_HERE}.ego_motion:Velocity",
-        "acceleration": f"{_HERE}.ego_motion:Acceleration",
-        "yaw-rate": f"{_HERE}.ego_motion:YawRate",
-        "command": f"{_HERE}.navigation:NavigationCommand",
-        "target-point": f"{_HERE}.navigation:TargetPoint",
-        "past": f"{_HERE}.ego_motion:Past",
-        "can-bus": f"{_HERE}.ego_motion:CanBus",
-        "timestamp": f"{_HERE}.navigation:Timestamp",
-        "use-previous": f"{_HERE}.navigation:UsePrevious",
-        "l2g-rotation": f"{_HERE}.ego_motion:LidarToGlobalRotation",
-        "l2g-translation": f"{_HERE}.ego_motion:LidarToGlobalTranslation",
-        "lidar2img": f"{_HERE}.camera_geometry:LidarToImage",
-        "lidar2cam": f"{_HERE}.camera_geometry:LidarToCamera",
-        "intrinsics": f"{_HERE}.camera_geometry:Intrinsics",
-        "constant": f"{_HERE}.navigation:ConstantInput",
+        "speed": f"{_HERE}:Speed",
+        "velocity": f"{_HERE}:Velocity",
+        "acceleration": f"{_HERE}:Acceleration",
+        "yaw-rate": f"{_HERE}:YawRate",
+        "command": f"{_HERE}:NavigationCommand",
+        "target-point": f"{_HERE}:TargetPoint",
+        "past": f"{_HERE}:Past",
+        "can-bus": f"{_HERE}:CanBus",
+        "timestamp": f"{_HERE}:Timestamp",
+        "use-previous": f"{_HERE}:UsePrevious",
+        "l2g-rotation": f"{_HERE}:LidarToGlobalRotation",
+        "l2g-translation": f"{_HERE}:LidarToGlobalTranslation",
+        "lidar2img": f"{_HERE}:LidarToImage",
+        "lidar2cam": f"{_HERE}:LidarToCamera",
+        "intrinsics": f"{_HERE}:Intrinsics",
+        "constant": f"{_HERE}:ConstantInput",
     },
 )

@@ -12,9 +12,15 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from me2e_compress.metrics.episode import LARGEST, Ending, Episode, Given
-from me2e_compress.metrics.infraction import Infraction, InfractionKind
-from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.metrics.episode import (
+    LARGEST,
+    Ending,
+    Episode,
+    Given,
+    Infraction,
+    InfractionKind,
+)
+from me2e_compress.simulator.routes import SCENARIO_ABILITIES
 
 _PERCENT = re.compile(r"\b\d+\.?\d*%")
 """The first percentage of a message, as efficiency_smoothness_benchmark.py finds it."""

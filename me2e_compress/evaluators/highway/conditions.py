@@ -12,7 +12,7 @@ from me2e_compress.driving.latency import FixedLatency, LatencySource
 from me2e_compress.driving.realtime import DT_US, LatencyModel
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.episode import FRAME_US
-from me2e_compress.simulator.weather import CLEAR, Weather
+from me2e_compress.simulator.camera_rig import CLEAR, Weather
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,9 @@ from me2e_compress.metrics.episode import (
     PET_HORIZON_S,
     TTC_HORIZON_S,
     ConflictRecord,
+    Contact,
     Encounter,
 )
-from me2e_compress.metrics.infraction import Contact
 from me2e_compress.simulator.plane_geometry import Lane, Roadmap
 from me2e_compress.simulator.scene import Actor, ActorKind, Ego, Scene
 

@@ -16,8 +16,7 @@ from me2e_compress.evaluators.highway.observe import ObservationBuilder
 from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
-from me2e_compress.simulator.routes import Route, load_routes
-from me2e_compress.simulator.scenarios.catalogue import EXPERT_S
+from me2e_compress.simulator.routes import EXPERT_S, Route, load_routes
 from me2e_compress.simulator.world import World
 
 STEP_US = 500_000

@@ -10,22 +10,20 @@ from me2e_compress.evaluators.highway.conflict_recorder import (
     contact_of,
 )
 from me2e_compress.metrics.episode import (
+    COLLISIONS,
     FRAME_US,
     EgoFrame,
     Ending,
     Episode,
     FirstCollision,
     InferenceRecord,
-)
-from me2e_compress.metrics.infraction import (
-    COLLISIONS,
     Infraction,
     InfractionKind,
 )
 from me2e_compress.simulator.plane_geometry import Command, RoutePath
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import ActorKind, Event, EventKind, Scene
-from me2e_compress.simulator.traffic.legs import ANNOUNCED_M
+from me2e_compress.simulator.traffic.network import ANNOUNCED_M
 from me2e_compress.simulator.world import World
 
 NEAR_M = 50.0

@@ -15,15 +15,15 @@ from me2e_compress.evaluators.highway.engine import Engine, LocalEngine, RayEngi
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.extras import need_extra
-from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.route_scores import route_score
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.simulator.routes import (
+    EXPERT_S,
     Route,
     load_routes,
     pick_routes,
 )
-from me2e_compress.simulator.scenarios.catalogue import EXPERT_S
 
 
 @dataclass(frozen=True)

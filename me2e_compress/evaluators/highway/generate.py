@@ -22,12 +22,10 @@ from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.runner import Listeners, drive
-from me2e_compress.metrics.episode import Ending
-from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.episode import Ending, InfractionKind
 from me2e_compress.runtime.children import pool
-from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.routes import SCENARIO_ABILITIES, VARIANTS, Route
 from me2e_compress.simulator.scenarios.builders import stage_of
-from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES, VARIANTS
 from me2e_compress.simulator.scene import INFRACTIONS, EventKind
 from me2e_compress.simulator.traffic.stage import TRAFFIC
 from me2e_compress.simulator.world import World

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.driving.contract import EgoKinematics, Observation, Policy
-from me2e_compress.driving.ego_track import can_bus_between
+from me2e_compress.driving.input_sources import can_bus_between
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.rectangles import rays_through
 from me2e_compress.simulator.camera_rig import CAMERA_HEIGHT_M, CAMERAS

@@ -6,7 +6,7 @@ from pathlib import Path
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.simulator.cameras import paint_texture
-from me2e_compress.simulator.pictures import (
+from me2e_compress.simulator.pictures.route import (
     Moment,
     RoutePicture,
     write_gif,

@@ -9,9 +9,8 @@ import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.camera_rig import SUBPIXEL_BITS, fixed_point
-from me2e_compress.simulator.cameras.classes import ACTOR_CLASSES, PixelClass
-from me2e_compress.simulator.cameras.texture import RESOLUTION_M, GroundTexture
-from me2e_compress.simulator.scene import Actor, Ego, Scene
+from me2e_compress.simulator.cameras.ground import RESOLUTION_M, GroundTexture
+from me2e_compress.simulator.scene import ACTOR_CLASSES, Actor, Ego, PixelClass, Scene
 
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
@@ -97,19 +96,15 @@ def covered(actors: Sequence[Actor], ego: Ego, grid: BirdseyeGrid) -> Flags:
     ``ego`` may be of another instant than the actors.
     """
     touched = np.zeros((grid.rows, grid.columns), np.uint8)
-    for actor in _near(actors, ego, grid):
-        _fill(touched, _footprint(actor, ego), 1, grid)
-    return touched.astype(np.bool_)
-
-
-def _near(actors: Sequence[Actor], ego: Ego, grid: BirdseyeGrid) -> list[Actor]:
-    """Return the actors that may touch the grid: most are far, and cost as much."""
+    # leave out those that cannot touch the grid: most are far, and cost as much
     boxes = np.array([(a.x, a.y, a.length, a.width) for a in actors]).reshape(-1, 4)
     cells = grid.cells(ego.seen(boxes[:, 0], boxes[:, 1]))
     # half a diagonal, and a cell for the rounding of what is drawn
     reach = np.hypot(boxes[:, 2], boxes[:, 3])[:, None] / (2 * grid.cell_m) + 1
     far = (cells < -reach) | (cells - reach > (grid.columns, grid.rows))
-    return [actors[i] for i in np.flatnonzero(~far.any(axis=1)).tolist()]
+    for i in np.flatnonzero(~far.any(axis=1)).tolist():
+        _fill(touched, _footprint(actors[i], ego), 1, grid)
+    return touched.astype(np.bool_)
 
 
 def _footprint(box: Actor | Ego, ego: Ego) -> Floats:

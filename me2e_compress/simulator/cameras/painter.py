@@ -61,7 +61,12 @@ def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints
     camera, solid = camera[order], solid[order]
     # pairs in the same columns whose separating edges contradict the distance
     x, y = right[camera, :, solid].T, forward[camera, :, solid].T
-    first, second = _rivals(x, y, camera)
+    bearing = np.arctan2(x, y)
+    low, high = bearing.min(axis=0), bearing.max(axis=0)
+    wide = high - low > np.pi  # a footprint across the line straight behind
+    apart = (low[:, None] > high) | (high[:, None] < low)
+    shared = (~apart | wide[:, None] | wide) & (camera[:, None] == camera)
+    first, second = np.nonzero(np.triu(shared, 1))
     if len(first) == 0:
         return camera, solid
     edges = _edges(x, y)
@@ -69,25 +74,14 @@ def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints
     wrong = after & ~before
     # sort the cameras with such a pair anew, by the edges
     for k in np.unique(camera[first[wrong]]).tolist():
-        low, high = np.searchsorted(camera, [k, k + 1]).tolist()
-        behind = np.zeros((high - low, high - low), np.bool_)
+        begin, end = np.searchsorted(camera, [k, k + 1]).tolist()
+        behind = np.zeros((end - begin, end - begin), np.bool_)
         mine = camera[first] == k
-        p, q = first[mine] - low, second[mine] - low
+        p, q = first[mine] - begin, second[mine] - begin
         behind[p, q] = (before & ~after)[mine]
         behind[q, p] = wrong[mine]
-        solid[low:high] = solid[low:high][_sorted(behind)]
+        solid[begin:end] = solid[begin:end][_sorted(behind)]
     return camera, solid
-
-
-def _rivals(x: Floats, y: Floats, camera: Ints) -> tuple[Ints, Ints]:
-    """Find the pairs (farther, nearer) that may share columns of a camera's image."""
-    bearing = np.arctan2(x, y)
-    low, high = bearing.min(axis=0), bearing.max(axis=0)
-    wide = high - low > np.pi  # a footprint across the line straight behind
-    apart = (low[:, None] > high) | (high[:, None] < low)
-    shared = ~apart | wide[:, None] | wide
-    first, second = np.nonzero(np.triu(shared & (camera[:, None] == camera), 1))
-    return first, second
 
 
 def _edges(x: Floats, y: Floats) -> Edges:
@@ -141,15 +135,10 @@ LIMIT_PX = 20_000.0
 class Faces:
     """Visible polygons of all cameras, in painting order.
 
-    Attributes:
-        cameras: [M] index of the camera.
-        polygons: M arrays int32 [N, 1 or 4.., 2], fixed-point pixels for cv2.
-        colours: [M, 3] RGB.
-        lamps: [M] whether it emits light.
-        details: [M] whether it lies on another face.
-        kinds: [M] `PixelClass`.
-        places: [M, 2] position of its solid, metres in the ego frame.
-        distances: [M] metres from the camera to its solid.
+    ``polygons`` are int32 [N, 1 or 4.., 2], fixed-point pixels for cv2; ``colours`` [M,
+    3] RGB, ``kinds`` of `PixelClass`; ``lamps`` emit light, ``details`` lie on another
+    face; ``places`` [M, 2] is where its solid is, metres in the ego frame,
+    ``distances`` metres from the camera to it.
     """
 
     cameras: Ints
@@ -185,7 +174,11 @@ class Painter:
         if not solids:
             return NO_FACES
         # which solids each camera may see, in painting order
-        poses = _to_ego(np.array([s.pose for s in solids]), ego)
+        x, y, heading = np.array([s.pose for s in solids]).T
+        cos, sin = np.cos(ego.heading), np.sin(ego.heading)
+        dx, dy = x - ego.x, y - ego.y
+        ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
+        poses = np.stack([ahead, left, heading - ego.heading], axis=1)
         corners, footprints = _place(solids, poses)
         camera, solid = painting_order(*self._views(footprints))
         # their faces that look at the camera, inside its frustum
@@ -197,9 +190,8 @@ class Painter:
         pixels = self._project(points, camera[view])
         details = np.concatenate([s.template.details for s in solids])[face]
         lamps = np.concatenate([s.template.slots for s in solids])[face] >= FIRST_LAMP
-        keep = np.flatnonzero(
-            ~details | (_extent(pixels) > LEAST_PX[lamps.astype(int)])
-        )
+        sides = (pixels.max(axis=1) - pixels.min(axis=1)).max(axis=0)
+        keep = np.flatnonzero(~details | (sides > LEAST_PX[lamps.astype(int)]))
         view, face = view[keep], face[keep]
         camera, solid = camera[view], solid[view]
         away = poses[solid, :2] - self.rig.positions[camera, :2]
@@ -237,7 +229,13 @@ class Painter:
 
     def _seen(self, points: Floats, camera: Ints) -> Ints:
         """Return the indices of the faces [3, 4, M] that a camera sees."""
-        front = np.flatnonzero(_towards(points))
+        # those that look at the camera, by their diagonals
+        (ax, ay, az), (bx, by, bz) = (points[:, i] - points[:, i - 2] for i in (2, 3))
+        x, y, z = points[:, 0]
+        volume = x * (ay * bz - az * by)
+        volume = volume + y * (az * bx - ax * bz) + z * (ax * by - ay * bx)
+        front = np.flatnonzero(volume < 0.0)
+        # and lie in its frustum
         right, down, depth = points[:, :, front]
         centre_column, horizon = self.rig.centre_px
         slope = depth / self.rig.focals_px[camera[front]]
@@ -283,14 +281,6 @@ def label(labels: Bytes, faces: Faces) -> None:
         cv2.fillConvexPoly(plane, faces.polygons[i], kind, cv2.LINE_8, SUBPIXEL_BITS)
 
 
-def _to_ego(poses: Floats, ego: Ego) -> Floats:
-    """Convert world poses [S, 3] (x, y, heading) to the ego frame."""
-    cos, sin = np.cos(ego.heading), np.sin(ego.heading)
-    dx, dy = poses[:, 0] - ego.x, poses[:, 1] - ego.y
-    turned = poses[:, 2] - ego.heading
-    return np.stack([cos * dx + sin * dy, cos * dy - sin * dx, turned], axis=1)
-
-
 def _place(solids: list[Solid], poses: Floats) -> tuple[Floats, Floats]:
     """Return the corners [3, 4, N] of all faces and the footprints [2, 4, S]."""
     sizes = np.array([solid.size for solid in solids]).T
@@ -313,22 +303,6 @@ def _spread(counts: Ints, solid: Ints) -> tuple[Ints, Ints]:
     view = np.repeat(np.arange(len(solid)), many)
     within = np.arange(len(view)) - np.repeat(np.cumsum(many) - many, many)
     return view, (np.cumsum(counts) - counts)[solid][view] + within
-
-
-def _extent(pixels: Floats) -> Floats:
-    """Return [M], the longer side of each polygon's bounding box, in pixels."""
-    return np.asarray((pixels.max(axis=1) - pixels.min(axis=1)).max(axis=0))
-
-
-def _towards(points: Floats) -> Flags:
-    """Return whether faces [3, 4, M] look at the camera, by their diagonals."""
-    (ax, ay, az), (bx, by, bz) = (
-        points[:, 2] - points[:, 0],
-        points[:, 3] - points[:, 1],
-    )
-    x, y, z = points[:, 0]
-    volume = x * (ay * bz - az * by) + y * (az * bx - ax * bz) + z * (ax * by - ay * bx)
-    return np.asarray(volume < 0.0)
 
 
 def _cut(polygon: list[list[float]]) -> Floats:

@@ -1,20 +1,23 @@
 """The six cameras of one route: sky, ground and solids, then weather and sensor."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.simulator.camera_rig import CAMERA_NAMES, CAMERAS, CameraRig
-from me2e_compress.simulator.cameras.classes import PixelClass
-from me2e_compress.simulator.cameras.ground import SKY_M, GroundSampler
+from me2e_compress.simulator.camera_rig import (
+    CAMERA_NAMES,
+    CAMERAS,
+    CLEAR,
+    CameraRig,
+    Weather,
+)
+from me2e_compress.simulator.cameras.ground import SKY_M, GroundSampler, GroundTexture
 from me2e_compress.simulator.cameras.painter import Faces, Painter, draw, label
 from me2e_compress.simulator.cameras.solids import solids_of
-from me2e_compress.simulator.cameras.texture import GroundTexture
-from me2e_compress.simulator.scene import Scene
-from me2e_compress.simulator.weather import CLEAR, Weather
+from me2e_compress.simulator.scene import PixelClass, Scene
 
 # The effects of weather and sensor faults on the images.
 
@@ -121,7 +124,17 @@ class Sensor:
             return
         rng = np.random.default_rng((weather.seed, time_us))
         if weather.rain > 0.0:
-            self._rain(images, rng)
+            # thin slanted streaks, new in every frame
+            height, width = self.rig.height, self.rig.width
+            count = round(STREAKS * weather.rain)
+            for image in images:
+                mask = np.zeros((height, width), np.uint8)
+                x, y = rng.integers(0, width, count), rng.integers(0, height, count)
+                length = rng.integers(height // 16, height // 6 + 1, count)
+                ends = np.stack([x, y, x + length // 5, y + length], axis=1)
+                lines = list(ends.reshape(-1, 2, 2).astype(np.int32))
+                cv2.polylines(mask, lines, False, (STREAK_LEVEL,), 1, cv2.LINE_AA)
+                np.copyto(image, cv2.add(image, cv2.merge([mask] * 3)))
         flat = images.reshape(-1, self.rig.width, 3)
         if weather.brightness != 1.0:
             np.copyto(flat, cv2.convertScaleAbs(flat, alpha=weather.brightness))
@@ -143,19 +156,6 @@ class Sensor:
         rng = np.random.default_rng(self.weather.seed)
         noise = rng.normal(0.0, self._deviation, (rows, self.rig.width, 3))
         return np.rint(noise).astype(np.int16)
-
-    def _rain(self, images: Bytes, rng: np.random.Generator) -> None:
-        """Brighten thin slanted streaks, new in every frame."""
-        height, width = self.rig.height, self.rig.width
-        count = round(STREAKS * self.weather.rain)
-        for image in images:
-            mask = np.zeros((height, width), np.uint8)
-            x, y = rng.integers(0, width, count), rng.integers(0, height, count)
-            length = rng.integers(height // 16, height // 6 + 1, count)
-            ends = np.stack([x, y, x + length // 5, y + length], axis=1)
-            lines = ends.reshape(-1, 2, 2).astype(np.int32)
-            cv2.polylines(mask, list(lines), False, (STREAK_LEVEL,), 1, cv2.LINE_AA)
-            np.copyto(image, cv2.add(image, cv2.merge([mask] * 3)))
 
 
 ZENITH, HAZE = (128, 170, 224), (216, 228, 238)
@@ -180,15 +180,11 @@ class Sky:
     def paint(self, images: Bytes, heading: float) -> None:
         """Fill the sky rows of uint8 [6, H, W, 3] for an ego heading in radians."""
         first, texels = self._strip
-        images[:, :first] = self._even[:first]
+        images[:, :first] = ZENITH
         turned = texels + round(heading / (2 * np.pi) * COLUMNS) % COLUMNS
         seen = self._panorama.take(turned).view(np.uint8)
         strip = cv2.cvtColor(seen.reshape(-1, self.rig.width, 4), cv2.COLOR_RGBA2RGB)
         images[:, first : self.height] = strip.reshape(*texels.shape, 3)
-
-    @cached_property
-    def _even(self) -> Bytes:
-        return np.full((self.height, self.rig.width, 3), ZENITH, np.uint8)
 
     @cached_property
     def _strip(self) -> tuple[int, npt.NDArray[np.intp]]:
@@ -220,8 +216,12 @@ class Sky:
             (HILLS, 0.045, 0.035, (2, 3, 5, 9)),
             (TREES, 0.014, 0.012, (7, 23, 61, 137)),
         )
+        angle = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
         for colour, mean, spread, waves in layers:
-            skyline = mean + spread * _skyline(waves, rng)
+            # waves around the circle with seeded phases, [COLUMNS] in -1 .. 1
+            phases = rng.uniform(0, 2 * np.pi, len(waves))
+            terms = [np.sin(n * angle + p) for n, p in zip(waves, phases, strict=True)]
+            skyline = mean + spread * np.mean(terms, axis=0)
             covered = (skyline - elevation) * ROWS / TALLEST + 0.5
             alpha = np.clip(covered, 0.0, 1.0)[..., None]
             picture = (1 - alpha) * picture + alpha * np.array(colour, float)
@@ -230,25 +230,22 @@ class Sky:
         return texels.reshape(-1).view(np.uint32)
 
 
-def _skyline(waves: tuple[int, ...], rng: np.random.Generator) -> Floats:
-    """Return [COLUMNS] in -1 .. 1: waves around the circle with seeded phases."""
-    angle = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
-    phases = rng.uniform(0, 2 * np.pi, len(waves))
-    terms = [np.sin(n * angle + p) for n, p in zip(waves, phases, strict=True)]
-    return np.asarray(np.mean(terms, axis=0))
-
-
-@dataclass(frozen=True, eq=False)
 class Cameras:
     """Renders scenes; the pixels depend on the scene (and its time) alone."""
 
-    texture: GroundTexture
-    rig: CameraRig = field(default_factory=CameraRig)
-    weather: Weather = CLEAR
-
-    def __post_init__(self) -> None:
-        """Keep OpenCV on one thread: routes run in parallel, one process each."""
-        cv2.setNumThreads(1)
+    def __init__(
+        self,
+        texture: GroundTexture,
+        rig: CameraRig | None = None,
+        weather: Weather = CLEAR,
+    ) -> None:
+        cv2.setNumThreads(1)  # routes run in parallel, one process each
+        self.texture, self.rig = texture, rig or CameraRig()
+        self._shape = len(CAMERAS), self.rig.height, self.rig.width
+        self._sky, self._painter = Sky(self.rig), Painter(self.rig)
+        self._ground = GroundSampler(self.rig)
+        self._atmosphere = Atmosphere(self._ground, weather)
+        self._sensor = Sensor(self.rig, weather)
 
     def render(self, scene: Scene) -> Bytes:
         """Render the six images, uint8 [6, H, W, 3], RGB, in the order of the rig."""
@@ -273,27 +270,3 @@ class Cameras:
         self._ground.label(labels, self.texture, scene.ego)
         label(labels, self._painter.faces(solids_of(scene), scene.ego))
         return labels
-
-    @property
-    def _shape(self) -> tuple[int, int, int]:
-        return len(CAMERAS), self.rig.height, self.rig.width
-
-    @cached_property
-    def _sky(self) -> Sky:
-        return Sky(self.rig)
-
-    @cached_property
-    def _ground(self) -> GroundSampler:
-        return GroundSampler(self.rig)
-
-    @cached_property
-    def _painter(self) -> Painter:
-        return Painter(self.rig)
-
-    @cached_property
-    def _atmosphere(self) -> Atmosphere:
-        return Atmosphere(self._ground, self.weather)
-
-    @cached_property
-    def _sensor(self) -> Sensor:
-        return Sensor(self.rig, self.weather)

@@ -7,7 +7,6 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.simulator.cameras.classes import ACTOR_CLASSES, PixelClass
 from me2e_compress.simulator.cameras.template import (
     FULL,
     Box,
@@ -20,10 +19,11 @@ from me2e_compress.simulator.cameras.template import (
     template,
 )
 from me2e_compress.simulator.scene import (
+    ACTOR_CLASSES,
     Actor,
     ActorKind,
+    PixelClass,
     Scene,
-    Signal,
     SignalKind,
     SignalState,
 )
@@ -377,7 +377,11 @@ def solids_of(scene: Scene) -> list[Solid]:
             solids += _actor_solids(actor, scene.time_us)
     for signal in scene.signals:
         if math.hypot(signal.x - ego.x, signal.y - ego.y) < FARTHEST_M:
-            solids.append(_signal_solid(signal))
+            template, kind = SIGNS[signal.kind]
+            lit = () if signal.state is None else (STATE_LAMPS[signal.state],)
+            colours = _colours(template, SIGN_RED, DIM[Slot.STRIPE], lit)
+            pose = (signal.x, signal.y, signal.heading)
+            solids.append(Solid(template, colours, pose, (1.0, 1.0, 1.0), kind))
     return solids
 
 
@@ -392,7 +396,11 @@ def _actor_solids(actor: Actor, time_us: int) -> list[Solid]:
     if actor.kind is ActorKind.EMERGENCY and time_us // BEACON_US % 2 == 0:
         lit.append(Slot.BEACON)
     # one solid per piece of the actor's shape
-    paint, stripe = _paint(actor), STRIPES.get(actor.kind, DIM[Slot.STRIPE])
+    # its colour, by its kind or id, is the same in every frame
+    people = actor.kind in (ActorKind.PEDESTRIAN, ActorKind.BICYCLE)
+    choice = CLOTHES if people else PAINTS
+    paint = FIXED_PAINT.get(actor.kind, choice[actor.id * 5 % len(choice)])
+    stripe = STRIPES.get(actor.kind, DIM[Slot.STRIPE])
     return [
         Solid(
             template,
@@ -403,23 +411,6 @@ def _actor_solids(actor: Actor, time_us: int) -> list[Solid]:
         )
         for template in TEMPLATES[actor.kind]
     ]
-
-
-def _paint(actor: Actor) -> Colour:
-    """Return an actor's colour, by its kind or id, the same in every frame."""
-    if actor.kind in FIXED_PAINT:
-        return FIXED_PAINT[actor.kind]
-    people = actor.kind in (ActorKind.PEDESTRIAN, ActorKind.BICYCLE)
-    choice = CLOTHES if people else PAINTS
-    return choice[actor.id * 5 % len(choice)]
-
-
-def _signal_solid(signal: Signal) -> Solid:
-    template, kind = SIGNS[signal.kind]
-    lit = () if signal.state is None else (STATE_LAMPS[signal.state],)
-    colours = _colours(template, SIGN_RED, DIM[Slot.STRIPE], lit)
-    pose = (signal.x, signal.y, signal.heading)
-    return Solid(template, colours, pose, (1.0, 1.0, 1.0), kind)
 
 
 @cache

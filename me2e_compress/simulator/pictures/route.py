@@ -2,9 +2,9 @@
 
 import os
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import cv2
@@ -176,7 +176,7 @@ COLOURS = 256
 
 def write_png(path: Path, picture: Bytes) -> None:
     """Write uint8 [H, W, 3] as PNG."""
-    _replace(path, "PNG", [Image.fromarray(picture)], 0)
+    _replace(path, partial(Image.fromarray(picture).save, format="PNG"))
 
 
 def write_gif(path: Path, pictures: Iterable[Bytes], frame_us: int) -> None:
@@ -190,39 +190,31 @@ def write_gif(path: Path, pictures: Iterable[Bytes], frame_us: int) -> None:
     images = [Image.fromarray(picture) for picture in pictures]
     if not images:
         raise EvaluationError(f"{path}: an animation needs at least one picture")
-    palette = _palette(images)
+    # the 256 colours of a few frames from the whole animation
+    chosen = images[:: max(1, len(images) // 6)]
+    sheet = np.concatenate([np.asarray(image) for image in chosen])
+    palette = Image.fromarray(sheet).quantize(COLOURS, Image.Quantize.MEDIANCUT)
     frames = [
         image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
     ]
-    _replace(path, "GIF", frames, max(20, round(frame_us / 10_000) * 10))
+    save = partial(
+        frames[0].save,
+        format="GIF",
+        save_all=True,
+        append_images=frames[1:],
+        duration=max(20, round(frame_us / 10_000) * 10),
+        loop=0,
+        optimize=False,
+    )
+    _replace(path, save)
 
 
-def _palette(images: list[Image.Image]) -> Image.Image:
-    """Return the 256 colours of a few frames from the whole animation."""
-    chosen = images[:: max(1, len(images) // 6)]
-    sheet = np.concatenate([np.asarray(image) for image in chosen])
-    return Image.fromarray(sheet).quantize(COLOURS, Image.Quantize.MEDIANCUT)
-
-
-def _replace(
-    path: Path, kind: str, frames: list[Image.Image], duration_ms: int
-) -> None:
+def _replace(path: Path, save: Callable[[Path], None]) -> None:
     try:
         # write beside the file, so that it is replaced in one step
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as near:
             draft = Path(near) / path.name
-            if kind == "GIF":
-                frames[0].save(
-                    draft,
-                    kind,
-                    save_all=True,
-                    append_images=frames[1:],
-                    duration=duration_ms,
-                    loop=0,
-                    optimize=False,
-                )
-            else:
-                frames[0].save(draft, kind)
+            save(draft)
             os.replace(draft, path)
     except OSError as error:
         raise EvaluationError(

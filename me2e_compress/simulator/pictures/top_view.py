@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from me2e_compress.simulator.camera_rig import SUBPIXEL_BITS, fixed_point
 from me2e_compress.simulator.cameras import GroundTexture, PixelClass
-from me2e_compress.simulator.cameras.texture import RESOLUTION_M
+from me2e_compress.simulator.cameras.ground import RESOLUTION_M
 from me2e_compress.simulator.scene import (
     Actor,
     ActorKind,
@@ -215,7 +215,10 @@ class BirdsEye:
         scale = rows / (AHEAD_M + BEHIND_M)
         anchor = (columns / 2, AHEAD_M * scale)
         if other is not None:
-            scale /= _zoom(ego, other.ego, columns / scale / 2)
+            ahead, left = ego.seen(np.array(other.ego.x), np.array(other.ego.y))
+            side_m = columns / scale / 2
+            shares = (ahead / AHEAD_M, -ahead / BEHIND_M, abs(left) / side_m)
+            scale /= max(1.0, *(float(share) / MARGIN for share in shares))
         pixels = np.empty((rows, columns, 3), np.uint8)
         canvas = Canvas(pixels, (ego.x, ego.y), ego.heading, scale, anchor)
         # layers, what matters most last
@@ -268,20 +271,18 @@ class BirdsEye:
         )
 
 
-def _zoom(ego: Ego, other: Ego, side_m: float) -> float:
-    """Return the factor by which more must be shown to include the other ego."""
-    ahead, left = ego.seen(np.array(other.x), np.array(other.y))
-    shares = (ahead / AHEAD_M, -ahead / BEHIND_M, abs(left) / side_m)
-    return max(1.0, *(float(share) / MARGIN for share in shares))
-
-
 def _ego(
     canvas: Canvas, ego: Ego, plan: Floats | None, colour: Colour, planned: Colour
 ) -> None:
     corners = canvas.box(ego.x, ego.y, ego.heading, (ego.length, ego.width))
     _vehicle(canvas, corners, colour)
-    if plan is not None:
-        _plan(canvas, ego, plan, planned)
+    if plan is None:
+        return
+    points = np.concatenate([[(ego.x, ego.y)], ego.placed(plan)])
+    canvas.line(points, planned, 2)
+    for point in points[1:]:
+        canvas.dot(point, PAPER, 4.0)
+        canvas.dot(point, planned, 3.0)
 
 
 def _vehicle(canvas: Canvas, corners: Floats, colour: Colour) -> None:
@@ -332,14 +333,6 @@ def _signals(canvas: Canvas, scene: Scene) -> None:
         canvas.polygon(ring + place, colour)
 
 
-def _plan(canvas: Canvas, ego: Ego, plan: Floats, colour: Colour) -> None:
-    points = np.concatenate([[(ego.x, ego.y)], ego.placed(plan)])
-    canvas.line(points, colour, 2)
-    for point in points[1:]:
-        canvas.dot(point, PAPER, 4.0)
-        canvas.dot(point, colour, 3.0)
-
-
 def _infractions(canvas: Canvas, events: tuple[Event, ...]) -> None:
     """Draw a cross and a name where the ego was; one per kind and place."""
     rows, columns = canvas.pixels.shape[:2]
@@ -352,17 +345,14 @@ def _infractions(canvas: Canvas, events: tuple[Event, ...]) -> None:
         inside = 0 <= column < columns and 0 <= row < rows
         if not inside or name in (text.content for text in near):
             continue
-        _cross(canvas, np.array([event.x, event.y]), arm)
+        place = np.array([event.x, event.y])
+        for colour, width in ((PAPER, 7), (INFRACTION, 3)):
+            for slant in (1.0, -1.0):
+                offset = np.array([arm, slant * arm])
+                canvas.line((place - offset, place + offset), colour, width)
         top = row - LABEL_PX / 2 + (LABEL_PX + 2) * len(near)
         texts.append(Text(name, left, top, LABEL_PX, INFRACTION, PAPER))
     write(canvas.pixels, texts)
-
-
-def _cross(canvas: Canvas, place: Floats, arm_m: float) -> None:
-    for colour, width in ((PAPER, 7), (INFRACTION, 3)):
-        for slant in (1.0, -1.0):
-            offset = np.array([arm_m, slant * arm_m])
-            canvas.line((place - offset, place + offset), colour, width)
 
 
 def _scale_bar(canvas: Canvas) -> None:

@@ -3,41 +3,26 @@
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.routes import Route
-from me2e_compress.simulator.scenarios.layouts.crossings import (
+from me2e_compress.simulator.scenarios import actors, flows, roads
+from me2e_compress.simulator.scenarios.crossings import (
+    Crossing,
     crosswalk_junction,
     junction,
     roundabout,
     signal_junction,
 )
-from me2e_compress.simulator.scenarios.layouts.ramps import (
-    four_lanes,
-    lane_drop,
-    off_ramp,
-    on_ramp,
-)
-from me2e_compress.simulator.scenarios.layouts.streets import (
-    bend,
-    multilane,
-    parking_bay,
-    parking_street,
-    single_lane,
-    two_way,
-    two_way_bend,
-    zebra_street,
-)
-from me2e_compress.simulator.scenarios.scripts import crossers, flows, leads, obstacles
-from me2e_compress.simulator.scenarios.scripts.streams import Traffic, stream
+from me2e_compress.simulator.scenarios.flows import Traffic, stream
 from me2e_compress.simulator.scene import ActorKind, SignalKind, SignalState
-from me2e_compress.simulator.traffic.legs import LaneTable
-from me2e_compress.simulator.traffic.network import LaneIndex, Network
-from me2e_compress.simulator.traffic.stage import Script, Stage
+from me2e_compress.simulator.traffic.network import LaneIndex, LaneTable, Network
+from me2e_compress.simulator.traffic.stage import Stage
 
 # Background of a route: traffic on every lane, people beside it.
 
@@ -127,9 +112,7 @@ def _people(stage: Stage) -> None:
             ahead = rides or random.random() < 0.5
             part = line if ahead else line[::-1]
             begin = int(random.integers(0, len(part) - 1))
-            speed = float(
-                random.uniform(3.0, 5.0) if rides else random.uniform(1.0, 1.7)
-            )
+            speed = float(random.uniform(*(RIDE_MPS if rides else WALK_MPS)))
             kind = ActorKind.BICYCLE if rides else ActorKind.PEDESTRIAN
             away = np.hypot(*(stage.path.points - part[begin]).T).min()
             if away > NEAR_M or len(stage.bodies) >= most:
@@ -181,134 +164,121 @@ def _longest(flags: npt.NDArray[np.bool_]) -> tuple[int, int] | None:
 
 
 Builder = Callable[[Stage], None]
-Place = TypeVar("Place")
-
-
-def scenario(
-    layout: Callable[[Stage], Place], *scripts: Callable[[Stage, Place], Script]
-) -> Builder:
-    """Return what lays roads and puts actors on them, in this order."""
-
-    def build(stage: Stage) -> None:
-        place = layout(stage)
-        for script in scripts:
-            stage.play(script(stage, place))
-
-    return build
-
-
 LEFT, RIGHT, AHEAD = ("left",), ("right",), ("ahead",)
 TURNS = ("left", "right")
 MOVES = ("left", "right", "ahead")
-GIVING_WAY = partial(junction, sign=SignalKind.GIVE_WAY)
-"""The ego has a give-way sign; in the types without it, others have, or nobody."""
-SIDE_ROAD = partial(GIVING_WAY, arms=("left", "back", "right"))
+SIDE_ROAD = partial(junction, sign=SignalKind.GIVE_WAY, arms=("left", "back", "right"))
 """The ego comes out of a side road."""
 
-BUILDERS: dict[str, Builder] = {
+
+def lights(moves: tuple[str, ...]) -> Callable[[Stage], Crossing]:
+    """Return the layout of a junction with lights, at which the ego has green."""
+    return partial(signal_junction, moves=moves)
+
+
+def give_way(moves: tuple[str, ...]) -> Callable[[Stage], Crossing]:
+    """Return the layout of a junction at which the ego has a give-way sign.
+
+    In the types without it, others have it, or nobody.
+    """
+    return partial(junction, moves=moves, sign=SignalKind.GIVE_WAY)
+
+
+STRAIGHT_ON = partial(junction, moves=AHEAD)
+FROM_SIDE = partial(flows.FROM_LEFT, cars=False)
+"""Traffic from the left; the background brings some from the right."""
+
+SCENARIOS: dict[str, tuple[Callable[..., Any], ...]] = {
     # something stands or crawls in the lane: go round it
-    "Accident": scenario(multilane, obstacles.crashed_cars),
-    "AccidentTwoWays": scenario(
-        two_way, obstacles.crashed_cars, obstacles.oncoming_cars
+    "Accident": (roads.multilane, actors.crashed_cars),
+    "AccidentTwoWays": (roads.two_way, actors.crashed_cars, actors.oncoming_cars),
+    "ConstructionObstacle": (roads.multilane, actors.construction),
+    "ConstructionObstacleTwoWays": (
+        roads.two_way,
+        actors.construction,
+        actors.oncoming_cars,
     ),
-    "ConstructionObstacle": scenario(multilane, obstacles.construction),
-    "ConstructionObstacleTwoWays": scenario(
-        two_way, obstacles.construction, obstacles.oncoming_cars
+    "HazardAtSideLane": (roads.multilane, actors.slow_cyclists),
+    "HazardAtSideLaneTwoWays": (
+        roads.two_way,
+        actors.slow_cyclists,
+        actors.oncoming_cars,
     ),
-    "HazardAtSideLane": scenario(multilane, obstacles.slow_cyclists),
-    "HazardAtSideLaneTwoWays": scenario(
-        two_way, obstacles.slow_cyclists, obstacles.oncoming_cars
-    ),
-    "ParkedObstacle": scenario(bend, obstacles.parked_car),
-    "ParkedObstacleTwoWays": scenario(
-        two_way, obstacles.parked_car, obstacles.oncoming_cars
-    ),
-    "VehicleOpensDoorTwoWays": scenario(
-        parking_street, obstacles.opening_door, obstacles.oncoming_cars
+    "ParkedObstacle": (roads.bend, actors.parked_car),
+    "ParkedObstacleTwoWays": (roads.two_way, actors.parked_car, actors.oncoming_cars),
+    "VehicleOpensDoorTwoWays": (
+        roads.parking_street,
+        actors.opening_door,
+        actors.oncoming_cars,
     ),
     # join, cross or leave moving traffic; latecomers may ignore the ego's green
-    "CrossingBicycleFlow": scenario(
-        partial(signal_junction, moves=TURNS), crossers.bicycle_stream
-    ),
-    "EnterActorFlow": scenario(roundabout, flows.ring_flow),
-    "HighwayExit": scenario(off_ramp, flows.exit_lane_flow),
-    "InterurbanActorFlow": scenario(
+    "CrossingBicycleFlow": (lights(TURNS), actors.bicycle_stream),
+    "EnterActorFlow": (roundabout, flows.ring_flow),
+    "HighwayExit": (roads.off_ramp, flows.exit_lane_flow),
+    "InterurbanActorFlow": (
         partial(junction, moves=LEFT, arms=("ahead", "left", "back"), limit_mps=16.0),
-        flows.oncoming_platoon,
+        flows.ONCOMING,
     ),
-    "HighwayCutIn": scenario(partial(on_ramp, ego_on_ramp=False), leads.ramp_cut_in),
-    "InterurbanAdvancedActorFlow": scenario(
+    "HighwayCutIn": (partial(roads.on_ramp, ego_on_ramp=False), actors.ramp_cut_in),
+    "InterurbanAdvancedActorFlow": (
         partial(SIDE_ROAD, moves=LEFT, lanes=2, limit_mps=14.0),
-        flows.near_and_far_flow,
+        partial(FROM_SIDE, name="near_and_far_flow"),
     ),
-    "MergerIntoSlowTrafficV2": scenario(lane_drop, leads.slow_queue),
-    "MergerIntoSlowTraffic": scenario(
-        partial(on_ramp, ego_on_ramp=True), leads.slow_queue
-    ),
-    "NonSignalizedJunctionLeftTurn": scenario(
-        partial(junction, moves=LEFT), flows.oncoming_platoon
-    ),
-    "NonSignalizedJunctionRightTurn": scenario(
-        partial(GIVING_WAY, moves=RIGHT), flows.platoon_from_left
-    ),
-    "NonSignalizedJunctionLeftTurnEnterFlow": scenario(
-        partial(GIVING_WAY, moves=LEFT), flows.platoon_to_enter
-    ),
-    "ParkingExit": scenario(parking_bay, flows.bay_flow),
-    "SequentialLaneChange": scenario(four_lanes, flows.side_flows),
-    "SignalizedJunctionLeftTurn": scenario(
-        partial(signal_junction, moves=LEFT), flows.oncoming_platoon
-    ),
-    "SignalizedJunctionRightTurn": scenario(
-        partial(signal_junction, moves=RIGHT), flows.platoon_from_left
-    ),
-    "SignalizedJunctionLeftTurnEnterFlow": scenario(
-        partial(signal_junction, moves=LEFT), flows.platoon_to_enter
+    "MergerIntoSlowTrafficV2": (roads.lane_drop, actors.slow_queue),
+    "MergerIntoSlowTraffic": (roads.on_ramp, actors.slow_queue),
+    "NonSignalizedJunctionLeftTurn": (partial(junction, moves=LEFT), flows.ONCOMING),
+    "NonSignalizedJunctionRightTurn": (give_way(RIGHT), flows.FROM_LEFT),
+    "NonSignalizedJunctionLeftTurnEnterFlow": (give_way(LEFT), flows.TO_ENTER),
+    "ParkingExit": (roads.parking_bay, flows.bay_flow),
+    "SequentialLaneChange": (roads.four_lanes, flows.side_flows),
+    "SignalizedJunctionLeftTurn": (lights(LEFT), flows.ONCOMING),
+    "SignalizedJunctionRightTurn": (lights(RIGHT), flows.FROM_LEFT),
+    "SignalizedJunctionLeftTurnEnterFlow": (
+        lights(LEFT),
+        partial(flows.TO_ENTER, late=True),
     ),
     # another road user appears suddenly
-    "BlockedIntersection": scenario(
-        partial(junction, moves=MOVES, lights=True), leads.blocked_exit
+    "BlockedIntersection": (
+        partial(junction, moves=MOVES, lights=True),
+        actors.blocked_exit,
     ),
-    "DynamicObjectCrossing": scenario(two_way, crossers.walker_behind_van),
-    "HardBreakRoute": scenario(single_lane, leads.hard_brake),
-    "OppositeVehicleTakingPriority": scenario(
-        partial(junction, moves=AHEAD), flows.crossing_car
+    "DynamicObjectCrossing": (roads.two_way, actors.walker_behind_van),
+    "HardBreakRoute": (roads.single_lane, actors.hard_brake),
+    "OppositeVehicleTakingPriority": (STRAIGHT_ON, flows.crossing_car),
+    "OppositeVehicleRunningRedLight": (lights(AHEAD), flows.crossing_car),
+    "ParkingCutIn": (roads.parking_street, actors.pull_out),
+    "PedestrianCrossing": (roads.zebra_street, actors.walkers_on_zebra),
+    "ParkingCrossingPedestrian": (roads.parking_street, actors.walker_between_cars),
+    "StaticCutIn": (roads.multilane, actors.queue_cut_in),
+    "VehicleTurningRoute": (
+        partial(junction, moves=TURNS, lights=True),
+        actors.cyclists_on_exit,
     ),
-    "OppositeVehicleRunningRedLight": scenario(
-        partial(signal_junction, moves=AHEAD), flows.crossing_car
+    "VehicleTurningRoutePedestrian": (
+        partial(crosswalk_junction, moves=TURNS),
+        actors.pedestrians_on_exit,
     ),
-    "ParkingCutIn": scenario(parking_street, leads.pull_out),
-    "PedestrianCrossing": scenario(zebra_street, crossers.walkers_on_zebra),
-    "ParkingCrossingPedestrian": scenario(parking_street, crossers.walker_between_cars),
-    "StaticCutIn": scenario(multilane, leads.queue_cut_in),
-    "VehicleTurningRoute": scenario(
-        partial(junction, moves=TURNS, lights=True), crossers.cyclists_on_exit
-    ),
-    "VehicleTurningRoutePedestrian": scenario(
-        partial(crosswalk_junction, moves=TURNS), crossers.pedestrians_on_exit
-    ),
-    "ControlLoss": scenario(bend, obstacles.spun_car),
+    "ControlLoss": (roads.bend, actors.spun_car),
     # make room
-    "InvadingTurn": scenario(two_way_bend, flows.invader),
-    "YieldToEmergencyVehicle": scenario(multilane, flows.emergency_behind),
+    "InvadingTurn": (roads.two_way_bend, flows.invader),
+    "YieldToEmergencyVehicle": (roads.multilane, flows.emergency_behind),
     # obey the lights and signs at the junction
-    "T_Junction": scenario(
-        partial(SIDE_ROAD, moves=TURNS), flows.flows_from_both_sides
+    "T_Junction": (
+        partial(SIDE_ROAD, moves=TURNS),
+        partial(FROM_SIDE, name="flows_from_both_sides"),
     ),
-    "VanillaNonSignalizedTurn": scenario(
-        partial(GIVING_WAY, moves=TURNS), flows.priority_car
-    ),
-    "VanillaSignalizedTurnEncounterGreenLight": scenario(
-        partial(signal_junction, moves=TURNS), leads.queue_at_light
-    ),
-    "VanillaSignalizedTurnEncounterRedLight": scenario(
+    "VanillaNonSignalizedTurn": (give_way(TURNS), flows.priority_car),
+    "VanillaSignalizedTurnEncounterGreenLight": (lights(TURNS), actors.queue_at_light),
+    "VanillaSignalizedTurnEncounterRedLight": (
         partial(signal_junction, moves=TURNS, ego_light=SignalState.RED),
         flows.red_light,
     ),
-    "VanillaNonSignalizedTurnEncounterStopsign": scenario(
-        partial(junction, moves=TURNS, sign=SignalKind.STOP_SIGN), flows.stop_sign
+    "VanillaNonSignalizedTurnEncounterStopsign": (
+        partial(junction, moves=TURNS, sign=SignalKind.STOP_SIGN),
+        flows.stop_sign,
     ),
 }
+"""A layout, and the scripts that put actors on what it returns, in this order."""
 
 
 def stage_of(route: Route, builder: Builder | None = None) -> Stage:
@@ -322,10 +292,15 @@ def stage_of(route: Route, builder: Builder | None = None) -> Stage:
     """
     stage = Stage(route)
     if builder is None:
-        BUILDERS[route.scenario](stage)
+        layout, *scripts = SCENARIOS[route.scenario]
+        place = layout(stage)
+        for script in scripts:
+            stage.play(script(stage, place))
         populate(stage)
     else:
         builder(stage)
-    stage.schedule.close()
+    if not hasattr(stage, "ego"):
+        raise EvaluationError(f"{route.scenario}: its layout set no route")
+    stage.schedule.arrivals.sort(key=lambda arrival: (arrival[0], arrival[1].id))
     stage.complete()
     return stage

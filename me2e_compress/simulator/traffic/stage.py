@@ -1,9 +1,7 @@
 """The setup of a scenario, and what its scripts see while it runs.
 
-What is drawn before a route begins: arrivals and signals.
-
-Nothing here looks at the ego, except that who would appear on top of somebody stays
-away.
+Arrivals and signals are drawn before a route begins. Nothing looks at the ego, except
+that who would appear on top of somebody stays away.
 """
 
 import math
@@ -15,25 +13,26 @@ import numpy as np
 from highway_env.vehicle.objects import RoadObject
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.simulator.camera_rig import DRAWN, drawn_weather
 from me2e_compress.simulator.plane_geometry import Floats, Point, RoutePath
 from me2e_compress.simulator.routes import Parameter, Route
-from me2e_compress.simulator.scene import (
-    ActorKind,
-    Event,
-    EventKind,
-    SignalKind,
+from me2e_compress.simulator.scene import ActorKind, Event, EventKind, SignalKind
+from me2e_compress.simulator.traffic.bodies import (
+    Behaviour,
+    Car,
+    EgoVehicle,
+    StaticObject,
+    Walker,
 )
-from me2e_compress.simulator.traffic.bodies import EgoVehicle, StaticObject, Walker
-from me2e_compress.simulator.traffic.cars import Behaviour, Car
-from me2e_compress.simulator.traffic.legs import Leg, build_path
 from me2e_compress.simulator.traffic.network import (
     LANE_WIDTH_M,
     LaneIndex,
+    Leg,
     Network,
     Pose,
+    build_path,
 )
-from me2e_compress.simulator.traffic.signals import Regulator, SignalPlan
-from me2e_compress.simulator.weather import DRAWN, drawn_weather
+from me2e_compress.simulator.traffic.right_of_way import Regulator, SignalPlan
 
 # Parameters of a route, drawn by name.
 
@@ -121,37 +120,24 @@ PLATOON = 4
 """Most followers in a platoon."""
 
 
-@dataclass(frozen=True, slots=True)
-class Arrival:
-    """A body and when it appears."""
-
-    time_us: int
-    body: Car | Walker
-
-
 @dataclass
 class Schedule:
     """Arrivals and signal plans of one route.
 
-    Attributes:
-        claimed: Lanes into the map whose traffic a script has drawn.
-        lines: Lights by the lane that they stop, with the arc length of the line.
-        arrivals: In order of time, once closed.
+    A script has drawn the traffic of the lanes that are ``claimed``; ``lines`` are
+    lights by the lane that they stop, with the arc length of the line; ``arrivals`` are
+    bodies and the microseconds at which they appear, in order of time once closed.
     """
 
     plans: list[SignalPlan] = field(default_factory=list)
     claimed: list[LaneIndex] = field(default_factory=list)
     lines: dict[LaneIndex, list[tuple[float, Regulator]]] = field(default_factory=dict)
-    arrivals: list[Arrival] = field(default_factory=list)
+    arrivals: list[tuple[int, Car | Walker]] = field(default_factory=list)
     _next: int = 0
 
     def add(self, time_s: float, body: Car | Walker) -> None:
         """Let a body appear at a time."""
-        self.arrivals.append(Arrival(round(time_s * 1e6), body))
-
-    def close(self) -> None:
-        """Put the arrivals in order; none is added afterwards."""
-        self.arrivals.sort(key=lambda each: (each.time_us, each.body.id))
+        self.arrivals.append((round(time_s * 1e6), body))
 
     def show(self, time_us: int) -> None:
         """Set all lights."""
@@ -162,12 +148,12 @@ class Schedule:
         """Return who appears now; who finds the place taken stays away for good."""
         found = list[Car | Walker]()
         while self._next < len(self.arrivals):
-            arrival = self.arrivals[self._next]
-            if arrival.time_us > time_us:
+            arrives_us, body = self.arrivals[self._next]
+            if arrives_us > time_us:
                 break
             self._next += 1
-            if is_free(arrival.body, [*present, *found]):
-                found.append(arrival.body)
+            if is_free(body, [*present, *found]):
+                found.append(body)
         return found
 
 
@@ -223,13 +209,13 @@ class Stage(Draws):
 
     Layouts lay out the network and the route, scripts put actors on it; both do so
     before the first frame. Afterwards scripts are resumed at every decision.
-
-    Arrivals, signal plans and weather are drawn before the route begins.
     """
 
     def __init__(self, route: Route) -> None:
         super().__init__(route)
         # set by layouts and scripts
+        self.path: RoutePath
+        self.ego: EgoVehicle
         self.network = Network()
         self.scripts: list[Script] = []
         self.bodies: list[Car | Walker] = []
@@ -241,8 +227,6 @@ class Stage(Draws):
         # set by the world, frame by frame
         self.time_us = 0
         self.ego_s = 0.0
-        self._path: RoutePath | None = None
-        self._ego: EgoVehicle | None = None
         self._next_id = 1
         # traffic and weather
         self.ego_lanes: list[tuple[LaneIndex, float]] = []
@@ -261,20 +245,6 @@ class Stage(Draws):
         if kind != "clear":
             strength = self.uniform("weather_strength", 0.2, 1.0)
         self.weather = drawn_weather(kind, strength, route.seed % 2**31)
-
-    @property
-    def path(self) -> RoutePath:
-        """The ego's route."""
-        if self._path is None:
-            raise EvaluationError(f"{self.route.scenario}: its layout set no route")
-        return self._path
-
-    @property
-    def ego(self) -> EgoVehicle:
-        """The ego."""
-        if self._ego is None:
-            raise EvaluationError(f"{self.route.scenario}: its layout set no route")
-        return self._ego
 
     @property
     def time_s(self) -> float:
@@ -297,19 +267,19 @@ class Stage(Draws):
 
     def drive(self, legs: Sequence[Leg], speed_mps: float) -> None:
         """Set the ego's route and put the ego at its beginning."""
-        self._path = build_path(self.network, legs, self.goal_m)
-        if self._path.length_m < self.goal_m:
+        self.path = build_path(self.network, legs, self.goal_m)
+        if self.path.length_m < self.goal_m:
             raise EvaluationError(
-                f"{self.route.scenario}: the route is {self._path.length_m:.0f} m "
+                f"{self.route.scenario}: the route is {self.path.length_m:.0f} m "
                 f"long, its goal {self.goal_m:.0f} m away"
             )
         for leg in legs:
             if leg.lane in self.network.ranks:
                 x, y = self.network.centre(leg.lane)[0]
-                begin, _ = self._path.project(float(x), float(y))
+                begin, _ = self.path.project(float(x), float(y))
                 self.ego_lanes.append((leg.lane, begin))
-        (x, y), heading = self._path.points[0], self._path.headings[0]
-        self._ego = EgoVehicle(Pose(float(x), float(y), float(heading)), speed_mps)
+        (x, y), heading = self.path.points[0], self.path.headings[0]
+        self.ego = EgoVehicle(Pose(float(x), float(y), float(heading)), speed_mps)
 
     def car(
         self,
@@ -319,26 +289,19 @@ class Stage(Draws):
         target_mps: float | None = None,
         kind: ActorKind = ActorKind.CAR,
         behaviour: Behaviour | None = None,
+        comes: bool = False,
     ) -> Car:
-        """Put a car on a chain of lanes, at an arc length from its beginning."""
-        car = self.coming(chain, s_m, speed_mps, target_mps, kind, behaviour)
-        self.bodies.append(car)
-        return car
+        """Put a car on a chain of lanes, at an arc length from its beginning.
 
-    def coming(
-        self,
-        chain: Sequence[LaneIndex],
-        s_m: float,
-        speed_mps: float,
-        target_mps: float | None = None,
-        kind: ActorKind = ActorKind.CAR,
-        behaviour: Behaviour | None = None,
-    ) -> Car:
-        """Build a car that is not there yet."""
+        One that ``comes`` is not there yet.
+        """
         lanes, s = self.network.rest(chain, s_m)
-        return Car(
+        car = Car(
             self._id(), self.network, lanes, s, speed_mps, target_mps, kind, behaviour
         )
+        if not comes:
+            self.bodies.append(car)
+        return car
 
     def walker(self, kind: ActorKind, line: Floats, speed_mps: float) -> Walker:
         """Put a walker at the beginning of a line; `going` starts it."""
@@ -358,10 +321,7 @@ class Stage(Draws):
         return placed
 
     def regulate(
-        self,
-        kind: SignalKind,
-        line: Pose,
-        width_m: float = LANE_WIDTH_M,
+        self, kind: SignalKind, line: Pose, width_m: float = LANE_WIDTH_M
     ) -> Regulator:
         """Put a light or a sign at a stop line, given by its middle and width."""
         s, lateral = self.path.project(line.x, line.y)

@@ -14,10 +14,8 @@ from highway_env.road.road import Road
 from highway_env.vehicle.objects import RoadObject
 
 from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.traffic.bodies import Walker
-from me2e_compress.simulator.traffic.cars import LOOK_AHEAD_M, Car
-from me2e_compress.simulator.traffic.legs import LaneTable
-from me2e_compress.simulator.traffic.network import LaneIndex, Network
+from me2e_compress.simulator.traffic.bodies import LOOK_AHEAD_M, Car, Walker
+from me2e_compress.simulator.traffic.network import LaneIndex, LaneTable, Network
 from me2e_compress.simulator.traffic.right_of_way import RightOfWay
 
 EVERY = 10
@@ -32,23 +30,6 @@ SETTLED_M = 30.0
 """Nobody changes nearer than this to the beginning of a lane, or in a junction: who
 comes up behind is on another lane yet."""
 SLOWEST_MPS = 1.0
-
-
-def consider(car: Car, lane_s: float, wanted_mps2: float) -> float:
-    """Let a car change lanes if its driver does so now.
-
-    Returns the acceleration that the driver wants then.
-    """
-    if car.joins is not None and car.leg == len(car.lanes) - 1:
-        if _join(car, car.joins):
-            car.joins = None
-            return wanted_mps2
-        end = car.network.length(car.lanes[-1]) - car.LENGTH / 2 - 2.0
-        return min(wanted_mps2, car.idm_stop(max(end - lane_s, 0.1)))
-    begins = car.leg > 0 and lane_s < SETTLED_M
-    if car.behaviour.changes_lanes and not begins:
-        _change(car, wanted_mps2)
-    return wanted_mps2
 
 
 def _change(car: Car, wanted_mps2: float) -> None:
@@ -71,16 +52,6 @@ def _change(car: Car, wanted_mps2: float) -> None:
             best, gained = (chain, side), gain
     if best is not None:
         car.change_lane(*best)
-
-
-def _join(car: Car, chain: list[LaneIndex]) -> bool:
-    """Leave a lane that ends for another one, if there is a gap."""
-    station = car.network.lane(chain[0]).local_coordinates(car.position)[0]
-    lanes, _ = car.network.rest(chain, float(station))
-    if _imposed(car, lanes) > JOIN_IMPOSED_MPS2 or _wanted(car, lanes) < -4.0:
-        return False
-    car.change_lane(lanes, 1)
-    return True
 
 
 def _beside(car: Car, lane: int) -> list[LaneIndex] | None:
@@ -107,15 +78,13 @@ def _imposed(car: Car, chain: list[LaneIndex]) -> float:
     if found is None:
         return 0.0
     body, gap = found
-    return math.inf if gap < NEAREST_M else -_following(body, car, gap)
-
-
-def _following(body: RoadObject, lead: Car, gap_m: float) -> float:
+    if gap < NEAREST_M:
+        return math.inf
     if isinstance(body, Car):
-        return body.idm(lead, gap_m, float(body.target_speed))
+        return -float(body.idm(car, gap, float(body.target_speed)))
     # the ego, or who follows no lane: what braking avoids a contact
-    closing = max(float(body.speed) - float(lead.speed), 0.0)
-    return -(closing**2) / (2 * gap_m) if closing else 0.0
+    closing: float = max(body.speed - car.speed, 0.0)
+    return float(closing**2 / (2 * gap))
 
 
 FORESEEN_S = (1.0, 2.0, 3.0)
@@ -152,15 +121,18 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         self._bodies = [*self.vehicles, *self.objects]
         self._lanes = {}
         points = np.array([body.position for body in self._bodies])
-        points = self._with_crossers(points)
+        # where people who cross will be, too: drivers stop for them in time
+        crossers = [points]
+        for walker in self.vehicles:
+            if isinstance(walker, Walker) and walker.crosses and walker.speed > 0.3:
+                for ahead_s in FORESEEN_S:
+                    self._bodies.append(walker)
+                    crossers.append((walker.position + walker.velocity * ahead_s)[None])
+        points = np.concatenate(crossers)
         self._row = {id(body): i for i, body in enumerate(self.vehicles)}
         self._s, self._r = self.table.coordinates(points)
         self._half = [body.WIDTH / 2 for body in self._bodies]
-        self._turn_objects()
-        self._ego = [body.id == 0 for body in self._bodies]
-
-    def _turn_objects(self) -> None:
-        """Let what stands across a lane take the width that it takes there."""
+        # what stands across a lane takes the width that it takes there
         first = len(self.vehicles)
         s, r = self._s[first:], np.abs(self._r[first:])
         along = self.table.headings(s)
@@ -169,16 +141,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             askew = body.heading - along[row, int(np.argmin(r[row]))]
             cos, sin = abs(math.cos(askew)), abs(math.sin(askew))
             self._half[first + row] = float(body.WIDTH * cos + body.LENGTH * sin) / 2
-
-    def _with_crossers(self, points: Floats) -> Floats:
-        """Add where people who cross will be: drivers stop for them in time."""
-        found = [points]
-        for walker in self.vehicles:
-            if isinstance(walker, Walker) and walker.crosses and walker.speed > 0.3:
-                for ahead_s in FORESEEN_S:
-                    self._bodies.append(walker)
-                    found.append((walker.position + walker.velocity * ahead_s)[None])
-        return np.concatenate(found)
+        self._ego = [body.id == 0 for body in self._bodies]
 
     def seat(self, car: Car, index: LaneIndex) -> tuple[float, float]:
         """Return a car's arc length and right offset in a lane, at the last refresh."""
@@ -204,8 +167,12 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             for s, r, other in self._on_lane(column):
                 if other == row or s + offset <= 0:
                     continue
-                if blind and self._ego[other] and not self._leads(car, r):
-                    continue
+                if blind and self._ego[other]:
+                    # the distance is kept to an ego well inside, in one's direction
+                    turn = self.vehicles[0].heading - car.heading
+                    along = abs(math.remainder(turn, math.tau)) < ALONG_RAD
+                    if not (along and abs(r) < INSIDE_M):
+                        continue
                 room = self._half[other] + beside
                 if abs(r + car.offset_m) < room or (here and abs(r - own) < room):
                     body = self._bodies[other]
@@ -215,14 +182,6 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             if offset > LOOK_AHEAD_M:
                 break
         return None
-
-    def _leads(self, car: Car, aside_m: float) -> bool:
-        """Return whether the ego drives in a lane in a car's direction, well inside.
-
-        Even who does not mind the ego keeps the distance then.
-        """
-        turn = math.remainder(self.vehicles[0].heading - car.heading, math.tau)
-        return abs(aside_m) < INSIDE_M and abs(turn) < ALONG_RAD
 
     def _on_lane(self, column: int) -> list[tuple[float, float, int]]:
         """Return (arc length, right offset, row) of the bodies along a lane."""
@@ -259,7 +218,24 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         stop_m = self.rules.stop_m(car, lane_s)
         if stop_m < math.inf:
             wanted_mps2 = min(wanted_mps2, car.idm_stop(stop_m))
-        return consider(car, lane_s, wanted_mps2)
+        if car.joins is not None and car.leg == len(car.lanes) - 1:
+            # leave a lane that ends, if there is a gap in the other one
+            chain = car.joins
+            station = car.network.lane(chain[0]).local_coordinates(car.position)[0]
+            lanes, _ = car.network.rest(chain, float(station))
+            if (
+                _imposed(car, lanes) <= JOIN_IMPOSED_MPS2
+                and _wanted(car, lanes) >= -4.0
+            ):
+                car.change_lane(lanes, 1)
+                car.joins = None
+                return wanted_mps2
+            end = car.network.length(car.lanes[-1]) - car.LENGTH / 2 - 2.0
+            return min(wanted_mps2, car.idm_stop(max(end - lane_s, 0.1)))
+        begins = car.leg > 0 and lane_s < SETTLED_M
+        if car.behaviour.changes_lanes and not begins:
+            _change(car, wanted_mps2)
+        return wanted_mps2
 
     def act(self) -> None:
         """Let every car decide on the same positions."""

@@ -8,9 +8,8 @@ import numpy.typing as npt
 
 from me2e_compress.simulator.cameras import BirdseyeGrid, PixelClass
 from me2e_compress.simulator.cameras.birdseye import covered
-from me2e_compress.simulator.cameras.classes import ACTOR_CLASSES
 from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.scene import Actor, Ego, Scene
+from me2e_compress.simulator.scene import ACTOR_CLASSES, Actor, Ego, Scene
 
 AGENTS = 24
 AGENT_COLUMNS = 10

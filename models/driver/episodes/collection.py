@@ -4,8 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from me2e_compress.evaluators.highway.generate import propose, seed_of
-from me2e_compress.simulator.routes import Route, load_routes
-from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route, load_routes
 from models.driver.errors import TrainingError
 
 MANIFEST = "dataset.json"

@@ -14,9 +14,8 @@ from me2e_compress.evaluators.highway.reentry import beyond
 from me2e_compress.simulator.cameras import CameraRig
 from me2e_compress.simulator.cameras.birdseye import ground_classes
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
-from me2e_compress.simulator.privileged import Privileged
 from me2e_compress.simulator.scene import Signal, SignalKind, SignalState
-from me2e_compress.simulator.world import World
+from me2e_compress.simulator.world import Privileged, World
 from models.driver.episodes.agents import (
     FUTURE_STEPS,
     FUTURE_US,

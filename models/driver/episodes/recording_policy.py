@@ -33,9 +33,8 @@ from me2e_compress.evaluators.highway.observe import (
 from me2e_compress.runtime.trajectory import Trajectory
 from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
 from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.privileged import Phase
 from me2e_compress.simulator.scene import Scene
-from me2e_compress.simulator.world import World
+from me2e_compress.simulator.world import Phase, World
 
 BURST_S = (0.4, 1.5)
 PAUSE_S = (0.9, 4.8)

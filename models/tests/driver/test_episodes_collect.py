@@ -19,8 +19,7 @@ import pytest
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.generate import seed_of
 from me2e_compress.graph import sha256_of
-from me2e_compress.simulator.routes import Route, load_routes
-from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route, load_routes
 from models.driver.episodes import (
     Collection,
     collect,

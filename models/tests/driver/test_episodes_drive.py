@@ -11,6 +11,7 @@ from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.evaluators.highway.runner import drive
+from me2e_compress.simulator.camera_rig import CLEAR
 from me2e_compress.simulator.cameras import (
     CameraRig,
     Cameras,
@@ -19,7 +20,6 @@ from me2e_compress.simulator.cameras import (
     paint_texture,
 )
 from me2e_compress.simulator.scene import Scene
-from me2e_compress.simulator.weather import CLEAR
 from me2e_compress.simulator.world import World
 from models.driver.episodes import GRID, Collection, decode
 from models.driver.episodes.collecting import episode_of
@@ -267,7 +267,8 @@ def test_a_recorded_picture_shows_the_weather() -> None:
     arrays = arrays_of(policy.world, policy.top, policy.frames, 20, SIZE)
 
     expected = cameras.render(policy.frames[0].scene).astype(int)
-    by_day = replace(cameras, weather=CLEAR).render(policy.frames[0].scene)
+    in_daylight = Cameras(cameras.texture, cameras.rig, CLEAR)
+    by_day = in_daylight.render(policy.frames[0].scene)
     found = decode(arrays["jpeg"]).astype(int)
     assert np.abs(found - expected).mean() < 3.0
     assert np.abs(by_day - expected).mean() > 20.0

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.evaluators.highway.expert.expert_policy import ExpertDecision, Memory
-from me2e_compress.simulator.privileged import Phase
 from me2e_compress.simulator.scene import (
     DIMENSIONS,
     Actor,
@@ -19,6 +18,7 @@ from me2e_compress.simulator.scene import (
     SignalKind,
     SignalState,
 )
+from me2e_compress.simulator.world import Phase
 from models.driver.episodes import GRID
 from models.driver.episodes.agents import agents
 from models.driver.episodes.episode_arrays import Arrays, signals

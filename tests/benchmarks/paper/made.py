@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.paper.drives import FILE, Int8Counts, KeptFacts, ModelFacts
-from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.episode import InfractionKind
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.study import Study
 from me2e_compress.study.drive_record import DriveRecord

@@ -9,7 +9,7 @@ from me2e_compress.evaluators.bench2drive.recordings import (
     read_recording,
 )
 from me2e_compress.metrics import bench2drive
-from me2e_compress.metrics.comfort import comfort
+from me2e_compress.metrics.route_scores import comfort
 from tests.evaluators.bench2drive.files import Json, recording
 from tests.metrics.drives import drive
 

@@ -7,9 +7,8 @@ from me2e_compress.evaluators.bench2drive.records import (
     number_of,
     read_record,
 )
-from me2e_compress.metrics.driving_score import route_score
-from me2e_compress.metrics.episode import Ending, Given
-from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.episode import Ending, Given, InfractionKind
+from me2e_compress.metrics.route_scores import route_score
 from tests.evaluators.bench2drive.files import OUTSIDE, RAMMED, Json, record, speed
 
 

@@ -13,8 +13,7 @@ from me2e_compress.evaluators.highway.generate import (
     propose,
     seed_of,
 )
-from me2e_compress.metrics.episode import Ending
-from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.episode import Ending, InfractionKind
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.simulator.world import World
 from tests.simulator.world.driving import route_of

@@ -7,7 +7,7 @@ from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind, centre_plan
 from me2e_compress.evaluators.highway.generate import dry_run
-from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.episode import InfractionKind
 from me2e_compress.simulator.routes import Route
 from tests.evaluators.highway.tiny_world import circle, ego_at, straight
 

@@ -13,8 +13,7 @@ from me2e_compress.evaluators.highway.conflict_recorder import (
     contact_of,
 )
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
-from me2e_compress.metrics.episode import ConflictRecord, Ending
-from me2e_compress.metrics.infraction import Contact, Infraction
+from me2e_compress.metrics.episode import ConflictRecord, Contact, Ending, Infraction
 from me2e_compress.simulator.plane_geometry import Lane, LaneMarking, Roadmap
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Actor, ActorKind, Ego, Event, EventKind, Scene
@@ -27,7 +26,7 @@ FRAMES_A_SECOND = 20
 
 def lane(name: str, begin: float, end: float, y: float = 0.0) -> Lane:
     points = np.array([[begin, y], [end, y]])
-    return Lane(name, points, 3.5, LaneMarking.DASHED, LaneMarking.DASHED, 10.0)
+    return Lane(name, points, 3.5, LaneMarking.DASHED, LaneMarking.DASHED)
 
 
 ROAD = Roadmap((lane("a>b:0", -20.0, 6.0), lane("b>c:0", 6.0, 60.0)))

@@ -11,9 +11,8 @@ from me2e_compress.evaluators.highway.drivers import BlindDriver
 from me2e_compress.evaluators.highway.results import fingerprint
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.evaluators.highway.worker import Job
-from me2e_compress.metrics.driving_score import route_score, score_to_first_collision
-from me2e_compress.metrics.episode import Ending, Episode
-from me2e_compress.metrics.infraction import COLLISIONS
+from me2e_compress.metrics.episode import COLLISIONS, Ending, Episode
+from me2e_compress.metrics.route_scores import route_score, score_to_first_collision
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.traffic.bodies import Contacts, EgoVehicle, depth
 from me2e_compress.simulator.traffic.network import Pose

@@ -9,8 +9,7 @@ from me2e_compress.evaluators.highway.expert.expert_policy import Expert, Memory
 from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.evaluators.highway.generate import dry_run
 from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.routes import Route
-from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route
 from me2e_compress.simulator.scene import INFRACTIONS, Control
 from me2e_compress.simulator.world import World
 

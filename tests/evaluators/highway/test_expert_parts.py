@@ -20,8 +20,8 @@ from me2e_compress.evaluators.highway.expert.speed_limits import (
     must_give_way,
 )
 from me2e_compress.simulator.plane_geometry import RoutePath
-from me2e_compress.simulator.privileged import Intent
 from me2e_compress.simulator.scene import Actor, ActorKind, Scene
+from me2e_compress.simulator.world import Intent
 from tests.evaluators.highway.tiny_world import actor, circle, ego_at, straight
 
 

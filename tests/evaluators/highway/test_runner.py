@@ -15,9 +15,8 @@ from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.observe import can_bus_of, road_users
 from me2e_compress.evaluators.highway.runner import Listeners, drive
-from me2e_compress.metrics.episode import Ending
-from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.simulator.pictures import Moment
+from me2e_compress.metrics.episode import Ending, InfractionKind
+from me2e_compress.simulator.pictures.route import Moment
 from me2e_compress.simulator.scene import ActorKind, Ego
 from me2e_compress.simulator.world import World
 from tests.evaluators.highway.drivers import (

@@ -3,8 +3,8 @@
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.runner import drive
-from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Ending
+from me2e_compress.metrics.route_scores import route_score
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.routes import load_routes, pick_routes
 

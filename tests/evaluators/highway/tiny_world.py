@@ -16,11 +16,6 @@ from me2e_compress.simulator.plane_geometry import (
     polyline_headings,
     resample,
 )
-from me2e_compress.simulator.privileged import (
-    Intent,
-    Phase,
-    Privileged,
-)
 from me2e_compress.simulator.scene import (
     DIMENSIONS,
     Actor,
@@ -32,6 +27,7 @@ from me2e_compress.simulator.scene import (
     SignalKind,
     SignalState,
 )
+from me2e_compress.simulator.world import Intent, Phase, Privileged
 
 DT_US = 50_000
 LAG_S = (0.2, 0.1)

@@ -12,10 +12,7 @@ from me2e_compress.simulator.cameras import (
     PixelClass,
     bev_classes,
 )
-from me2e_compress.simulator.cameras.birdseye import (
-    covered,
-    ground_classes,
-)
+from me2e_compress.simulator.cameras.birdseye import covered, ground_classes
 from me2e_compress.simulator.scene import ActorKind, Scene
 from tests.simulator.cameras import town
 

@@ -146,13 +146,12 @@ def test_a_pixel_has_the_class_of_what_it_shows(
     assert cameras.classes(town.scene(seen_from=ego))[FRONT, int(v), int(u)] == kind
 
 
-def test_the_sky_is_above_the_horizon_only(cameras: Cameras) -> None:
+def test_the_sky_is_above_the_horizon_only_and_the_road_goes_on(
+    cameras: Cameras,
+) -> None:
     sky = cameras.classes(town.scene()) == PixelClass.SKY
     assert sky[:, :54].all()
     assert not sky[:, 54:].any()
-
-
-def test_beyond_the_texture_the_straight_road_goes_on(cameras: Cameras) -> None:
     far = town.scene(seen_from=town.ego(180.0, 0.0))
     assert (cameras.classes(far)[FRONT, 60:] == PixelClass.DRIVABLE).any()
 

@@ -5,16 +5,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.simulator.cameras import (
-    CAMERA_NAMES,
-    CameraRig,
-    Cameras,
-    PixelClass,
-)
-from me2e_compress.simulator.cameras.classes import ACTOR_CLASSES
+from me2e_compress.simulator.cameras import CAMERA_NAMES, CameraRig, Cameras, PixelClass
 from me2e_compress.simulator.cameras.painter import painting_order
 from me2e_compress.simulator.cameras.solids import TEMPLATES
 from me2e_compress.simulator.scene import (
+    ACTOR_CLASSES,
     DIMENSIONS,
     Actor,
     ActorKind,

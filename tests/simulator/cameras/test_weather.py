@@ -2,6 +2,7 @@ import hashlib
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,19 +35,16 @@ for options in (Weather(), weather):
 """
 
 
-class Eyes:
-    def __init__(self, texture: GroundTexture, rig: CameraRig) -> None:
-        self.texture, self.rig = texture, rig
-
-    def __call__(self, weather: Weather, time_us: int = 0) -> npt.NDArray[np.int64]:
-        scene = replace(town.busy(), time_us=time_us)
-        images = Cameras(self.texture, self.rig, weather).render(scene)
-        return images.astype(np.int64)
+Eyes = Callable[..., npt.NDArray[np.int64]]
 
 
 @pytest.fixture
 def see(texture: GroundTexture, rig: CameraRig) -> Eyes:
-    return Eyes(texture, rig)
+    def seen(weather: Weather, time_us: int = 0) -> npt.NDArray[np.int64]:
+        scene = replace(town.busy(), time_us=time_us)
+        return Cameras(texture, rig, weather).render(scene).astype(np.int64)
+
+    return seen
 
 
 def test_an_image_does_not_depend_on_those_before(
@@ -133,13 +131,10 @@ def test_a_dropped_camera_is_black_and_the_others_are_as_ever(
         np.testing.assert_array_equal(images[i], expected)
 
 
-def test_brightness_multiplies_and_saturates(see: Eyes) -> None:
-    expected = np.minimum(np.rint(see(Weather()) * 1.5), 255)
-    np.testing.assert_allclose(see(Weather(brightness=1.5)), expected, atol=1)
-
-
-def test_noise_has_the_deviation_asked_for(see: Eyes) -> None:
+def test_brightness_saturates_and_noise_has_the_deviation_asked_for(see: Eyes) -> None:
     clear = see(Weather())
+    expected = np.minimum(np.rint(clear * 1.5), 255)
+    np.testing.assert_allclose(see(Weather(brightness=1.5)), expected, atol=1)
     noise = (see(Weather(noise=8.0)) - clear)[(clear > 40) & (clear < 215)]
     assert noise.std() == pytest.approx(8.0, rel=0.05)
     assert abs(noise.mean()) < 0.2

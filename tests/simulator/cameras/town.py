@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from me2e_compress.simulator.cameras import paint_texture
-from me2e_compress.simulator.cameras.texture import GroundTexture
+from me2e_compress.simulator.cameras.ground import GroundTexture
 from me2e_compress.simulator.plane_geometry import Lane, LaneMarking, Roadmap
 from me2e_compress.simulator.scene import (
     DIMENSIONS,
@@ -25,7 +25,7 @@ CROSSWALK = ((22.0, -2.0), (22.0, 6.0), (26.0, 6.0), (26.0, -2.0))
 def lane(y: float, left: LaneMarking, right: LaneMarking) -> Lane:
     stations = np.arange(-200.0, 201.0, 2.0)
     centre = np.stack([stations, np.full_like(stations, y)], axis=1)
-    return Lane(f"w>e:{y:g}", centre, 4.0, left, right, 13.9)
+    return Lane(f"w>e:{y:g}", centre, 4.0, left, right)
 
 
 ROADMAP = Roadmap(
@@ -86,14 +86,9 @@ def busy() -> Scene:
             zip(ActorKind, np.linspace(0.0, 6.0, len(ActorKind)), strict=True)
         )
     )
+    states = (SignalState.RED, None, None)
     signals = tuple(
-        Signal(i, kind, 9.0, 3.0 * i - 4.0, 0.1, state, STOP_LINE)
-        for i, (kind, state) in enumerate(
-            (
-                (SignalKind.TRAFFIC_LIGHT, SignalState.RED),
-                (SignalKind.STOP_SIGN, None),
-                (SignalKind.GIVE_WAY, None),
-            )
-        )
+        Signal(i, kind, 9.0, 3.0 * i - 4.0, 0.1, states[i], STOP_LINE)
+        for i, kind in enumerate(SignalKind)
     )
     return Scene(50_000, ego(), (*actors, actor(-2.5, 0.5)), signals)

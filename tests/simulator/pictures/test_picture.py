@@ -9,7 +9,7 @@ from PIL import Image
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.cameras import CAMERA_NAMES
-from me2e_compress.simulator.pictures import (
+from me2e_compress.simulator.pictures.route import (
     Moment,
     RoutePicture,
     overlay,
@@ -54,15 +54,9 @@ def above(pixels: Image8) -> Image8:
 def test_a_frame_has_six_tiles_a_view_from_above_and_a_caption() -> None:
     images = np.stack([np.full((96, 160, 3), 20 * i, np.uint8) for i in range(6)])
     frame = picture(moment(0, images=images)).frame(0)
-    places = {
-        "FRONT_LEFT": (0, 0),
-        "FRONT": (0, 1),
-        "FRONT_RIGHT": (0, 2),
-        "BACK_LEFT": (1, 0),
-        "BACK": (1, 1),
-        "BACK_RIGHT": (1, 2),
-    }
-    for name, (row, column) in places.items():
+    sides = ("{}_LEFT", "{}", "{}_RIGHT")
+    for row, column in np.ndindex(2, 3):
+        name = sides[column].format(("FRONT", "BACK")[row])
         pixel = frame[row * 100 + 60, column * 164 + 80]
         assert pixel.tolist() == [20 * CAMERA_NAMES.index(name)] * 3
     assert above(frame).shape[0] == 196
@@ -84,9 +78,7 @@ def test_the_plan_lies_ahead_of_the_ego() -> None:
     scale = view.shape[0] / 72.0  # the ego stands 50 m below the upper edge
     assert rows.min() == pytest.approx((50 - 24) * scale, abs=4)
     assert columns.mean() == pytest.approx(view.shape[1] / 2, abs=2)
-
-
-def test_a_moment_may_have_no_plan() -> None:
+    # a moment may have none
     bare = replace(moment(0), plan=None)
     frame = picture(bare).frame(0)
     assert count(above(frame), PLAN) == 0
@@ -100,14 +92,11 @@ def test_an_infraction_is_marked_from_its_moment_on() -> None:
     assert min(red[2:]) > 20
 
 
-def test_an_event_handed_in_twice_is_drawn_as_once() -> None:
+def test_an_event_is_drawn_once_and_a_trigger_is_no_infraction() -> None:
     crash = event(EventKind.RED_LIGHT, 50_000)
     once = picture(moment(0), moment(1, crash), moment(2))
     twice = picture(moment(0), moment(1, crash), moment(2, crash))
     np.testing.assert_array_equal(once.frame(2), twice.frame(2))
-
-
-def test_a_trigger_is_no_infraction() -> None:
     trigger = event(EventKind.TRIGGER, 0)
     with_it, without = picture(moment(0, trigger)), picture(moment(0))
     np.testing.assert_array_equal(with_it.frame(0), without.frame(0))
@@ -117,9 +106,7 @@ def test_a_strip_sets_moments_side_by_side() -> None:
     film = picture(*(moment(i) for i in range(4)))
     strip = film.strip([0, 2, 3])
     assert strip.shape == (30 + 4 + 96 + 4 + 160, 3 * 160 + 2 * 4, 3)
-
-
-def test_without_a_moment_there_is_nothing_to_draw() -> None:
+    # without a moment there is nothing to draw
     with pytest.raises(EvaluationError, match="Accident_1: no moments to draw"):
         picture()
 
@@ -143,9 +130,6 @@ def test_a_gif_has_all_frames_and_their_pace(tmp_path: Path) -> None:
         shown = np.asarray(image.convert("RGB")).astype(int)
     assert np.abs(shown - film.frame(4)).mean() < 3
     assert [path.name for path in tmp_path.iterdir()] == ["route.gif"]
-
-
-def test_a_gif_needs_a_frame(tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match="needs at least one picture"):
         write_gif(tmp_path / "route.gif", [], 50_000)
 

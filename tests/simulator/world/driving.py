@@ -2,9 +2,8 @@
 
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.generate import DryRun, dry_run
-from me2e_compress.simulator.routes import Parameter, Route
-from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
-from me2e_compress.simulator.scenarios.layouts.streets import two_way
+from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Parameter, Route
+from me2e_compress.simulator.scenarios.roads import two_way
 from me2e_compress.simulator.scene import Control
 from me2e_compress.simulator.traffic.stage import Stage
 from me2e_compress.simulator.world import World

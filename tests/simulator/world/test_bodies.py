@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from me2e_compress.simulator.scene import ActorKind, Control
 from me2e_compress.simulator.traffic.bodies import (
     DRY_GRIP_MPS2,
+    Behaviour,
+    Car,
     EgoVehicle,
     StaticObject,
     Walker,
 )
-from me2e_compress.simulator.traffic.cars import Behaviour, Car
 from me2e_compress.simulator.traffic.network import Network, Pose, Section
 from me2e_compress.simulator.traffic.right_of_way import RightOfWay
 from me2e_compress.simulator.traffic.traffic_road import TrafficRoad, overlap
@@ -28,17 +29,13 @@ def driven(control: Control, seconds: float, dt: float, speed: float) -> EgoVehi
     return ego
 
 
-def test_the_ego_brakes_to_rest_and_never_reverses() -> None:
+def test_the_ego_brakes_with_a_lag_to_rest_and_never_reverses() -> None:
     ego = driven(Control(-8.0, 0.0), 4.0, 0.05, 10.0)
+    begun = driven(Control(3.0, 0.0), 0.2, 0.05, 5.0)
 
     assert ego.speed == 0
     assert ego.pose.x > 0
-
-
-def test_the_ego_follows_an_order_with_a_lag() -> None:
-    ego = driven(Control(3.0, 0.0), 0.2, 0.05, 5.0)
-
-    assert ego.snapshot().acceleration_mps2 == pytest.approx(3 * (1 - math.exp(-1)))
+    assert begun.snapshot().acceleration_mps2 == pytest.approx(3 * (1 - math.exp(-1)))
 
 
 def test_a_positive_wheel_angle_turns_left() -> None:
@@ -105,16 +102,23 @@ def test_a_follower_never_reverses_nor_hits_a_leader_with_room(
     run(road, 8.0)
 
     assert road.touching() == []
-    assert rear.station_m < front.station_m
+    assert rear.lane_s < front.lane_s
+
+
+def bent(heading: float, before: float, radius: float, angle: float) -> Network:
+    network = Network()
+    pose = network.straight("a", "b", Pose(0.0, 0.0, heading), before, Section())
+    pose = network.arc("b", "c", pose, radius, angle, Section())
+    network.straight("c", "d", pose, 60.0, Section())
+    return network
+
+
+BENT = [("a", "b", 0), ("b", "c", 0), ("c", "d", 0)]
 
 
 def test_a_car_stops_behind_what_stands_around_the_corner() -> None:
-    network = Network()
-    pose = network.straight("a", "b", Pose(0.0, 0.0, 0.0), 40.0, Section())
-    pose = network.arc("b", "c", pose, 15.0, math.pi / 2, Section())
-    network.straight("c", "d", pose, 60.0, Section())
-    road = road_on(network)
-    car = Car(1, network, [("a", "b", 0), ("b", "c", 0), ("c", "d", 0)], 5.0, 8.0)
+    network = bent(0.0, 40.0, 15.0, math.pi / 2)
+    road, car = road_on(network), Car(1, network, BENT, 5.0, 8.0)
     parked = StaticObject(2, ActorKind.PARKED, network.pose(("c", "d", 0), 8.0))
     put(road, car, parked)
 
@@ -126,12 +130,8 @@ def test_a_car_stops_behind_what_stands_around_the_corner() -> None:
 
 
 def test_a_car_keeps_to_its_lane_through_a_bend() -> None:
-    network = Network()
-    pose = network.straight("a", "b", Pose(0.0, 0.0, 1.0), 30.0, Section())
-    pose = network.arc("b", "c", pose, 12.0, -math.pi / 2, Section())
-    network.straight("c", "d", pose, 60.0, Section())
-    road = road_on(network)
-    car = Car(1, network, [("a", "b", 0), ("b", "c", 0), ("c", "d", 0)], 5.0, 8.0)
+    network = bent(1.0, 30.0, 12.0, -math.pi / 2)
+    road, car = road_on(network), Car(1, network, BENT, 5.0, 8.0)
     put(road, car)
 
     for _ in range(60):

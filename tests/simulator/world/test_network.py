@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.simulator.traffic.legs import LaneTable
 from me2e_compress.simulator.traffic.network import (
+    LaneTable,
     Network,
     Pose,
     Section,

@@ -3,12 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.simulator.plane_geometry import (
-    Command,
-    Lane,
-    LaneMarking,
-    Roadmap,
-)
+from me2e_compress.simulator.plane_geometry import Command, Lane, LaneMarking, Roadmap
 from me2e_compress.simulator.world import World
 from tests.simulator.world.driving import route_of
 
@@ -30,14 +25,10 @@ def test_projecting_a_point_beside_the_route_finds_it_again(
 def test_left_is_positive() -> None:
     x, y, heading = PATH.at(10.0)
     left = float(x - np.sin(heading)), float(y + np.cos(heading))
-
-    assert PATH.project(*left)[1] == pytest.approx(1.0, abs=1e-6)
-
-
-def test_curvature_is_positive_to_the_left() -> None:
     path = World(route_of("VehicleTurningRoute", 0, move="left")).path
     inside = path.commands == Command.LEFT
 
+    assert PATH.project(*left)[1] == pytest.approx(1.0, abs=1e-6)
     assert path.curvature[inside].max() == pytest.approx(1 / 13.75, rel=0.05)
     assert path.curvature.min() > -0.01
 
@@ -63,7 +54,7 @@ def test_three_lane_changes_are_commanded() -> None:
 @given(st.floats(-30.0, 60.0), st.floats(-20.0, 20.0))
 def test_metres_outside_a_straight_lane(x: float, y: float) -> None:
     centre = np.stack([np.arange(0.0, 31.0), np.zeros(31)], axis=1)
-    lane = Lane("a>b:0", centre, 4.0, LaneMarking.SOLID, LaneMarking.SOLID, 10.0)
+    lane = Lane("a>b:0", centre, 4.0, LaneMarking.SOLID, LaneMarking.SOLID)
     beyond = max(-x, x - 30.0, 0.0)
 
     expected = max(0.0, np.hypot(beyond, y) - 2.0)

@@ -1,10 +1,14 @@
 import numpy as np
 import pytest
 
-from me2e_compress.metrics.abilities import ABILITIES
-from me2e_compress.simulator.routes import Route, load_routes
-from me2e_compress.simulator.scenarios.builders import BUILDERS, stage_of
-from me2e_compress.simulator.scenarios.catalogue import EXPERT_S, SCENARIO_ABILITIES
+from me2e_compress.metrics.bench2drive import ABILITIES
+from me2e_compress.simulator.routes import (
+    EXPERT_S,
+    SCENARIO_ABILITIES,
+    Route,
+    load_routes,
+)
+from me2e_compress.simulator.scenarios.builders import SCENARIOS, stage_of
 from me2e_compress.simulator.traffic.traffic_road import overlap
 from me2e_compress.simulator.world import World
 from tests.simulator.world.driving import drive_blind, route_of
@@ -19,7 +23,7 @@ def test_there_are_the_44_types_of_bench2drive() -> None:
     ]
 
     assert len(TYPES) == 44
-    assert set(BUILDERS) == set(TYPES) == set(EXPERT_S)
+    assert set(SCENARIOS) == set(TYPES) == set(EXPERT_S)
     assert sizes == [9, 16, 12, 2, 19]
 
 

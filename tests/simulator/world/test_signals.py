@@ -4,7 +4,7 @@ import pytest
 
 from me2e_compress.simulator.scene import EventKind, SignalKind, SignalState
 from me2e_compress.simulator.traffic.network import Pose
-from me2e_compress.simulator.traffic.signals import Regulator
+from me2e_compress.simulator.traffic.right_of_way import Regulator
 
 LINE_S = 50.0
 

@@ -5,19 +5,13 @@ from statistics import median
 import pytest
 
 from me2e_compress.evaluators.highway.generate import propose, with_other_traffic
-from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.camera_rig import CLEAR, DRAWN, drawn_weather
+from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route
 from me2e_compress.simulator.scenarios.builders import stage_of
-from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
-from me2e_compress.simulator.scenarios.scripts.streams import TRIGGERED
 from me2e_compress.simulator.scene import Control, EventKind, SignalKind, SignalState
-from me2e_compress.simulator.traffic.cars import Car
-from me2e_compress.simulator.traffic.signals import (
-    ALL_RED_S,
-    YELLOW_S,
-    SignalPlan,
-)
+from me2e_compress.simulator.traffic.bodies import Car
+from me2e_compress.simulator.traffic.right_of_way import ALL_RED_S, YELLOW_S, SignalPlan
 from me2e_compress.simulator.traffic.stage import HORIZON_S, Stage, arrival_times
-from me2e_compress.simulator.weather import CLEAR, DRAWN, drawn_weather
 from me2e_compress.simulator.world import World
 from tests.simulator.world.driving import trace
 
@@ -47,26 +41,25 @@ def moving_near(stage: Stage) -> int:
 
 def arrivals(stage: Stage) -> list[tuple[int, int, str]]:
     found = stage.schedule.arrivals
-    return [(e.time_us, e.body.id, str(e.body.kind)) for e in found]
+    return [(time_us, body.id, str(body.kind)) for time_us, body in found]
 
 
-def test_routes_are_200_to_400_m_long(stages: dict[str, Stage]) -> None:
+def test_routes_are_200_to_400_m_long_and_begin_among_eight_who_move(
+    stages: dict[str, Stage],
+) -> None:
     lengths = [stage.path.goal_m for stage in stages.values()]
 
     assert 200.0 <= min(lengths) < 240.0
     assert 300.0 < max(lengths) <= 400.0
-
-
-def test_the_median_route_begins_among_eight_who_move(stages: dict[str, Stage]) -> None:
     assert median(map(moving_near, stages.values())) >= 8
 
 
 def test_every_lane_into_the_map_brings_traffic(stages: dict[str, Stage]) -> None:
     for name in ("T_Junction", "SequentialLaneChange", "EnterActorFlow"):
         coming = {
-            each.body.lanes[0]
-            for each in stages[name].schedule.arrivals
-            if isinstance(each.body, Car)
+            body.lanes[0]
+            for _, body in stages[name].schedule.arrivals
+            if isinstance(body, Car)
         }
         arms = {"T_Junction": 3, "SequentialLaneChange": 4, "EnterActorFlow": 4}
         assert len(coming) == arms[name]
@@ -77,7 +70,12 @@ def test_few_types_wait_for_the_ego_and_the_list_names_them(
 ) -> None:
     waiting = [n for n, stage in stages.items() if "trigger_m" in stage.parameters]
 
-    assert sorted(waiting) == sorted(TRIGGERED)
+    assert sorted(waiting) == [
+        *("CrossingBicycleFlow", "DynamicObjectCrossing", "HardBreakRoute"),
+        *("ParkingCrossingPedestrian", "ParkingCutIn", "StaticCutIn"),
+        *("VehicleOpensDoorTwoWays", "VehicleTurningRoute"),
+        "VehicleTurningRoutePedestrian",
+    ]
     assert len(waiting) <= 12
 
 
@@ -203,9 +201,6 @@ def test_a_third_of_the_routes_has_weather() -> None:
     assert len(kinds) * 3 == len(DRAWN)
     for kind in set(kinds):
         assert drawn_weather(kind, 0.0, 0) != drawn_weather(kind, 1.0, 0)
-
-
-def test_a_route_says_its_weather() -> None:
     night = Route("test", "Accident", "Overtaking", 1, {"weather": "night"})
 
     assert World(night).weather.night > 0.5

@@ -7,17 +7,13 @@ import pytest
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import resample
-from me2e_compress.simulator.scenarios.layouts.streets import two_way
+from me2e_compress.simulator.routes import Parameter
+from me2e_compress.simulator.scenarios.roads import two_way
 from me2e_compress.simulator.scene import ActorKind, Control, EventKind
-from me2e_compress.simulator.traffic.cars import Behaviour
+from me2e_compress.simulator.traffic.bodies import Behaviour
 from me2e_compress.simulator.traffic.stage import Script, Stage
 from me2e_compress.simulator.world import EndReason, World
-from tests.simulator.world.driving import (
-    coast,
-    empty_road,
-    route_of,
-    trace,
-)
+from tests.simulator.world.driving import coast, empty_road, route_of, trace
 
 DIGEST = """
 import hashlib
@@ -27,16 +23,14 @@ print(hashlib.sha256(repr(seen).encode()).hexdigest())
 """
 
 
-def digest_in_a_fresh_process() -> str:
-    command = [sys.executable, "-c", DIGEST]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return done.stdout.strip()
-
-
 def test_fresh_processes_see_the_same_bytes() -> None:
-    first, second = digest_in_a_fresh_process(), digest_in_a_fresh_process()
+    command = [sys.executable, "-c", DIGEST]
+    first, second = (
+        subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    )
 
-    assert len(first) == 64
+    assert len(first.strip()) == 64
     assert first == second
 
 
@@ -55,14 +49,19 @@ def test_a_given_parameter_changes_that_one_alone() -> None:
     assert given == {**drawn, "obstacle_m": 70.5}
 
 
-def test_a_parameter_of_the_wrong_kind_is_named() -> None:
-    with pytest.raises(EvaluationError, match="obstacle_m is 'far'"):
-        World(route_of(obstacle_m="far"))
-
-
-def test_a_parameter_that_nothing_asks_for_is_named() -> None:
-    with pytest.raises(EvaluationError, match="has no parameter obstacle here; there"):
-        World(route_of(obstacle=70.0))
+@pytest.mark.parametrize(
+    ("scenario", "given", "words"),
+    [
+        ("Accident", {"obstacle_m": "far"}, "obstacle_m is 'far'"),
+        ("Accident", {"obstacle": 70.0}, "has no parameter obstacle here; there"),
+        ("VehicleTurningRoute", {"move": "up"}, "is 'up'; there are left, right"),
+    ],
+)
+def test_a_wrong_parameter_is_named(
+    scenario: str, given: dict[str, Parameter], words: str
+) -> None:
+    with pytest.raises(EvaluationError, match=words):
+        World(route_of(scenario, **given))  # type: ignore[arg-type]
 
 
 def test_a_script_must_draw_its_parameters_before_it_starts() -> None:
@@ -76,11 +75,6 @@ def test_a_script_must_draw_its_parameters_before_it_starts() -> None:
 
     with pytest.raises(EvaluationError, match="parameter dice is drawn after"):
         coast(World(route_of(), builder=late), 1)
-
-
-def test_a_word_that_is_no_option_is_named() -> None:
-    with pytest.raises(EvaluationError, match="move is 'up'; there are left, right"):
-        World(route_of("VehicleTurningRoute", move="up"))
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
@@ -144,8 +138,7 @@ def test_two_actors_that_collide_are_told_from_the_ego() -> None:
 
 
 @pytest.mark.parametrize(
-    ("brake", "kinds"),
-    [(-8.0, [EventKind.STRUCK]), (0.0, [EventKind.COLLISION])],
+    ("brake", "kinds"), [(-8.0, [EventKind.STRUCK]), (0.0, [EventKind.COLLISION])]
 )
 def test_a_standing_ego_that_is_struck_has_not_collided(
     brake: float, kinds: list[EventKind]

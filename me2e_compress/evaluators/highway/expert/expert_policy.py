@@ -26,8 +26,8 @@ from me2e_compress.evaluators.highway.expert.speed_limits import (
 from me2e_compress.evaluators.highway.observe import scene_and_world, seen
 from me2e_compress.evaluators.highway.reentry import slope_of
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
-from me2e_compress.simulator.privileged import Privileged
 from me2e_compress.simulator.scene import Scene
+from me2e_compress.simulator.world import Privileged
 
 WAYPOINTS = np.searchsorted(TIMES_S, np.arange(0.5, 3.01, 0.5))
 """[6] columns of the candidates that become waypoints."""

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
-from me2e_compress.simulator.privileged import Intent
 from me2e_compress.simulator.scene import Actor, ActorKind, Scene
+from me2e_compress.simulator.world import Intent
 
 Flags = npt.NDArray[np.bool_]
 TIMES_S = np.concatenate([np.arange(0.25, 3.01, 0.25), np.arange(3.5, 6.01, 0.5)])

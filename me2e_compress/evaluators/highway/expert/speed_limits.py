@@ -7,8 +7,8 @@ import numpy as np
 
 from me2e_compress.evaluators.highway.expert.forecast import NOW_S, Forecast
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
-from me2e_compress.simulator.privileged import Phase
 from me2e_compress.simulator.scene import Ego, Scene, Signal, SignalKind, SignalState
+from me2e_compress.simulator.world import Phase
 
 LATERAL_MPS2 = 2.2
 """Lateral acceleration in bends; the comfort bound of nuPlan is 4.89."""

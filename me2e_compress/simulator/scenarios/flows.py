@@ -1,17 +1,22 @@
-"""Traffic, drawn before the route begins, whatever the ego does."""
+"""Scripts of traffic, drawn before the route begins, and how scripts are timed.
+
+Scripts are generators that are resumed at every decision (10 Hz). What waits for the
+ego, as in scenario_runner, is triggered by its position and a delay that is drawn.
+"""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from me2e_compress.simulator.scenarios.layouts.road import BEFORE_M
-from me2e_compress.simulator.scene import ActorKind
-from me2e_compress.simulator.traffic.bodies import Walker
-from me2e_compress.simulator.traffic.cars import Behaviour, Car
-from me2e_compress.simulator.traffic.network import LaneIndex
-from me2e_compress.simulator.traffic.right_of_way import DECIDE_M
+from me2e_compress.simulator.scenarios.crossings import Crossing, ring_way
+from me2e_compress.simulator.scenarios.roads import BEFORE_M, Ramp, Street
+from me2e_compress.simulator.scene import ActorKind, Event, EventKind
+from me2e_compress.simulator.traffic.bodies import Behaviour, Car, Walker
+from me2e_compress.simulator.traffic.network import LANE_WIDTH_M, LaneIndex
+from me2e_compress.simulator.traffic.right_of_way import DECIDE_M, Regulator
 from me2e_compress.simulator.traffic.stage import Script, Stage, arrival_times, is_free
 
 # Timing of scripts: meeting points, and what waits for the ego.
@@ -80,6 +85,8 @@ def keep_clear(stage: Stage, chain: Sequence[LaneIndex], until_s: float) -> None
 HEEDLESS, SLOW = 0.12, 0.15
 """Shares of drivers who follow closely and take short gaps, and of slow ones: our
 choice."""
+LATE = 0.45
+"""Share of drivers of a conflict who obey neither lights nor signs, where some do."""
 BLIND_TO_EGO = 0.4
 """Share of drivers of a conflict who do not make room for an ego that comes in."""
 TURNING = 0.4
@@ -127,7 +134,10 @@ def stream(
     low, high = traffic.speed or (0.0, 0.0)
     usual = (low + high) / 2 or 0.85 * float(network.lane(entry).speed_limit)
     free_m = _free_m(stage, chains[0])
-    weights = np.array([_weight(stage, chain, chains) for chain in chains])
+    # most go straight on
+    ranks = [[network.ranks.get(index, 0) for index in chain] for chain in chains]
+    turns = np.array([any(rank % 3 for rank in several) for several in ranks])
+    weights = np.where(turns, TURNING / len(chains), 1.0 - TURNING)
     clear = stage.clear.get(entry, (0.0, 0.0))
     cars = list[Car]()
     for time_s in arrival_times(
@@ -138,7 +148,11 @@ def stream(
         car = _driver(stage, random, chain, at, traffic)
         if time_s >= 0.0:
             schedule.add(time_s, car)
-        elif not clear[0] < at < clear[1] and _has_room(stage, car):
+        elif not clear[0] < at < clear[1] and (
+            math.hypot(*(car.position - stage.ego.position))
+            >= EGO_ROOM_M + (car.LENGTH + stage.ego.LENGTH) / 2
+            and is_free(car, [*stage.bodies, *stage.static_objects])
+        ):
             stage.bodies.append(car)
         else:
             continue
@@ -175,7 +189,7 @@ def _driver(
     vehicle = ActorKind.VAN if kind < 0.12 else ActorKind.CAR
     vehicle = ActorKind.TRUCK if kind > 0.93 else vehicle
     wanted = float(wanted)
-    car = stage.coming(chain, s_m, wanted, wanted, vehicle, mind)
+    car = stage.car(chain, s_m, wanted, wanted, vehicle, mind, comes=True)
     car.joins = list(traffic.joins) or None
     if traffic.blind_to_ego and random.random() < traffic.blind_to_ego:
         car.behaviour = replace(mind, sees_ego=False)
@@ -195,40 +209,25 @@ def _free_m(stage: Stage, chain: Sequence[LaneIndex]) -> float:
     return length - END_M
 
 
-def _weight(
-    stage: Stage, chain: Sequence[LaneIndex], chains: Sequence[Sequence[LaneIndex]]
-) -> float:
-    """Return how often a chain is taken: most go straight on."""
-    ranks = [stage.network.ranks.get(index, 0) for index in chain]
-    turns = any(rank % 3 for rank in ranks)
-    return TURNING / len(chains) if turns else 1.0 - TURNING
-
-
-def _has_room(stage: Stage, car: Car) -> bool:
-    x, y = car.position
-    ex, ey = stage.ego.position
-    if math.hypot(x - ex, y - ey) < EGO_ROOM_M + (car.LENGTH + stage.ego.LENGTH) / 2:
-        return False
-    return is_free(car, [*stage.bodies, *stage.static_objects])
-
-
 def across(
     stage: Stage,
     chain: Sequence[LaneIndex],
-    route_s: float,
     name: str,
+    route_s: float | None = None,
     gap_s: tuple[float, float] = (5.0, 9.0),
     late: bool = False,
 ) -> Script:
     """Drive traffic that the ego's route crosses or joins; see `encounter`.
 
-    With ``late``, some of it comes through a light that is red.
+    Without ``route_s``: where they meet. With ``late``, some of it comes through a
+    light that is red, or takes priority.
     """
-    reckless = 0.45 if late or name == "crossing_car" else 0.0
+    place = meeting(stage, chain) if route_s is None else route_s
     gap = stage.uniform(f"{name}_gap_s", *gap_s)
+    reckless = LATE if late else 0.0
     traffic = Traffic(gap, reckless=reckless, blind_to_ego=BLIND_TO_EGO)
     cars = stream(stage, name, [chain], traffic)
-    yield from encounter(stage, cars, route_s, name)
+    yield from encounter(stage, cars, place, name)
 
 
 def encounter(
@@ -252,12 +251,6 @@ def encounter(
                 return
 
 
-TRIGGERED = (
-    *("DynamicObjectCrossing", "HardBreakRoute", "ParkingCrossingPedestrian"),
-    *("ParkingCutIn", "StaticCutIn", "VehicleOpensDoorTwoWays"),
-    *("CrossingBicycleFlow", "VehicleTurningRoute", "VehicleTurningRoutePedestrian"),
-)
-"""Types in which somebody waits for the ego, as in scenario_runner."""
 TRIGGER_M, DELAY_S = (18.0, 36.0), (0.0, 1.0)
 """Where the ego sets off what waits for it, and how long that still waits.
 scenario_runner's actors start when the ego is within a distance; ours is drawn."""
@@ -269,6 +262,165 @@ def near(stage: Stage, route_s: float) -> Script:
     delay = stage.uniform("delay_s", *DELAY_S)
     while stage.ahead_m(route_s) - stage.ego.LENGTH / 2 > metres:
         yield
-    until = stage.time_s + delay
-    while stage.time_s < until:
+    yield from hold(stage, delay)
+
+
+# Traffic that the ego must give way to, cross or join.
+
+
+def platoon(
+    stage: Stage,
+    crossing: Crossing,
+    name: str,
+    origin: str,
+    to: str,
+    cars: bool = True,
+    late: bool = False,
+) -> Script:
+    """Drive traffic from one arm of a junction to another, in the far lane.
+
+    ``cars`` draws a parameter that decides nothing: the routes that ship name it. See
+    `across` for ``late``.
+    """
+    if cars:
+        stage.integer("cars", 2, 4)
+    chain = crossing.way(origin, to, crossing.lanes - 1)
+    yield from across(stage, chain, name, late=late)
+
+
+ONCOMING = partial(platoon, name="oncoming_platoon", origin="ahead", to="back")
+"""Oncoming traffic drives straight on while the ego wants to turn left."""
+FROM_LEFT = partial(platoon, name="platoon_from_left", origin="left", to="right")
+"""Cars come from the left straight into the arm that the ego turns into."""
+TO_ENTER = partial(platoon, name="platoon_to_enter", origin="right", to="left")
+"""Cars come from the right into the road that the ego turns left into."""
+
+
+def priority_car(stage: Stage, crossing: Crossing) -> Script:
+    """Drive cars, from a random side, that have the right of way."""
+    chain = _from_a_side(stage, crossing)
+    if crossing.move == "right":
+        chain = crossing.way("left", "right")
+    yield from across(stage, chain, "priority_car")
+
+
+def crossing_car(stage: Stage, crossing: Crossing) -> Script:
+    """Drive cars from the side that must give way; some do not."""
+    chain = _from_a_side(stage, crossing)
+    yield from across(stage, chain, "crossing_car", late=True)
+
+
+def _from_a_side(stage: Stage, crossing: Crossing) -> list[LaneIndex]:
+    """Return a chain straight through a junction, from its left or its right."""
+    side = stage.choice("from", ("left", "right"))
+    return crossing.way(side, "right" if side == "left" else "left")
+
+
+def ring_flow(stage: Stage, _: Regulator) -> Script:
+    """Circulate cars past the entry at which the ego waits."""
+    to = stage.choice("flow_to", ("right", "ahead"))
+    stage.integer("cars", 2, 4)  # as in `platoon`
+    yield from across(stage, ring_way("left", to), "ring_flow")
+
+
+DENSE_S = (2.5, 4.0)
+"""Mean gap in the lane that the ego changes into."""
+
+
+def exit_lane_flow(stage: Stage, ramp: Ramp) -> Script:
+    """Drive dense traffic in the lane that the ego must cross to reach the exit."""
+    lane, place = ramp.main.ahead(), ramp.merge_s
+    yield from across(stage, lane, "exit_lane_flow", place, DENSE_S)
+
+
+def side_flows(stage: Stage, street: Street) -> Script:
+    """Drive dense traffic in the lane of the ego's first change."""
+    change = float(stage.parameters["first_m"]) + 12.5
+    yield from across(stage, street.ahead(1), "side_flows", change, DENSE_S)
+
+
+def bay_flow(stage: Stage, street: Street) -> Script:
+    """Drive cars past the parking bay that the ego wants to leave."""
+    chain = street.ahead()
+    route_s = meeting(stage, chain)
+    gap = stage.uniform("bay_flow_gap_s", 3.0, 5.0)
+    cars = stream(stage, "bay_flow", [chain], Traffic(gap, (5.0, 7.5), 0.4))
+    yield from encounter(stage, cars, route_s, "bay_flow")
+
+
+# Lights, signs, and vehicles that take or demand priority.
+
+
+def red_light(stage: Stage, crossing: Crossing) -> Script:
+    """Note that the ego comes to a light that its plan holds red then."""
+    line_s = crossing.signals["back"].line_s or crossing.approach_m
+    while stage.ahead_m(line_s) > 35.0:
         yield
+    stage.fire("red_light")
+
+
+def stop_sign(stage: Stage, crossing: Crossing) -> Script:
+    """Wait for the ego at a stop sign without traffic: only the stop counts."""
+    sign = crossing.signals["back"]
+    yield from met(stage, sign.line_s or crossing.approach_m, "stop_sign")
+
+
+INVADING, INTO_M = 0.4, (0.9, 1.2)
+"""Share of the oncoming cars that drive partly in the ego's lane,
+and how far they reach into it."""
+ASIDE_M = 1.1
+"""How far right of its lane's centre traffic keeps there, to have room."""
+
+
+def invader(stage: Stage, street: Street) -> Script:
+    """Drive oncoming traffic, a share of it partly in the ego's lane."""
+    gap, random = stage.uniform("oncoming_gap_s", 4.0, 7.0), stage.random("invaders")
+    keep_clear(stage, street.ahead(), 60.0)
+    for car in stream(stage, "same_way", [street.ahead()], Traffic(2 * gap)):
+        car.offset_m = -ASIDE_M
+    cars = stream(stage, "oncoming", [street.oncoming()], Traffic(gap))
+    invaders = [car for car in cars if random.random() < INVADING]
+    for car in invaders:
+        into = float(random.uniform(*INTO_M))
+        car.offset_m = (LANE_WIDTH_M - car.WIDTH) / 2 + into
+        car.behaviour = replace(car.behaviour, sees_ego=False)
+    yield from encounter(stage, invaders, None, "invader")
+
+
+SPARSE_S = 20.0
+"""Mean gap in the ego's lane where an emergency vehicle comes: others make room."""
+HELD_UP_M, HELD_UP_S = 20.0, 4.0
+"""The ego has not yielded if the vehicle was this close behind for this long, and still
+is behind at the end: it may come too late to be let by."""
+
+
+def emergency_behind(stage: Stage, street: Street) -> Script:
+    """Let an emergency vehicle come from behind that wants to pass.
+
+    It comes from a place that is drawn, and is judged at the end of the route.
+    scenario_runner's YieldToEmergencyVehicleTest only asks whether it is ahead then.
+    """
+    lanes = street.ahead()
+    mind = Behaviour(
+        3.5, headway_s=0.5, jam_gap_m=4.0, obeys_limits=False, obeys_rules=False
+    )
+    begin = BEFORE_M - stage.uniform("behind_m", 24.0, 56.0)
+    car = stage.car(lanes, begin, 16.0, 20.0, ActorKind.EMERGENCY, mind)
+    stream(stage, "same_way", [lanes], Traffic(SPARSE_S))
+    held = [0.0]
+
+    def judge() -> Event | None:
+        if held[0] < HELD_UP_S or stage.gap_m(car) > 0:
+            return None
+        return stage.event(EventKind.YIELD_EMERGENCY, "it was held up", car)
+
+    stage.at_goal.append(judge)
+    fired = False
+    while True:
+        yield
+        if not -HELD_UP_M < stage.gap_m(car) < 0:
+            continue
+        held[0] += 0.1
+        if not fired:
+            fired = True
+            stage.fire("emergency_behind", car)

@@ -6,21 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from me2e_compress.simulator.plane_geometry import Command, LaneMarking
-from me2e_compress.simulator.scenarios.layouts.streets import (
-    origin,
-    start_speed,
-)
+from me2e_compress.simulator.scenarios.roads import origin, start_speed
 from me2e_compress.simulator.scene import SignalKind, SignalState
-from me2e_compress.simulator.traffic.legs import Leg
 from me2e_compress.simulator.traffic.network import (
     LANE_WIDTH_M,
     PLAIN,
     LaneIndex,
+    Leg,
     Network,
     Pose,
     Section,
 )
-from me2e_compress.simulator.traffic.signals import Regulator, SignalPlan
+from me2e_compress.simulator.traffic.right_of_way import Regulator, SignalPlan
 from me2e_compress.simulator.traffic.stage import Stage
 
 ARMS = ("ahead", "left", "back", "right")
@@ -39,9 +36,8 @@ class Crossing:
     """A finished junction.
 
     Attributes:
-        centre: Its middle, with the ego's heading as it approaches.
-        half_m: Half its side.
-        lanes: Lanes of each arm in each direction.
+        centre: Its middle, with the ego's heading as it approaches; ``half_m`` is half
+            its side, and there are ``lanes`` of each arm in each direction.
         move: The ego's move: ahead, left or right.
         approach_m: Route from the ego's start to the junction's edge.
         signals: The regulator of each arm that has one.
@@ -54,11 +50,6 @@ class Crossing:
     approach_m: float
     signals: dict[str, Regulator]
     arm_m: float = ARM_M
-
-    @property
-    def sign(self) -> Regulator | None:
-        """The regulator of the ego's arm, if it has one."""
-        return self.signals.get("back")
 
     def way(self, origin: str, to: str, lane: int = 0) -> list[LaneIndex]:
         """Return the chain of lanes from one arm to another."""
@@ -120,7 +111,20 @@ def signal_junction(
     for arm in ARMS:
         line = _stop_line(crossing, arm)
         crossing.signals[arm] = stage.regulate(SignalKind.TRAFFIC_LIGHT, line)
-    _planned(stage, crossing, ego_light)
+    # their plan
+    lights, schedule = crossing.signals, stage.schedule
+    green = (stage.uniform("green_s", *GREEN_S), stage.uniform("cross_s", *GREEN_S))
+    groups = (lights["back"], lights["ahead"]), (lights["left"], lights["right"])
+    if ego_light is None:
+        cycle_s = SignalPlan(groups, green, 0.0).cycle_s
+        offset = stage.uniform("offset_s", 0.0, cycle_s)
+    else:
+        since = stage.uniform("found_s", *FOUND_S[ego_light])
+        offset = since - (crossing.approach_m - SETBACK_M) / USUAL_MPS
+    schedule.plans.append(SignalPlan(groups, green, offset))
+    for arm in ARMS:
+        at = crossing.arm_m - SETBACK_M - 1.0
+        schedule.lines[f"{arm}.far", f"{arm}.in", 0] = [(at, lights[arm])]
     return crossing
 
 
@@ -129,23 +133,6 @@ USUAL_MPS = 9.0
 """The speed for which a plan is said to show a driver red or green."""
 FOUND_S = {SignalState.GREEN: (1.0, 6.0), SignalState.RED: (-9.0, -3.0)}
 """Seconds after green at which the usual driver arrives."""
-
-
-def _planned(stage: Stage, crossing: Crossing, found: SignalState | None) -> None:
-    """Draw the plan of a junction's lights."""
-    lights, schedule = crossing.signals, stage.schedule
-    green = (stage.uniform("green_s", *GREEN_S), stage.uniform("cross_s", *GREEN_S))
-    groups = (lights["back"], lights["ahead"]), (lights["left"], lights["right"])
-    plan = SignalPlan(groups, green, 0.0)
-    if found is None:
-        offset = stage.uniform("offset_s", 0.0, plan.cycle_s)
-    else:
-        since = stage.uniform("found_s", *FOUND_S[found])
-        offset = since - (crossing.approach_m - SETBACK_M) / USUAL_MPS
-    schedule.plans.append(SignalPlan(groups, green, offset))
-    for arm in ARMS:
-        at = crossing.arm_m - SETBACK_M - 1.0
-        schedule.lines[f"{arm}.far", f"{arm}.in", 0] = [(at, lights[arm])]
 
 
 def crosswalk_junction(stage: Stage, moves: Sequence[str]) -> Crossing:
@@ -179,34 +166,25 @@ def _crossing(
     crossing = Crossing(centre, half, lanes, move, approach, {}, arm_m)
     section = Section(lanes=lanes, limit_mps=limit_mps)
     # arms, then a connection for each pair
+    net = stage.network
     for arm in arms:
-        _arm(stage.network, crossing, arm, section)
+        away = crossing.arm(arm, 0.0, -LANE_WIDTH_M / 2)
+        net.straight(f"{arm}.out", f"{arm}.end", away, arm_m, section)
+        towards = crossing.arm(arm, arm_m, LANE_WIDTH_M / 2).turned(math.pi)
+        net.straight(f"{arm}.far", f"{arm}.in", towards, arm_m, section)
     for start, end in itertools.permutations(arms, 2):
-        _connect(stage.network, crossing, start, end, limit_mps)
-        _rank(stage.network, start, end, start in minor)
+        _connect(net, crossing, start, end, limit_mps)
+        # straight on before right before left, then minor roads
+        turn = (ARMS.index(end) - ARMS.index(start)) % 4
+        rank = {2: 0, 1: 1, 3: 2}[turn] + (3 if start in minor else 0)
+        for lane in range(len(net.graph.graph[f"{start}.in"][f"{end}.out"])):
+            net.ranks[f"{start}.in", f"{end}.out", lane] = rank
     # the ego's route
     incoming, inside, outgoing = crossing.way("back", move)
-    begin = stage.network.length(incoming) - approach
+    begin = net.length(incoming) - approach
     legs = [Leg(incoming, enter_m=begin), Leg(inside, _TURNS[move]), Leg(outgoing)]
     stage.drive(legs, start_speed(stage))
     return crossing
-
-
-def _arm(network: Network, crossing: Crossing, name: str, section: Section) -> None:
-    half_lane = LANE_WIDTH_M / 2
-    away = crossing.arm(name, 0.0, -half_lane)
-    length = crossing.arm_m
-    network.straight(f"{name}.out", f"{name}.end", away, length, section)
-    towards = crossing.arm(name, length, half_lane).turned(math.pi)
-    network.straight(f"{name}.far", f"{name}.in", towards, length, section)
-
-
-def _rank(network: Network, start: str, end: str, minor: bool) -> None:
-    """Rank a way through: straight on before right before left, then minor roads."""
-    turn = (ARMS.index(end) - ARMS.index(start)) % 4
-    rank = {2: 0, 1: 1, 3: 2}[turn] + (3 if minor else 0)
-    for lane in range(len(network.graph.graph[f"{start}.in"][f"{end}.out"])):
-        network.ranks[f"{start}.in", f"{end}.out", lane] = rank
 
 
 def _connect(

@@ -1,0 +1,349 @@
+"""Scores of one route: driving score, efficiency, comfort, and room kept to others."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.metrics.episode import (
+    COLLISIONS,
+    CROSSING_RAD,
+    FRAME_US,
+    EgoFrame,
+    Ending,
+    Episode,
+    InfractionKind,
+)
+from me2e_compress.metrics.measure import Measure
+
+DIGITS = 6
+"""Digits to which the leaderboard rounds each of the three scores."""
+
+
+@dataclass(frozen=True, slots=True)
+class RouteScore:
+    """Scores of one route: route and composed in percent, penalty as a factor."""
+
+    route: float
+    penalty: float
+    composed: float
+
+
+def route_score(episode: Episode) -> RouteScore:
+    """Return completion, penalty and their product (equation 5, one summand).
+
+    As in the leaderboard (statistics_manager.py of Bench2Drive 0.0.3), every infraction
+    multiplies the completed percentage by its factor.
+    """
+    penalty = math.prod(infraction.factor for infraction in episode.infractions)
+    return composed_of(episode.completion_percent, penalty)
+
+
+def score_to_first_collision(episode: Episode) -> RouteScore:
+    """Return the scores that a drive would have if its first collision had ended it.
+
+    That is `route_score` unless the drive went on: one drive is scored by both rules.
+    """
+    first = episode.first_collision
+    if first is None:
+        return route_score(episode)
+    penalty = 1.0 - first.outside_percent / 100.0
+    for infraction in episode.infractions:
+        before = infraction.time_us is not None and infraction.time_us <= first.time_us
+        if before and infraction.kind is not InfractionKind.OUTSIDE_ROUTE_LANES:
+            penalty *= infraction.factor
+    return composed_of(first.completion_percent, penalty)
+
+
+def composed_of(route: float, penalty: float) -> RouteScore:
+    """Multiply a completion in percent by the factor of all infractions."""
+    return RouteScore(
+        round(route, DIGITS),
+        round(penalty, DIGITS),
+        round(max(route * penalty, 0.0), DIGITS),
+    )
+
+
+# Driving efficiency: the ego's speed relative to the traffic around it.
+
+
+CHECKPOINTS = 20
+OUTLIER_PERCENT = 1000.0
+DONE_PERCENT = 95.0
+"""Beyond this Bench2Drive also reports the speed over the last stretch."""
+PERCENT = "%"
+
+
+def efficiency(episode: Episode) -> Measure:
+    """Return the mean of ego speed over traffic speed at 20 check points, in percent.
+
+    Equation 6: at each check point, every twentieth of the route, the mean ego speed
+    since the last one is divided by that of nearby vehicles. Ratios above 1000 % and
+    check points without moving traffic are dropped. A route that ends within its first
+    5 % has no efficiency.
+    """
+    ratios = speed_ratios(episode)
+    if episode.completion_percent < 100.0 / CHECKPOINTS:
+        return Measure(None, PERCENT, "the ego did not pass the first 5 % of the route")
+    kept = [ratio for ratio in ratios if ratio <= OUTLIER_PERCENT]
+    if not kept:
+        return Measure(None, PERCENT, "no check point saw moving traffic")
+    return Measure(fmean(kept), PERCENT)
+
+
+def speed_ratios(episode: Episode) -> tuple[float, ...]:
+    """Return the ratio at each check point that saw moving traffic, in percent.
+
+    Ratios reported by the simulator take precedence. Bench2Drive writes the last one
+    twice if more than 95 % of the route was passed; it is kept once.
+    """
+    if episode.speed_ratios_percent is not None:
+        given = episode.speed_ratios_percent
+        done = episode.completion_percent > DONE_PERCENT
+        twice = done and len(given) > 1 and given[-1] == given[-2]
+        return given[:-1] if twice else given
+    # the frames between two check points
+    spacing_m = episode.route_length_m / CHECKPOINTS
+    passed, stretches = 0, list[list[EgoFrame]]([[]])
+    for frame in episode.frames:
+        stretches[-1].append(frame)
+        reached = int(frame.route_m / spacing_m)
+        if reached > passed:
+            passed = reached
+            stretches.append([])
+    ended = episode.ending is Ending.COMPLETED and passed < CHECKPOINTS
+    sums = map(beside_traffic, stretches if ended else stretches[:-1])
+    return tuple(100.0 * ego / traffic for ego, traffic, _ in sums if traffic > 0.0)
+
+
+def beside_traffic(stretch: Sequence[EgoFrame]) -> tuple[float, float, int]:
+    """Return summed ego and traffic speeds (m/s) of frames with traffic; how many."""
+    seen = [
+        (frame.speed_mps, frame.traffic_speed_mps)
+        for frame in stretch
+        if frame.traffic_speed_mps is not None
+    ]
+    return sum(ego for ego, _ in seen), sum(other for _, other in seen), len(seen)
+
+
+# Driving comfort: the share of seconds with every variable in its range.
+
+
+SEGMENT_FRAMES = 20
+WINDOW = 7
+ORDER = 2
+BLOCKED_SPEED_MPS = 0.1
+BLOCKED_US = 60_000_000
+
+Floats = npt.NDArray[np.float64]
+
+
+# the paper's table 1 in SI units: the 99th percentiles of human drivers that nuPlan's
+# comfort metric uses
+LOWEST_ACCELERATION_MPS2, HIGHEST_ACCELERATION_MPS2 = -4.05, 2.40
+LATERAL_ACCELERATION_MPS2 = 4.89
+YAW_RATE_RADPS, YAW_ACCELERATION_RADPS2 = 0.95, 1.93
+LONGITUDINAL_JERK_MPS3, JERK_MPS3 = 4.13, 8.37
+
+
+def comfort(episode: Episode) -> Measure:
+    """Return the share of segments of 20 frames in which every frame is smooth.
+
+    Equation 7 with all six variables in SI units and the frames' own interval, which is
+    0.05 s unless a real run recorded fewer frames:
+
+    * accelerations and yaw rate are smoothed (Savitzky-Golay, 7 frames, order 2) over
+      the whole route before it is cut into segments;
+    * yaw acceleration and longitudinal jerk are the filter's derivatives of yaw rate
+      and longitudinal acceleration; the jerk is the norm of the derivative of the
+      acceleration vector in the plane of the road;
+    * the bounds are inclusive, and an incomplete last segment is dropped;
+    * frames of a stop that blocks the route always count as smooth (at most 0.1 m/s for
+      60 s, where the route ends; the paper's "more than 60 s" never occurs).
+    """
+    if len(episode.frames) < SEGMENT_FRAMES:
+        frames = len(episode.frames)
+        return Measure(None, "ratio", f"{frames} frames, {SEGMENT_FRAMES} are needed")
+    return Measure(float(_segments(smooth_frames(episode)).mean()), "ratio")
+
+
+def comfort_in_motion(episode: Episode) -> Measure:
+    """Return the comfort over the segments in which the ego moved.
+
+    A standing ego is comfortable, so a driver that is stuck for most of a route scores
+    well by `comfort`. Here a segment counts only if the ego was faster than 0.1 m/s in
+    at least one of its frames.
+    """
+    if len(episode.frames) < SEGMENT_FRAMES:
+        return comfort(episode)
+    moved = ~_segments(~_moving(episode.frames))
+    if not moved.any():
+        return Measure(None, "ratio", "the ego never moved")
+    return Measure(float(_segments(smooth_frames(episode))[moved].mean()), "ratio")
+
+
+def standing_share(episode: Episode) -> float | None:
+    """Return the share of frames in which the ego stood; None without frames."""
+    if not episode.frames:
+        return None
+    return float(1.0 - _moving(episode.frames).mean())
+
+
+def stood_most(episodes: Iterable[Episode]) -> tuple[str, ...]:
+    """Return the routes on which the ego stood for more than half of the frames."""
+    return tuple(one.route for one in episodes if (standing_share(one) or 0.0) > 0.5)
+
+
+def _segments(smooth: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    segments = len(smooth) // SEGMENT_FRAMES
+    cut = smooth[: segments * SEGMENT_FRAMES].reshape(segments, SEGMENT_FRAMES)
+    return np.asarray(cut.all(axis=1))
+
+
+def _moving(frames: Sequence[EgoFrame]) -> npt.NDArray[np.bool_]:
+    return np.array([frame.speed_mps > BLOCKED_SPEED_MPS for frame in frames])
+
+
+def smooth_frames(episode: Episode) -> npt.NDArray[np.bool_]:
+    """Return for each of at least 7 frames whether all six variables are in range."""
+    frames = episode.frames
+    # the jerk needs the acceleration vector in the world
+    along = np.array([frame.acceleration_mps2 for frame in frames])
+    left = np.array([frame.lateral_acceleration_mps2 for frame in frames])
+    heading = np.array([frame.heading for frame in frames])
+    yaw_rate = np.array([frame.yaw_rate_radps for frame in frames])
+    east = along * np.cos(heading) - left * np.sin(heading)
+    north = along * np.sin(heading) + left * np.cos(heading)
+    times_us = np.array([frame.time_us for frame in frames])
+    delta_s = (int(np.median(np.diff(times_us))) or FRAME_US) / 1e6
+    # every variable against its bounds
+    acceleration = filtered(along)
+    jerk_east, jerk_north = (filtered(each, delta_s, 1) for each in (east, north))
+    return (
+        (acceleration >= LOWEST_ACCELERATION_MPS2)
+        & (acceleration <= HIGHEST_ACCELERATION_MPS2)
+        & (np.abs(filtered(left)) <= LATERAL_ACCELERATION_MPS2)
+        & (np.abs(filtered(yaw_rate)) <= YAW_RATE_RADPS)
+        & (np.abs(filtered(yaw_rate, delta_s, 1)) <= YAW_ACCELERATION_RADPS2)
+        & (np.abs(filtered(along, delta_s, 1)) <= LONGITUDINAL_JERK_MPS3)
+        & (np.hypot(jerk_east, jerk_north) <= JERK_MPS3)
+    ) | _blocked_frames(episode)
+
+
+def filtered(
+    values: Floats, delta_s: float = 1.0, derivative: int = 0, window: int = WINDOW
+) -> Floats:
+    """Smooth values, or every row of them, by Savitzky and Golay's filter."""
+    from scipy.signal import savgol_filter  # takes half a second to import
+
+    smoothed: Any = savgol_filter(
+        values, window, ORDER, deriv=derivative, delta=delta_s
+    )
+    return np.asarray(smoothed, np.float64)
+
+
+def _blocked_frames(episode: Episode) -> npt.NDArray[np.bool_]:
+    """Mark the frames of every stop of 60 s, and of the stop that ended the route.
+
+    The last one may be a frame short on file: the rule is checked at finer steps.
+    """
+    still = [frame.speed_mps <= BLOCKED_SPEED_MPS for frame in episode.frames]
+    blocked = np.zeros(len(still), np.bool_)
+    edges = np.flatnonzero(np.diff([False, *still, False]))
+    for start, end in edges.reshape(-1, 2):
+        lasted = episode.frames[end - 1].time_us - episode.frames[start].time_us
+        ended = end == len(still) and episode.ending is Ending.BLOCKED
+        blocked[start:end] = lasted >= BLOCKED_US or ended
+    return blocked
+
+
+# Surrogate safety measures: how near an episode came to a collision, and its fault. Few
+# routes end in one, so collisions alone separate drivers slowly; these measures also
+# count near misses. Each is None if its input was not recorded.
+
+
+TTC_CRITICAL_S = 1.5
+"""A time to collision below this is a conflict: SSAM's default (Gettman et al. 2008,
+FHWA-HRT-08-051), after Van der Horst and Hogema 1993."""
+
+NOT_RECORDED = "nobody recorded the distances to others"
+
+
+def ttc_exposure(episode: Episode) -> Measure:
+    """Return the share of frames with a time to collision below 1.5 s, in percent.
+
+    This is the time exposed (TET, Minderhoud and Bovy 2001) over the time driven.
+    """
+    found = episode.conflicts
+    if found is None or not found.ttc_s:
+        return Measure(None, "%", NOT_RECORDED)
+    exposed = sum(ttc is not None and ttc < TTC_CRITICAL_S for ttc in found.ttc_s)
+    return Measure(100.0 * exposed / len(found.ttc_s), "%")
+
+
+def room_kept(episode: Episode) -> Measure:
+    """Return how much room a route kept to others, a grade from 0 to 100 percent.
+
+    It is the share of frames without a contact within 1.5 s, times the part of 1.5 s
+    that the smallest post-encroachment time reaches, at most 1; 0 after a collision
+    that was the ego's fault. The driving score sees neither near misses nor faults.
+    """
+    exposed, pet = ttc_exposure(episode).value, smallest_pet(episode).value
+    kept = room_of(exposed, pet, at_fault_collision(episode))
+    if kept is None:
+        why = "whose fault a collision was is not known"
+        return Measure(None, "%", NOT_RECORDED if exposed is None else why)
+    return Measure(kept, "%")
+
+
+def room_of(
+    ttc_exposure: float | None, smallest_pet: float | None, at_fault: bool | None
+) -> float | None:
+    """Return `room_kept` of its three parts; None if the first or last is unknown."""
+    if ttc_exposure is None or at_fault is None:
+        return None
+    kept = 1.0 if smallest_pet is None else min(smallest_pet / TTC_CRITICAL_S, 1.0)
+    return 0.0 if at_fault else (100.0 - ttc_exposure) * kept
+
+
+def smallest_ttc(episode: Episode) -> Measure:
+    """Return the smallest time to collision of a route, seconds; 0 if it collided."""
+    seconds = () if episode.conflicts is None else episode.conflicts.ttc_s
+    return _smallest(episode, seconds, "s", "no contact was ever within 10 s")
+
+
+def smallest_distance(episode: Episode) -> Measure:
+    """Return the smallest distance between the outlines of ego and others, metres."""
+    metres = () if episode.conflicts is None else episode.conflicts.nearest_m
+    return _smallest(episode, metres, "m", "nobody else was there")
+
+
+def smallest_pet(episode: Episode) -> Measure:
+    """Return the smallest post-encroachment time of crossing paths, seconds.
+
+    Only encounters at 30 degrees or more, at most 5 s apart, count.
+    """
+    encounters = () if episode.conflicts is None else episode.conflicts.encounters
+    crossing = [each.pet_s for each in encounters if each.angle_rad >= CROSSING_RAD]
+    return _smallest(episode, crossing, "s", "no paths crossed within 5 s")
+
+
+def at_fault_collision(episode: Episode) -> bool | None:
+    """Return whether a collision was the ego's fault, None if unknown."""
+    faults = [each.at_fault for each in episode.infractions if each.kind in COLLISIONS]
+    if any(faults):
+        return True
+    return None if None in faults else False
+
+
+def _smallest(
+    episode: Episode, column: Iterable[float | None], unit: str, reason: str
+) -> Measure:
+    if episode.conflicts is None:
+        return Measure(None, unit, NOT_RECORDED)
+    values = [value for value in column if value is not None]
+    return Measure(min(values), unit) if values else Measure(None, unit, reason)

@@ -1,1 +1,0 @@
-"""Roads: every layout lays the network and sets the ego's route."""
